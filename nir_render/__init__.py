@@ -1,0 +1,1 @@
+"""Physically based rendering of raw frames from narrowband near-infrared cameras."""

@@ -1,0 +1,38 @@
+"""Frames as pictures for human eyes."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.types import RawFrame
+
+
+def tone_map(data_dn: NDArray[np.uint16], black_level_dn: float, full_scale_dn: float) -> NDArray[np.uint8]:
+    """Map counts to 8 bits by an asinh curve, so that noise, faint and bright flares all show.
+
+    Parameters
+    ----------
+    data_dn
+        Counts, shape (rows, columns).
+    black_level_dn
+        The count that becomes black.
+    full_scale_dn
+        The count that becomes white.
+
+    Returns
+    -------
+    Grey values, uint8, same shape.
+    """
+    softening = 0.01
+    signal = np.clip((data_dn.astype(np.float64) - black_level_dn) / (full_scale_dn - black_level_dn), 0.0, 1.0)
+    curve = np.arcsinh(signal / softening) / np.arcsinh(1.0 / softening)
+    return np.rint(255.0 * curve).astype(np.uint8)
+
+
+def frame_png(frame: RawFrame) -> bytes:
+    """Encode a frame as an 8-bit PNG, tone-mapped up to its own brightest pixel."""
+    full_scale_dn = max(float(frame.data_dn.max()), frame.black_level_dn + 1.0)
+    done, buffer = cv2.imencode(".png", tone_map(frame.data_dn, frame.black_level_dn, full_scale_dn))
+    if not done:
+        raise RuntimeError("OpenCV could not encode the frame as PNG")
+    return buffer.tobytes()
