@@ -1,0 +1,51 @@
+"""The stack that reads raw near-infrared frames: flares, their bearings and their ranges.
+
+    frames = perception.read_frames("recording")
+    calibrations = perception.read_calibrations("recording")
+    for frame in frames:
+        hits = perception.detect(frame, calibrations[frame.camera])          # or estimator="paper"
+
+It needs a frame and a calibration and nothing else, and runs unchanged on a robot. The way of the data:
+`recording` → `detection` (`preparation` → `blobs` → `measurement`) → detections. `limits` says how well any
+estimator could do.
+"""
+
+from perception.calibrate import PaperRegression, regress_paper_range_constant
+from perception.calibration_file import calibration_document, parse_calibration_document
+from perception.detection_file import detection_record, parse_detection
+from perception.json_fields import RecordingError
+from perception.limits import FlareLimit, flare_limit
+from perception.pipeline import ESTIMATORS, Estimator, detect
+from perception.recording import (
+    FrameRecord,
+    encode_png16,
+    frame_record,
+    parse_frame_record,
+    read_calibrations,
+    read_frames,
+)
+from perception.types import Calibration, Detection, RawFrame
+
+__all__ = [
+    "ESTIMATORS",
+    "Calibration",
+    "Detection",
+    "Estimator",
+    "FlareLimit",
+    "FrameRecord",
+    "PaperRegression",
+    "RawFrame",
+    "RecordingError",
+    "calibration_document",
+    "detect",
+    "detection_record",
+    "encode_png16",
+    "flare_limit",
+    "frame_record",
+    "parse_calibration_document",
+    "parse_detection",
+    "parse_frame_record",
+    "read_calibrations",
+    "read_frames",
+    "regress_paper_range_constant",
+]

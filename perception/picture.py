@@ -24,9 +24,11 @@ def tone_map(data_dn: NDArray[np.uint16], black_level_dn: float, full_scale_dn: 
     Grey values, uint8, same shape.
     """
     softening = 0.01
-    signal = np.clip((data_dn.astype(np.float64) - black_level_dn) / (full_scale_dn - black_level_dn), 0.0, 1.0)
+    signal = np.clip(
+        (data_dn.astype(np.float64) - black_level_dn) / (full_scale_dn - black_level_dn), 0.0, 1.0
+    )
     curve = np.arcsinh(signal / softening) / np.arcsinh(1.0 / softening)
-    return np.rint(255.0 * curve).astype(np.uint8)
+    return np.asarray(np.rint(255.0 * curve), dtype=np.uint8)
 
 
 def frame_png(frame: RawFrame) -> bytes:

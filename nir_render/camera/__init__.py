@@ -1,0 +1,1 @@
+"""Light to raw counts: lens, point spread, spectral response, sensor. Plain numpy."""

@@ -1,0 +1,1 @@
+"""A stack's output against truth and against the physical limit."""

@@ -1,0 +1,1 @@
+"""What the world is: scene files, and the plain data that they become."""

@@ -1,0 +1,1 @@
+"""Everything that varies with wavelength: sampled curves, emission spectra, filters."""

@@ -1,0 +1,1 @@
+"""How light travels: the only room that imports Mitsuba."""

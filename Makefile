@@ -1,0 +1,50 @@
+# Every target that needs the environment sets it up first; a complete set-up costs a moment.
+# GNU make 3.81 is enough. Give pytest more words with ARGS, as in: make test ARGS="-k lens"
+
+PYTHON ?= python3
+ARGS ?=
+
+ifeq ($(OS),Windows_NT)
+BIN := .venv/Scripts
+else
+BIN := .venv/bin
+endif
+
+.PHONY: help setup demo test verify lint bench clean
+
+help:
+	@echo "make setup   make .venv, install the pinned packages, find a usable LLVM"
+	@echo "make demo    render and evaluate scenes/one_source.yaml into outputs/one_source"
+	@echo "make test    the tests, without the long statistical checks"
+	@echo "make verify  the long statistical checks"
+	@echo "make lint    ruff and mypy"
+	@echo "make bench   every benchmark, one JSON object each"
+	@echo "make clean   remove .venv and the tools' caches; outputs stay"
+
+setup:
+	@command -v "$(PYTHON)" >/dev/null || { echo "setup: error: there is no $(PYTHON): install the package python3-venv (Python 3.11 or newer)" >&2; exit 1; }
+	@"$(PYTHON)" tools/bootstrap.py
+
+demo: setup
+	$(BIN)/nir-render run scenes/one_source.yaml -o outputs/one_source --overwrite
+
+test: setup
+	$(BIN)/python -m pytest -m "not verify" $(ARGS)
+
+# Status 5 is pytest's for "no test was selected".
+verify: setup
+	$(BIN)/python -m pytest -m verify $(ARGS) || [ $$? -eq 5 ]
+
+lint: setup
+	$(BIN)/python -m ruff check
+	$(BIN)/python -m ruff format --check
+	$(BIN)/python -m mypy
+
+bench: setup
+	@set -e; for file in benchmarks/*.py; do \
+		if [ -f "$$file" ]; then $(BIN)/python "$$file"; fi; \
+	done
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

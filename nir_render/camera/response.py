@@ -1,0 +1,131 @@
+"""Spectral response: what one joule of a source's light becomes, in electrons, against the field angle.
+
+Everything spectral about a light group and a camera folds into one factor (PHYSICS section 1),
+
+    C(θ) = ∫ S(λ) τ_lens τ_filter(λ, θ) η(λ) λ / (h c) dλ,
+
+with S the group's spectrum of unit flux. Geometry (aperture, cos θ, distance) is not part of it.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
+
+from nir_render.camera.lens import intrinsics_of
+from nir_render.scene.devices import Camera, CurveDocument, Source
+from nir_render.spectra.bandpass import transmission
+from nir_render.spectra.curve import Curve, constant_curve, curve_from_points
+from nir_render.spectra.led import gaussian_spectrum
+
+PLANCK_J_S = 6.62607015e-34
+LIGHT_SPEED_M_PER_S = 299_792_458.0
+
+_ANGLES = 129
+_COSINES = 257
+_PUPIL_RINGS = 6
+_PUPIL_SPOKES = 12  # over half the pupil; the other half mirrors it
+# A quantum efficiency given as one number is taken as flat over what silicon sees.
+_SILICON_M = (300e-9, 1200e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """C(θ): `angle_rad`, increasing from 0, and `electrons_per_j`, shape (n,) each."""
+
+    angle_rad: NDArray[np.float64]
+    electrons_per_j: NDArray[np.float64]
+
+    def __call__(self, angle_rad: ArrayLike) -> NDArray[np.float64]:
+        """Return C at field angles of any shape, in electrons per joule, by monotone cubic interpolation.
+
+        Beyond the last angle, outside the image, it keeps its last value.
+        """
+        angle = np.clip(angle_rad, self.angle_rad[0], self.angle_rad[-1])
+        return np.asarray(PchipInterpolator(self.angle_rad, self.electrons_per_j)(angle))
+
+
+@lru_cache(maxsize=256)
+def response(camera: Camera, source: Source) -> Response:
+    """Return how a camera responds to the light of a source.
+
+    Raises
+    ------
+    InputError
+        The quantum efficiency does not cover the whole spectrum of the source.
+    """
+    # A little beyond the corner, for sources that are centred outside the image and reach into it.
+    angle_rad = np.linspace(0.0, min(1.2 * intrinsics_of(camera).corner_angle_rad, 0.5 * np.pi), _ANGLES)
+    cosines, weights = incidence(camera, angle_rad)
+    nodes = np.linspace(cosines.min(), 1.0, _COSINES)
+    at_nodes = PchipInterpolator(nodes, _electrons_per_j(camera, source, nodes))
+    return Response(angle_rad, np.asarray(at_nodes(cosines)) @ weights)
+
+
+def _electrons_per_j(camera: Camera, source: Source, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return electrons per joule of parallel light that meets the filter at given cosines, shape (n,)."""
+    spectrum = spectrum_of(source.spectrum, "the source's spectrum").normalised()
+    wavelength_m = _merged_grid(spectrum, camera)
+    efficiency = efficiency_of(camera)(wavelength_m)
+    photons_per_j = wavelength_m / (PLANCK_J_S * LIGHT_SPEED_M_PER_S)
+    integrand = camera.lens.transmission * spectrum(wavelength_m) * efficiency * photons_per_j
+    if camera.filter is None:
+        return np.full(cosines.shape, np.trapezoid(integrand, wavelength_m))
+    passed = transmission(camera.filter, wavelength_m, cosines[:, None])
+    return np.asarray(np.trapezoid(passed * integrand, wavelength_m, axis=1))
+
+
+def spectrum_of(document: CurveDocument, name: str) -> Curve:
+    """Return the curve that a document describes."""
+    if document.gaussian is not None:
+        return gaussian_spectrum(document.gaussian.centroid_m, document.gaussian.fwhm_m, name)
+    if document.points is not None:
+        return curve_from_points(document.points, name)
+    assert document.constant is not None  # noqa: S101 (the model admits no fourth form)
+    return constant_curve(document.constant, *_SILICON_M, name)
+
+
+def efficiency_of(camera: Camera) -> Curve:
+    """Return the quantum efficiency of a camera's sensor."""
+    return spectrum_of(camera.sensor.quantum_efficiency, "quantum_efficiency")
+
+
+def incidence(
+    camera: Camera, angle_rad: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how the light of field angles, shape (n,), meets the filter.
+
+    In front of the lens the light of a distant point is parallel and meets the filter at the field angle.
+    Behind it, a cone meets the filter about the chief ray; the mean is over the exit pupil by area.
+
+    Returns
+    -------
+    Cosines of incidence, shape (n, rays), and the weights of the rays (sum 1), shape (rays,).
+    """
+    bandpass = camera.filter
+    if bandpass is None or bandpass.placement == "in_front_of_lens":
+        return np.cos(angle_rad)[:, None], np.ones(1)
+    # The chief ray's angle grows linearly with the image height (beyond the corner: up to 85 degrees).
+    height = np.tan(angle_rad) / np.tan(intrinsics_of(camera).corner_angle_rad)
+    chief = np.tan(np.clip(height * bandpass.chief_ray_angle_at_corner_rad, 0.0, np.radians(85.0)))
+    nodes, ring_weights = np.polynomial.legendre.leggauss(_PUPIL_RINGS)
+    radius = np.sqrt(0.5 * (nodes + 1.0)) / (2.0 * camera.lens.f_number)  # Gauss–Legendre in area
+    turn = np.pi * (np.arange(_PUPIL_SPOKES) + 0.5) / _PUPIL_SPOKES
+    x = chief[:, None, None] + radius[:, None] * np.cos(turn)
+    y = radius[:, None] * np.sin(turn)
+    cosines = 1.0 / np.sqrt(1.0 + x**2 + y**2)
+    weights = np.repeat(0.5 * ring_weights / _PUPIL_SPOKES, _PUPIL_SPOKES)
+    return cosines.reshape(angle_rad.size, -1), weights
+
+
+def _merged_grid(spectrum: Curve, camera: Camera) -> NDArray[np.float64]:
+    """Return wavelengths that resolve the spectrum, the filter's flanks and the quantum efficiency."""
+    parts = [spectrum.wavelength_m]
+    if camera.filter is not None:
+        step_m = camera.filter.fwhm_m / 100.0
+        parts.append(np.arange(spectrum.low_m, spectrum.high_m, step_m))
+    efficiency = efficiency_of(camera).wavelength_m
+    parts.append(efficiency[(efficiency > spectrum.low_m) & (efficiency < spectrum.high_m)])
+    return np.unique(np.concatenate(parts))

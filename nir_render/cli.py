@@ -1,0 +1,261 @@
+"""The command nir-render. Thin: it reads arguments, calls one function, and shows what came back.
+
+Exit status: 0 done, 1 the work failed or a check did not hold, 2 the input was wrong.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from nir_render.errors import InputError
+
+app = typer.Typer(
+    name="nir-render",
+    help="Render raw frames of a narrowband near-infrared camera, and score what perception reads in them.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+_errors = Console(stderr=True, highlight=False)
+
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A scene file (YAML).")]
+FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")]
+Output = Annotated[
+    Path | None,
+    typer.Option("-o", "--output", metavar="DIR", help="Where the run goes; outputs/NAME by default."),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="PATH=VALUE", help='Change the scene: --set robots.r2.position="[3, 0, 0] m".'
+    ),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the run that the folder holds.")]
+Seed = Annotated[int | None, typer.Option("--seed", min=0, help="Replaces the scene's seed.")]
+Threads = Annotated[
+    int | None, typer.Option("--threads", min=1, help="Threads to render with; all by default.")
+]
+Estimators = Annotated[
+    list[str] | None,
+    typer.Option("--estimator", metavar="NAME", help="paper or robust; both by default. Repeatable."),
+]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else there.")
+]
+
+
+def main() -> None:
+    """Run the command; turn errors that a user can mend into their text and exit status 2."""
+    try:
+        app()
+    except InputError as error:
+        for problem in error.problems:
+            _errors.print(f"[bold red]error:[/] {_escape(problem)}", soft_wrap=True)
+        sys.exit(2)
+
+
+@app.command()
+def run(
+    scene: SceneArgument,
+    output: Output = None,
+    settings: Settings = None,
+    estimators: Estimators = None,
+    overwrite: Overwrite = False,
+    seed: Seed = None,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Render, perceive and evaluate a scene in one go."""
+    from nir_render.run import evaluate_run, perceive_run
+
+    names = _estimators(estimators)
+    folder = _render(scene, output, settings, overwrite, seed, threads)
+    with _progress("perceive") as progress:
+        perceive_run(folder, estimators=names, progress=progress)
+    _show_evaluation(evaluate_run(folder), folder, as_json)
+
+
+@app.command()
+def render(
+    scene: SceneArgument,
+    output: Output = None,
+    settings: Settings = None,
+    overwrite: Overwrite = False,
+    seed: Seed = None,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Render the frames of a scene, with truth and calibration."""
+    folder = _render(scene, output, settings, overwrite, seed, threads)
+    frames = len((folder / "frames.jsonl").read_text(encoding="utf-8").splitlines())
+    if as_json:
+        _print_json({"folder": str(folder), "frames": frames})
+    else:
+        typer.echo(f"{frames} frames in {folder}; next: nir-render perceive {folder}")
+
+
+@app.command()
+def perceive(folder: FolderArgument, estimators: Estimators = None, as_json: Json = False) -> None:
+    """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
+    from nir_render.run import perceive_run
+
+    with _progress("perceive") as progress:
+        counts = perceive_run(folder, estimators=_estimators(estimators), progress=progress)
+    if as_json:
+        _print_json({"folder": str(folder), "detections": counts})
+    else:
+        for name, count in counts.items():
+            typer.echo(f"{name}: {count} detections in {folder / f'detections.{name}.jsonl'}")
+
+
+@app.command()
+def evaluate(folder: FolderArgument, as_json: Json = False) -> None:
+    """Score the detections of a run against its truth and the physical limit."""
+    from nir_render.run import evaluate_run
+
+    _show_evaluation(evaluate_run(folder), folder, as_json)
+
+
+@app.command()
+def validate(
+    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene files.")],
+    as_json: Json = False,
+) -> None:
+    """Check scene files: every error names file, line, field and what was wanted."""
+    from nir_render.scene.load import load_scene
+    from nir_render.transport.world import not_rendered
+
+    problems: list[str] = []
+    warnings: dict[str, list[str]] = {}
+    for path in scenes:
+        try:
+            warnings[str(path)] = not_rendered(load_scene(path))
+        except InputError as error:
+            problems += error.problems
+    if as_json:
+        _print_json({"errors": problems, "not_rendered_yet": warnings})
+    else:
+        for path_name, lines in warnings.items():
+            typer.echo(f"{path_name}: valid" + (", but not rendered yet:" if lines else ""))
+            for line in lines:
+                typer.echo(f"  {line}")
+    if problems:
+        raise InputError(*problems)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of scene files, for editors."""
+    from nir_render.scene.schema import scene_schema
+
+    typer.echo(json.dumps(scene_schema(), indent=2))
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Say what this machine renders with, and hold a tiny render against its closed form."""
+    from nir_render.doctor import examine
+
+    report = examine()
+    if as_json:
+        _print_json(report)
+    else:
+        table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+        for key, value in report.items():
+            table.add_row(key.replace("_", " "), _escape(str(value)))
+        Console().print(table)
+    if not report["check_holds"]:
+        raise typer.Exit(1)
+
+
+def _render(
+    path: Path,
+    output: Path | None,
+    settings: list[str] | None,
+    overwrite: bool,
+    seed: int | None,
+    threads: int | None,
+) -> Path:
+    from nir_render.run import render_run
+    from nir_render.run_folder import check_free
+    from nir_render.scene.load import load_scene
+    from nir_render.transport.backend import set_threads
+
+    scene = load_scene(path, dict(map(_setting, settings or [])))
+    folder = output if output is not None else Path("outputs") / scene.document.name
+    check_free(folder, overwrite)
+    if threads is not None:
+        set_threads(threads)
+    with _progress("render") as progress:
+        run_seed = scene.document.seed if seed is None else seed
+        render_run(scene, folder, seed=run_seed, overwrite=overwrite, progress=progress)
+    return folder
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    path, equals, value = text.partition("=")
+    if not equals or not path:
+        raise InputError(f'--set {text}: wanted PATH=VALUE, such as --set robots.r2.position="[3, 0, 0] m"')
+    try:
+        return path.strip(), _yaml_value(value)
+    except yaml.YAMLError:
+        raise InputError(f"--set {text}: {value!r} is no YAML value") from None
+
+
+def _yaml_value(text: str) -> Any:
+    """Read a value as YAML does, but leave a vector with its unit as the text that it is."""
+    if text.lstrip().startswith("[") and not text.rstrip().endswith("]"):
+        return text.strip()
+    return yaml.safe_load(text)
+
+
+def _estimators(names: list[str] | None) -> list[str]:
+    from perception.pipeline import ESTIMATORS
+
+    return list(dict.fromkeys(names)) if names else list(ESTIMATORS)
+
+
+def _show_evaluation(result: Any, folder: Path, as_json: bool) -> None:
+    from nir_render.report.tables import range_table, summary_table
+
+    if as_json:
+        _print_json(result.summary)
+        return
+    console = Console()
+    console.print(range_table(result))
+    console.print(summary_table(result.summary))
+    console.print(
+        f"{folder}: frames, truth, detections, summary.json, preview.png", soft_wrap=True, highlight=False
+    )
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar on standard error; yield the function that moves it."""
+    columns = (TextColumn(f"{what:<9}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_errors, transient=not _errors.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+
+        def move(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield move
+
+
+def _print_json(document: Any) -> None:
+    typer.echo(json.dumps(document, allow_nan=False))
+
+
+def _escape(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)

@@ -1,0 +1,58 @@
+"""Which detection belongs to which source: without this, recall means nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from nir_render.evaluate.truth import SourceTruth
+from perception.types import Calibration, Detection
+
+GATE_PX = 3.0
+MIN_VISIBLE_FRACTION = 0.5
+MIN_PEAK_SNR = 5.0
+
+
+@dataclass(frozen=True)
+class FrameMatch:
+    """One frame: index pairs (truth, detection), and the detections that belong to nothing."""
+
+    pairs: tuple[tuple[int, int], ...]
+    unmatched: tuple[int, ...]
+
+
+def countable(truth: SourceTruth, calibration: Calibration) -> bool:
+    """Tell whether a source counts for recall: in the image, at least half visible, lit, and peak SNR ≥ 5."""
+    in_image = (
+        -0.5 <= truth.u_px <= calibration.width_px - 0.5 and -0.5 <= truth.v_px <= calibration.height_px - 0.5
+    )
+    lit = truth.on_fraction > 0.0
+    return (
+        in_image and lit and truth.visible_fraction >= MIN_VISIBLE_FRACTION and truth.peak_snr >= MIN_PEAK_SNR
+    )
+
+
+def match(
+    truth: Sequence[SourceTruth], detections: Sequence[Detection], calibration: Calibration
+) -> FrameMatch:
+    """Match sources and detections of one frame, one to one.
+
+    As many pairs as possible within max(3 px, radius of the source's image), and among these the nearest.
+    """
+    distance_px = np.empty((len(truth), len(detections)))
+    gates_px = np.array([max(GATE_PX, _image_radius_px(row, calibration)) for row in truth])
+    for i, row in enumerate(truth):
+        for j, detection in enumerate(detections):
+            distance_px[i, j] = np.hypot(detection.u_px - row.u_px, detection.v_px - row.v_px)
+    within = distance_px <= gates_px[:, None] if truth else np.zeros(distance_px.shape, dtype=bool)
+    # A pair beyond its gate costs more than all gates together, so it never displaces one within.
+    beyond = 1.0 + gates_px.sum()
+    rows, columns = linear_sum_assignment(np.where(within, distance_px, beyond))
+    pairs = tuple((int(i), int(j)) for i, j in zip(rows, columns, strict=True) if within[i, j])
+    taken = {j for _, j in pairs}
+    return FrameMatch(pairs, tuple(j for j in range(len(detections)) if j not in taken))
+
+
+def _image_radius_px(truth: SourceTruth, calibration: Calibration) -> float:
+    return calibration.fx_px * calibration.source_radius_m / max(truth.depth_z_m, calibration.source_radius_m)

@@ -1,0 +1,32 @@
+"""Directions in cones, for whoever looks at a small sphere from outside."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def perpendiculars(direction: Array) -> tuple[Array, Array]:
+    """Return two unit vectors that make a right-handed frame with a unit vector, shape (3,) each."""
+    helper = np.zeros(3)
+    helper[np.argmin(np.abs(direction))] = 1.0
+    x_axis = np.cross(direction, helper)
+    x_axis /= np.linalg.norm(x_axis)
+    return x_axis, np.cross(direction, x_axis)
+
+
+def cone_directions(direction: Array, versine: Array, azimuth_rad: Array) -> Array:
+    """Return unit directions at 1 − cos ψ = `versine` from an axis and at an azimuth about it.
+
+    `versine` and `azimuth_rad` broadcast; the result has their shape and a last axis of 3. Solid angle is
+    even in the versine, and the versine keeps its digits where the cosine of a small angle loses them.
+    """
+    x_axis, y_axis = perpendiculars(direction)
+    sine = np.sqrt(versine * (2.0 - versine))[..., None]
+    around = np.cos(azimuth_rad)[..., None] * x_axis + np.sin(azimuth_rad)[..., None] * y_axis
+    return (1.0 - versine)[..., None] * direction + sine * around
+
+
+def cone_versine(angular_radius_rad: float) -> float:
+    """Return 1 − cos of a cone's half angle, exact for small ones."""
+    return 2.0 * float(np.sin(0.5 * angular_radius_rad)) ** 2

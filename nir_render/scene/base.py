@@ -1,0 +1,182 @@
+"""What all models of a scene file share: closed fields, aliases without unit suffix, presets."""
+
+import csv
+import difflib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationInfo, model_validator
+
+_UNIT_SUFFIXES = (
+    "_dn_per_e",
+    "_px",
+    "_dn",
+    "_hz",
+    "_rad",
+    "_lm",
+    "_nm",
+    "_m",
+    "_s",
+    "_w",
+    "_e",
+    "_k",
+    "_bit",
+)
+CURVE_FORMS = {"constant", "gaussian", "points", "file"}
+_COLOUR_KEYS = {"rgb", "color", "colour", "srgb"}
+RGB_REFUSED = "RGB colours have no meaning at 940 nm; give the value in the band, a number from 0 to 1"
+
+
+def document_key(field: str) -> str:
+    """Return a field's key in the document: `exposure_s` is written `exposure: 1 ms`."""
+    for suffix in _UNIT_SUFFIXES:
+        if field.endswith(suffix):
+            return field.removesuffix(suffix)
+    return field
+
+
+class Document(BaseModel):
+    """A part of a scene file. Unknown keys are refused with the nearest known one."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, alias_generator=document_key, allow_inf_nan=False, strict=False
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        known = [document_key(name) for name in cls.model_fields]
+        for key in data:
+            if key in known:
+                continue
+            if str(key).lower() in _COLOUR_KEYS:
+                raise ValueError(f"{key!r}: {RGB_REFUSED}")
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(sorted(known))}"
+            raise ValueError(f"unknown key {key!r}; {hint}")
+        return data
+
+
+class PresetDocument(Document):
+    """A part that may be named instead of written: a preset of `data/`, or a `.yaml` file beside the scene.
+
+    `sensor: mt9m031` takes a preset whole; `sensor: {preset: mt9m031, read_noise: 5 e}` changes a part.
+    """
+
+    preset_folder: ClassVar[str]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_preset(cls, data: Any, info: ValidationInfo) -> Any:
+        return expand_preset(data, cls.preset_folder, _folder_of(info))
+
+
+def _folder_of(info: ValidationInfo) -> Path:
+    return info.context["folder"] if info.context else Path()
+
+
+def resolve_file(name: str, info: ValidationInfo) -> Path:
+    """Return the path of a file that a scene names; relative names count from the scene's folder.
+
+    Raises
+    ------
+    ValueError
+        There is no such file.
+    """
+    path = _folder_of(info) / name
+    if not path.is_file():
+        raise ValueError(f"there is no file {name!r} beside the scene (looked for {path})")
+    return path.resolve()
+
+
+def preset_names(folder: str) -> list[str]:
+    """Return the names of the presets of one kind."""
+    entries = resources.files("nir_render").joinpath("data", folder).iterdir()
+    return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
+
+
+def expand_preset(data: Any, kind: str, folder: Path) -> Any:
+    """Replace a preset's name by what it stands for, with the keys beside `preset` laid over it."""
+    if isinstance(data, str):
+        return _load_preset(data, kind, folder)
+    if isinstance(data, Mapping) and "preset" in data:
+        base = _load_preset(data["preset"], kind, folder)
+        return merge(base, {key: value for key, value in data.items() if key != "preset"})
+    return data
+
+
+def _load_preset(name: Any, kind: str, folder: Path) -> Any:
+    if isinstance(name, str) and name.endswith(".yaml"):
+        path = folder / name
+        if not path.is_file():
+            raise ValueError(f"there is no file {name!r} beside the scene (looked for {path})")
+        return expand_preset(read_yaml(path), kind, folder)
+    known = preset_names(kind)
+    if name not in known:
+        near = difflib.get_close_matches(str(name), known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+        raise ValueError(f"there is no preset {name!r} in {kind}; {hint}")
+    text = resources.files("nir_render").joinpath("data", kind, f"{name}.yaml").read_text(encoding="utf-8")
+    return expand_preset(parse_yaml(text, f"preset {kind}/{name}"), kind, folder)
+
+
+def merge(base: Any, change: Any) -> Any:
+    """Lay `change` over `base`, key by key; a preset's name in `base` stays the ground under the change."""
+    if not isinstance(change, Mapping):
+        return change
+    if isinstance(base, str):
+        return change if "preset" in change else {"preset": base, **change}
+    if not isinstance(base, Mapping) or change.get("type", base.get("type")) != base.get("type"):
+        return dict(change)
+    if CURVE_FORMS & change.keys():  # a curve that is written in another form replaces the first
+        base = {key: value for key, value in base.items() if key not in CURVE_FORMS}
+    return {**base, **{key: merge(base.get(key), value) for key, value in change.items()}}
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML 1.1 lets a repeated key silently replace the first; here it is an error."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if key in seen:
+                line = key_node.start_mark.line + 1
+                raise yaml.constructor.ConstructorError(None, None, f"line {line}: key {key!r} stands twice")
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def parse_yaml(text: str, name: str) -> Any:
+    """Read YAML; raise ValueError with `name` and line where it is broken or has a key twice."""
+    try:
+        return yaml.load(text, _UniqueKeyLoader)  # noqa: S506 (a subclass of SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{name}{where}: {getattr(error, 'problem', error)}") from None
+
+
+def read_yaml(path: Path) -> Any:
+    """Read a YAML file; errors as `parse_yaml`."""
+    try:
+        return parse_yaml(path.read_text(encoding="utf-8"), str(path))
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is not UTF-8 text") from None
+
+
+def read_curve_csv(path: Path) -> list[tuple[float, float]]:
+    """Read a curve from CSV with the header `wavelength_nm,value`; returns (wavelength_nm, value) pairs."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
+    if not rows or [cell.strip() for cell in rows[0]] != ["wavelength_nm", "value"]:
+        raise ValueError(f"{path}: the first line must be the header 'wavelength_nm,value'")
+    try:
+        return [(float(wavelength), float(value)) for wavelength, value in rows[1:]]
+    except ValueError as error:
+        raise ValueError(f"{path}: each line must hold two numbers ({error})") from None

@@ -1,0 +1,80 @@
+"""What no single field can tell: cameras inside solids, spectra that a sensor's data do not cover."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.response import efficiency_of, spectrum_of
+from nir_render.scene.document import SceneDocument
+from nir_render.scene.motion import camera_pose, rotation_of
+from nir_render.scene.world import Box, Cylinder, ShapeDocument, Sphere
+
+_BAND_M = 940e-9
+
+
+def check(document: SceneDocument) -> list[str]:
+    """Return one line per problem of a document whose fields are right one by one."""
+    return [*_flat_cylinders(document), *_uncovered_curves(document), *_cameras_inside_solids(document)]
+
+
+def _flat_cylinders(document: SceneDocument) -> list[str]:
+    return [
+        f"shapes.{name}: start and end of the cylinder are the same point"
+        for name, shape in document.shapes.items()
+        if isinstance(shape, Cylinder) and shape.start_m == shape.end_m
+    ]
+
+
+def _uncovered_curves(document: SceneDocument) -> list[str]:
+    problems = []
+    spectra = {
+        f"robots.{name}.rig.sources.{source_name}.spectrum": spectrum_of(source.spectrum, "spectrum")
+        for name, robot in document.robots.items()
+        for source_name, source in robot.rig.sources.items()
+    }
+    for place, spectrum in spectra.items():
+        if not spectrum.low_m <= _BAND_M <= spectrum.high_m:
+            problems.append(f"{place}: covers {spectrum.range_nm()}, not 940 nm")
+    for name, robot in document.robots.items():
+        for camera_name, camera in robot.rig.cameras.items():
+            efficiency = efficiency_of(camera)
+            for place, spectrum in spectra.items():
+                if efficiency.low_m > spectrum.low_m or efficiency.high_m < spectrum.high_m:
+                    problems.append(
+                        f"robots.{name}.rig.cameras.{camera_name}.sensor.quantum_efficiency: covers "
+                        f"{efficiency.range_nm()}, but {place} shines from "
+                        f"{spectrum.range_nm()}; give data for it all"
+                    )
+                    break
+    return problems
+
+
+def _cameras_inside_solids(document: SceneDocument) -> list[str]:
+    problems = []
+    for name, robot in document.robots.items():
+        for camera_name, camera in robot.rig.cameras.items():
+            for time_s in document.frame_times_s():
+                point_m = camera_pose(robot, camera, time_s).position_m
+                inside = [shape for shape, body in document.shapes.items() if _contains(body, point_m)]
+                if inside:
+                    problems.append(
+                        f"robots.{name}.rig.cameras.{camera_name}: the camera is inside shapes.{inside[0]} "
+                        f"at {time_s:g} s, at [{', '.join(f'{x:.4g}' for x in point_m)}] m; move one of them"
+                    )
+                    break
+    return problems
+
+
+def _contains(body: ShapeDocument, point_m: NDArray[np.float64]) -> bool:
+    """Tell whether a closed shape holds a point. Meshes are tested where they are built."""
+    match body:
+        case Sphere():
+            return float(np.linalg.norm(point_m - body.center_m)) < body.radius_m
+        case Box():
+            local_m = (point_m - body.center_m) @ rotation_of(body.orientation)
+            return bool((np.abs(local_m) < 0.5 * np.array(body.size_m)).all())
+        case Cylinder():
+            axis = np.subtract(body.end_m, body.start_m)
+            along = float((point_m - body.start_m) @ axis / (axis @ axis))
+            off_m = float(np.linalg.norm(point_m - body.start_m - along * axis))
+            return 0.0 < along < 1.0 and off_m < body.radius_m
+    return False

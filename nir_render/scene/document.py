@@ -1,0 +1,115 @@
+"""The model of a whole scene file."""
+
+import itertools
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, ValidationInfo, model_validator
+
+from nir_render.scene.base import Document, expand_preset, preset_names
+from nir_render.scene.devices import NotNegative, Orientation, Positive, Rig
+from nir_render.scene.units import Frequency, Position, Time
+from nir_render.scene.world import Lamp, MaterialDocument, ShapeDocument
+
+_NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_-]*$"
+Name = Annotated[str, Field(pattern=_NAME_PATTERN)]
+
+
+class Waypoint(Document):
+    """Where a robot is at one time; between two of them it moves evenly."""
+
+    time_s: Time
+    position_m: Position
+    orientation: Orientation = Orientation()
+
+
+class Robot(Document):
+    """A robot: its rig, and either a fixed pose or a motion through waypoints."""
+
+    rig: Rig
+    position_m: Position = (0.0, 0.0, 0.0)
+    orientation: Orientation = Orientation()
+    motion: tuple[Waypoint, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_way_to_move(self) -> Self:
+        if self.motion and self.model_fields_set & {"position_m", "orientation"}:
+            raise ValueError("write either 'position' and 'orientation', or 'motion', not both")
+        times = [waypoint.time_s for waypoint in self.motion]
+        if any(later <= earlier for earlier, later in itertools.pairwise(times)):
+            raise ValueError("the times of 'motion' must increase")
+        return self
+
+
+class Clock(Document):
+    """When frames are taken: `frames` of them at `frame_rate` from `start` on."""
+
+    frames: Annotated[int, Field(ge=1)] = 1
+    frame_rate_hz: Annotated[Frequency, Positive] = 30.0
+    start_s: Time = 0.0
+
+
+class RenderSettings(Document):
+    """How finely the transport of light is sampled."""
+
+    visibility_rays: Annotated[int, Field(ge=16, le=65536)] = 1024
+
+
+class SceneDocument(Document):
+    """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom."""
+
+    format: Literal[1]
+    name: str = "scene"
+    seed: Annotated[int, NotNegative] = 0
+    clock: Clock = Clock()
+    render: RenderSettings = RenderSettings()
+    observe: Annotated[tuple[str, ...], Field(min_length=1)]
+    robots: Annotated[dict[Name, Robot], Field(min_length=1)]
+    materials: dict[Name, MaterialDocument] = {}
+    shapes: dict[Name, ShapeDocument] = {}
+    lamps: dict[Name, Lamp] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_materials(cls, data: Any, info: ValidationInfo) -> Any:
+        """Let shapes name a preset of `data/materials` that the scene itself does not define."""
+        if not isinstance(data, dict) or not isinstance(data.get("shapes"), dict):
+            return data
+        materials = dict(data.get("materials") or {})
+        named = {str(shape.get("material")) for shape in data["shapes"].values() if isinstance(shape, dict)}
+        for name in sorted(named & set(preset_names("materials")) - set(materials)):
+            folder = info.context["folder"] if info.context else Path()
+            materials[name] = expand_preset(name, "materials", folder)
+        return {**data, "materials": materials}
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> Self:
+        for name, shape in self.shapes.items():
+            if shape.material not in self.materials:
+                known = ", ".join([*self.materials, *preset_names("materials")]) or "none"
+                raise ValueError(
+                    f"shapes.{name}.material: there is no material {shape.material!r}; known: {known}"
+                )
+        for name in self.observe:
+            if not self.cameras_of(name):
+                known = ", ".join(
+                    f"{robot}.{camera}" for robot in self.robots for camera in self.robots[robot].rig.cameras
+                )
+                raise ValueError(
+                    f"observe: there is no robot or camera {name!r}; known cameras: {known or 'none'}"
+                )
+        return self
+
+    def cameras_of(self, selector: str) -> list[str]:
+        """Return the cameras, `robot.camera`, that `r1` or `r1.front` selects; empty where there are none."""
+        robot, _, camera = selector.partition(".")
+        if robot not in self.robots:
+            return []
+        cameras = self.robots[robot].rig.cameras
+        if camera:
+            return [selector] if camera in cameras else []
+        return [f"{robot}.{name}" for name in cameras]
+
+    def frame_times_s(self) -> list[float]:
+        """Return the start of each frame's exposure."""
+        return [self.clock.start_s + index / self.clock.frame_rate_hz for index in range(self.clock.frames)]

@@ -1,0 +1,224 @@
+"""From a scene file to a Scene: read, include, override, validate, check."""
+
+import copy
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from nir_render.errors import InputError
+from nir_render.scene.base import merge, read_yaml
+from nir_render.scene.checks import check
+from nir_render.scene.devices import Camera, Source
+from nir_render.scene.document import Robot, SceneDocument
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene, read and checked.
+
+    `document` holds everything in SI units; `raw` is the document as written, with includes and overrides
+    but before presets; `folder` is where file names in it count from; `path` names it in errors.
+    """
+
+    document: SceneDocument
+    raw: Mapping[str, Any]
+    folder: Path
+    path: str
+
+    def with_(self, overrides: Mapping[str, Any]) -> "Scene":
+        """Return a copy changed at dotted paths, such as {"robots.r2.position": "[3, 0, 0.2] m"}."""
+        return _build(apply_overrides(self.raw, overrides), self.folder, self.path)
+
+    def cameras(self) -> list[str]:
+        """Return the names, `robot.camera`, of the cameras that take frames."""
+        names = [name for selector in self.document.observe for name in self.document.cameras_of(selector)]
+        return list(dict.fromkeys(names))
+
+    def camera(self, name: str) -> tuple[Robot, Camera]:
+        """Return the robot and the camera named `robot.camera`; raise InputError where there is none."""
+        if "." not in name or not self.document.cameras_of(name):
+            raise InputError(
+                f"{self.path}: there is no camera {name!r}; known: {', '.join(self.all_cameras())}"
+            )
+        robot, camera = name.split(".")
+        return self.document.robots[robot], self.document.robots[robot].rig.cameras[camera]
+
+    def all_cameras(self) -> list[str]:
+        """Return the names of all cameras, observing or not."""
+        return [name for robot in self.document.robots for name in self.document.cameras_of(robot)]
+
+    def sources(self) -> dict[str, tuple[Robot, Source]]:
+        """Return robot and source of each light group, by name `robot.source`."""
+        return {
+            f"{name}.{source_name}": (robot, source)
+            for name, robot in self.document.robots.items()
+            for source_name, source in robot.rig.sources.items()
+        }
+
+    def calibration(self, camera: str) -> Any:
+        """Return what perception may know about a camera, a `perception.Calibration`, exact."""
+        from nir_render.calibration import calibration  # a room further down the way of the data
+
+        return calibration(self, camera)
+
+    def resolved_yaml(self) -> str:
+        """Return the document with everything expanded, in SI units; it loads to the same scene."""
+        data = self.document.model_dump(mode="json", by_alias=True, exclude_none=True)
+        for robot in data["robots"].values():
+            if not robot["motion"]:
+                del robot["motion"]
+            else:
+                del robot["position"], robot["orientation"]
+        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=110)
+
+
+def load_scene(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read a scene file.
+
+    Parameters
+    ----------
+    path
+        A YAML file, format 1.
+    overrides
+        Values at dotted paths, laid over the file.
+
+    Raises
+    ------
+    InputError
+        A line per problem: file, line, field, value, what was wanted, how to mend it.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(f"{file}: there is no such scene file")
+    raw = _read_with_includes(file, ())
+    return _build(apply_overrides(raw, overrides or {}), file.parent, str(file))
+
+
+def apply_overrides(raw: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of a raw document with values set at dotted paths; numbers in a path index lists.
+
+    A preset's name on the way becomes the ground under the change: `...sensor.read_noise` on
+    `sensor: mt9m031` gives `{preset: mt9m031, read_noise: ...}`.
+    """
+    changed: dict[str, Any] = copy.deepcopy(dict(raw))
+    for path, value in overrides.items():
+        keys = path.split(".")
+        if not all(keys):
+            raise InputError(f"--set {path}: a dotted path such as 'robots.r2.position' was wanted")
+        if keys[0] not in SceneDocument.model_fields:
+            raise InputError(
+                f"--set {path}: {keys[0]!r} is no part of a scene; "
+                f"known: {', '.join(SceneDocument.model_fields)}"
+            )
+        changed = _set(changed, keys, value, path)
+    return changed
+
+
+def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
+    if not keys:
+        return value
+    if isinstance(node, list):
+        if not keys[0].isdigit() or int(keys[0]) >= len(node):
+            raise InputError(f"--set {path}: {keys[0]!r} is no index of a list of {len(node)}")
+        return [
+            _set(item, keys[1:], value, path) if i == int(keys[0]) else item for i, item in enumerate(node)
+        ]
+    if node is None:
+        node = {}
+    elif isinstance(node, str):
+        node = {"preset": node}
+    elif not isinstance(node, dict):
+        raise InputError(f"--set {path}: {keys[0]!r} lies inside the value {node!r}")
+    return {**node, keys[0]: _set(node.get(keys[0]), keys[1:], value, path)}
+
+
+def _read_with_includes(file: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
+    if file.resolve() in trail:
+        raise InputError(f"{file}: includes itself by way of {' > '.join(step.name for step in trail)}")
+    try:
+        raw = read_yaml(file)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    if not isinstance(raw, dict):
+        raise InputError(f"{file}: wanted a mapping of keys such as 'format' and 'robots'")
+    includes = raw.pop("include", [])
+    if not isinstance(includes, list) or not all(isinstance(name, str) for name in includes):
+        raise InputError(f"{file}: include: wanted a list of file names")
+    ground: dict[str, Any] = {}
+    for name in includes:
+        if not (file.parent / name).is_file():
+            raise InputError(f"{file}: include: there is no file {name!r} beside the scene")
+        ground = merge(ground, _read_with_includes(file.parent / name, (*trail, file.resolve())))
+    merged: dict[str, Any] = merge(ground, raw)
+    return merged
+
+
+def _build(raw: dict[str, Any], folder: Path, path: str) -> Scene:
+    try:
+        document = SceneDocument.model_validate(raw, context={"folder": folder})
+    except ValidationError as error:
+        raise InputError(*_explain(error, raw, path)) from None
+    scene = Scene(document, raw, folder, path)
+    problems = check(document)
+    if problems:
+        raise InputError(*[f"{path}: {problem}" for problem in problems])
+    return scene
+
+
+def _explain(error: ValidationError, raw: Any, path: str) -> Iterable[str]:
+    """Yield one line per problem: file, line, field, and what is wrong."""
+    lines = _line_numbers(path)
+    for problem in error.errors():
+        keys = _document_keys(problem["loc"], raw)
+        line = next(
+            (lines[tuple(keys[:n])] for n in range(len(keys), 0, -1) if tuple(keys[:n]) in lines), None
+        )
+        where = f"{path}:{line}" if line else path
+        message = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "missing":
+            message = "this key is missing"
+        elif problem["type"] in {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}:
+            message = f"{message[0].lower()}{message[1:]}, in SI units; not {problem['input']!r}"
+        yield f"{where}: {'.'.join(keys)}: {message}" if keys else f"{where}: {message}"
+
+
+def _document_keys(location: tuple[int | str, ...], raw: Any) -> list[str]:
+    """Return a problem's place as keys of the document, without the tags of unions (`rectangle`, …)."""
+    keys: list[str] = []
+    node = raw
+    for part in location:
+        tag = isinstance(node, Mapping) and part not in node and node.get("type") == part
+        if tag:
+            continue
+        keys.append(str(part))
+        if isinstance(node, Mapping):
+            node = node.get(part)
+        elif isinstance(node, list) and isinstance(part, int) and part < len(node):
+            node = node[part]
+        else:
+            node = None
+    return keys
+
+
+def _line_numbers(path: str) -> dict[tuple[str, ...], int]:
+    """Return the line of each key of a YAML file, by its path of keys."""
+    lines: dict[tuple[str, ...], int] = {}
+
+    def walk(node: yaml.Node, keys: tuple[str, ...]) -> None:
+        if isinstance(node, yaml.MappingNode):
+            for key, value in node.value:
+                lines[(*keys, key.value)] = key.start_mark.line + 1
+                walk(value, (*keys, key.value))
+        elif isinstance(node, yaml.SequenceNode):
+            for index, value in enumerate(node.value):
+                lines[(*keys, str(index))] = value.start_mark.line + 1
+                walk(value, (*keys, str(index)))
+
+    root = yaml.compose(Path(path).read_text(encoding="utf-8"), yaml.SafeLoader)
+    if root is not None:
+        walk(root, ())
+    return lines

@@ -1,0 +1,169 @@
+"""Models of the surroundings: shapes, their materials at 940 nm, lamps."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
+
+from nir_render.scene.base import RGB_REFUSED, Document, PresetDocument, resolve_file
+from nir_render.scene.devices import NotNegative, Orientation, Positive
+from nir_render.scene.units import (
+    Angle,
+    Fraction,
+    Length,
+    LuminousFlux,
+    Position,
+    Size2,
+    Size3,
+    Temperature,
+)
+
+
+def _refuse_rgb(value: Any) -> Any:
+    looks_rgb = isinstance(value, list | tuple) or (
+        isinstance(value, str) and value.strip().startswith(("#", "[", "rgb"))
+    )
+    if looks_rgb:
+        raise ValueError(f"{value!r}: {RGB_REFUSED}")
+    return value
+
+
+Reflectance = Annotated[Fraction, BeforeValidator(_refuse_rgb), Field(ge=0, le=1)]
+Direction = tuple[float, float, float]
+
+
+class Diffuse(Document):
+    """Lambertian: reflects the share `reflectance` evenly."""
+
+    type: Literal["diffuse"]
+    reflectance: Reflectance
+
+
+class RoughConductor(Document):
+    """Rough metal: GGX microfacets of width `roughness` with the complex index n + ik at 940 nm."""
+
+    type: Literal["rough_conductor"]
+    index: Annotated[float, Positive]
+    extinction_index: Annotated[float, NotNegative]
+    roughness: Annotated[float, Field(gt=0, le=1)]
+
+
+class Mirror(Document):
+    """A smooth mirror of the same reflectance at every angle."""
+
+    type: Literal["mirror"]
+    reflectance: Reflectance
+
+
+class Dielectric(Document):
+    """A smooth transparent solid of refractive index `index`."""
+
+    type: Literal["dielectric"]
+    index: Annotated[float, Field(ge=1)]
+
+
+class Plastic(Document):
+    """A diffuse ground of `reflectance` under a rough clear coat of refractive index `index`."""
+
+    type: Literal["plastic"]
+    index: Annotated[float, Field(ge=1)]
+    reflectance: Reflectance
+    roughness: Annotated[float, Field(ge=0, le=1)]
+
+
+MaterialDocument = Annotated[
+    Diffuse | RoughConductor | Mirror | Dielectric | Plastic, Field(discriminator="type")
+]
+
+
+class _Shape(Document):
+    """What all shapes have: the name of a material of the scene, or of a preset."""
+
+    material: str
+
+
+def _positive(size: tuple[float, ...]) -> tuple[float, ...]:
+    if min(size) <= 0:
+        raise ValueError("each extent must be greater than 0")
+    return size
+
+
+def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(vector):
+        raise ValueError("a direction must not be [0, 0, 0]")
+    return vector
+
+
+class Rectangle(_Shape):
+    """A flat rectangle that faces along `normal`; both sides are of its material.
+
+    `size` is width × height: width runs horizontally (along world x where the normal is vertical), turned
+    about the normal by `rotation`.
+    """
+
+    type: Literal["rectangle"]
+    center_m: Position
+    size_m: Annotated[Size2, AfterValidator(_positive)]
+    normal: Direction = (0.0, 0.0, 1.0)
+    rotation_rad: Angle = 0.0
+
+    _direction = field_validator("normal")(_not_zero)
+
+
+class Box(_Shape):
+    """A closed box; `size` is its extent along its own x, y and z."""
+
+    type: Literal["box"]
+    center_m: Position
+    size_m: Annotated[Size3, AfterValidator(_positive)]
+    orientation: Orientation = Orientation()
+
+
+class Sphere(_Shape):
+    """A closed sphere."""
+
+    type: Literal["sphere"]
+    center_m: Position
+    radius_m: Annotated[Length, Positive]
+
+
+class Cylinder(_Shape):
+    """A closed cylinder between the centres of its two ends."""
+
+    type: Literal["cylinder"]
+    start_m: Position
+    end_m: Position
+    radius_m: Annotated[Length, Positive]
+
+
+class Mesh(_Shape):
+    """A triangle mesh from a PLY or OBJ file in metres, scaled, turned and moved."""
+
+    type: Literal["mesh"]
+    file: str
+    scale: Annotated[float, Positive] = 1.0
+    position_m: Position = (0.0, 0.0, 0.0)
+    orientation: Orientation = Orientation()
+
+    @field_validator("file")
+    @classmethod
+    def _find(cls, name: str, info: ValidationInfo) -> str:
+        if not name.lower().endswith((".ply", ".obj")):
+            raise ValueError(f"{name!r} is neither a .ply nor an .obj file")
+        return str(resolve_file(name, info))
+
+
+ShapeDocument = Annotated[Rectangle | Box | Sphere | Cylinder | Mesh, Field(discriminator="type")]
+
+
+class Lamp(PresetDocument):
+    """A rectangular lamp that shines along `normal`, an incandescent body of `temperature`."""
+
+    preset_folder: ClassVar[str] = "lamps"
+
+    center_m: Position
+    size_m: Annotated[Size2, AfterValidator(_positive)]
+    normal: Direction = (0.0, 0.0, -1.0)
+    luminous_flux_lm: Annotated[LuminousFlux, Positive]
+    temperature_k: Annotated[Temperature, Positive]
+
+    _direction = field_validator("normal")(_not_zero)

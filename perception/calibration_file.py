@@ -1,0 +1,165 @@
+"""`calibration.json`: all that perception may know about the cameras of a recording.
+
+{"format": 1, "cameras": {name: {...}}}. Fields are named as in `Calibration`, but for the pose, which stands
+as `quaternion_body_camera_xyzw` and `position_body_m`. An entry whose standard deviation is known is written
+as {"value": v, "sigma": s}; that of the quaternion is an angle in radians.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from perception.json_fields import Place, as_number, check_format, get, integer, number, numbers
+from perception.types import Calibration
+
+_WHOLE = ("width_px", "height_px", "saturation_dn", "bit_depth")
+_POSITIVE = ("fx_px", "fy_px", "system_gain_dn_per_e", "psf_sigma_px", "wavelength_m")
+_REAL = (
+    "cx_px",
+    "cy_px",
+    "read_noise_e",
+    "black_level_dn",
+    "range_constant_dn_m2_per_s",
+    "range_constant_paper_dn_m2_per_s",
+    "source_radius_m",
+)
+_QUATERNION = "quaternion_body_camera_xyzw"
+_LISTS = (_QUATERNION, "position_body_m", "response_angle_rad", "response_relative")
+
+
+def calibration_document(calibrations: Iterable[Calibration]) -> dict[str, Any]:
+    """Make the content of `calibration.json`.
+
+    Parameters
+    ----------
+    calibrations
+        One per camera.
+
+    Returns
+    -------
+    A JSON object. Parsed again, it gives the same calibrations: numbers bit by bit, the rotation to within
+    rounding (it passes through a quaternion).
+
+    Raises
+    ------
+    ValueError
+        If two have the same camera, a sigma names no entry, or a rotation is none.
+    """
+    cameras: dict[str, Any] = {}
+    for calibration in calibrations:
+        if calibration.camera in cameras:
+            raise ValueError(f"two calibrations of camera {calibration.camera!r}")
+        cameras[calibration.camera] = _camera_record(calibration)
+    return {"format": 1, "cameras": cameras}
+
+
+def _camera_record(calibration: Calibration) -> dict[str, Any]:
+    matrix = np.asarray(calibration.rotation_body_camera, dtype=np.float64)
+    if matrix.shape != (3, 3) or not (
+        np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0.0
+    ):
+        raise ValueError(f"rotation_body_camera of {calibration.camera!r} is no rotation matrix")
+    record: dict[str, Any] = {name: getattr(calibration, name) for name in (*_WHOLE, *_POSITIVE, *_REAL)}
+    record[_QUATERNION] = Rotation.from_matrix(matrix).as_quat(canonical=True).tolist()
+    for name in ("position_body_m", "response_angle_rad", "response_relative"):
+        record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
+    for field, sigma in calibration.sigma.items():
+        name = _QUATERNION if field == "rotation_body_camera" else field
+        if name not in record:
+            raise ValueError(f"sigma of {field!r}, which is no entry of a calibration")
+        record[name] = {"value": record[name], "sigma": float(sigma)}
+    return record
+
+
+def parse_calibration_document(
+    document: Mapping[str, Any], file: str = "calibration.json"
+) -> dict[str, Calibration]:
+    """Read the content of `calibration.json`.
+
+    Parameters
+    ----------
+    document
+        The JSON object.
+    file
+        Its name, for error texts.
+
+    Returns
+    -------
+    Calibrations by the camera's name.
+
+    Raises
+    ------
+    RecordingError
+        If a field is missing, of the wrong type, or contradicts another.
+    """
+    place = Place(file)
+    check_format(document, place)
+    cameras = get(document, "cameras", place)
+    if not isinstance(cameras, dict):
+        raise place.error(f"is {cameras!r}", "Write an object of cameras by name", "cameras")
+    return {name: _calibration(name, cameras[name], place.within(f"cameras.{name}")) for name in cameras}
+
+
+def _calibration(name: str, record: Any, place: Place) -> Calibration:
+    if not isinstance(record, dict):
+        raise place.error(f"is {record!r}", "Write an object with the entries of one camera")
+    values, sigma = _split_sigmas(record, place)
+    quaternion = np.array(numbers(values, _QUATERNION, place, 4))
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > 1e-6:
+        raise place.error(f"has length {length:.9g}", "Write a unit quaternion x, y, z, w", _QUATERNION)
+    angles = np.array(numbers(values, "response_angle_rad", place))
+    if angles[0] != 0.0 or np.any(np.diff(angles) <= 0.0):
+        raise place.error("does not increase from 0", "Sort the angles, the first is 0", "response_angle_rad")
+    response = np.array(numbers(values, "response_relative", place, len(angles)))
+    for field in ("read_noise_e", "source_radius_m"):
+        if number(values, field, place) < 0.0:
+            raise place.error(f"is {values[field]!r}", "Write a number, 0 or more", field)
+
+    def whole(field: str) -> int:
+        return integer(values, field, place)
+
+    def real(field: str) -> float:
+        return number(values, field, place, positive=field in _POSITIVE)
+
+    return Calibration(
+        camera=name,
+        width_px=whole("width_px"),
+        height_px=whole("height_px"),
+        fx_px=real("fx_px"),
+        fy_px=real("fy_px"),
+        cx_px=real("cx_px"),
+        cy_px=real("cy_px"),
+        rotation_body_camera=Rotation.from_quat(quaternion).as_matrix(),
+        position_body_m=np.array(numbers(values, "position_body_m", place, 3)),
+        system_gain_dn_per_e=real("system_gain_dn_per_e"),
+        read_noise_e=real("read_noise_e"),
+        black_level_dn=real("black_level_dn"),
+        saturation_dn=whole("saturation_dn"),
+        bit_depth=whole("bit_depth"),
+        psf_sigma_px=real("psf_sigma_px"),
+        response_angle_rad=angles,
+        response_relative=response,
+        range_constant_dn_m2_per_s=real("range_constant_dn_m2_per_s"),
+        range_constant_paper_dn_m2_per_s=real("range_constant_paper_dn_m2_per_s"),
+        source_radius_m=real("source_radius_m"),
+        wavelength_m=real("wavelength_m"),
+        sigma=sigma,
+    )
+
+
+def _split_sigmas(record: Mapping[str, Any], place: Place) -> tuple[dict[str, Any], dict[str, float]]:
+    """Take {"value": v, "sigma": s} apart."""
+    values, sigma = dict(record), {}
+    for name in (*_WHOLE, *_POSITIVE, *_REAL, *_LISTS):
+        entry = record.get(name)
+        if not isinstance(entry, dict):
+            continue
+        values[name] = get(entry, "value", place.within(name))
+        field = "rotation_body_camera" if name == _QUATERNION else name
+        sigma[field] = as_number(get(entry, "sigma", place.within(name)), "sigma", place.within(name))
+        if sigma[field] < 0.0:
+            raise place.within(name).error(f"is {sigma[field]!r}", "Write a number, 0 or more", "sigma")
+    return values, sigma

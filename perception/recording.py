@@ -1,0 +1,196 @@
+"""Recorded frames: `frames.jsonl`, one JSON object per frame, beside raw 16-bit PNG files.
+
+This module only encodes and parses; what writes files to disk safely lives elsewhere.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.calibration_file import parse_calibration_document
+from perception.json_fields import (
+    Place,
+    check_format,
+    integer,
+    number,
+    parse_object,
+    read_text,
+    text,
+)
+from perception.types import Calibration, RawFrame
+
+FRAMES_FILE = "frames.jsonl"
+CALIBRATION_FILE = "calibration.json"
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One line of `frames.jsonl`: a frame without its pixels; `file` counts from the recording's folder."""
+
+    camera: str
+    index: int
+    time_s: float
+    exposure_s: float
+    line_time_s: float
+    gain: float
+    black_level_dn: float
+    file: str
+
+
+def frame_record(frame: RawFrame, file: str) -> dict[str, Any]:
+    """Describe a frame as the JSON object of its line in `frames.jsonl`.
+
+    Parameters
+    ----------
+    frame
+        The frame.
+    file
+        Where its PNG lies, relative to the recording's folder, with forward slashes.
+    """
+    return {
+        "format": 1,
+        "camera": frame.camera,
+        "index": frame.index,
+        "time_s": frame.time_s,
+        "exposure_s": frame.exposure_s,
+        "line_time_s": frame.line_time_s,
+        "gain": frame.gain,
+        "black_level_dn": frame.black_level_dn,
+        "file": file,
+    }
+
+
+def parse_frame_record(
+    record: Mapping[str, Any], file: str = FRAMES_FILE, line: int | None = None
+) -> FrameRecord:
+    """Read one object of `frames.jsonl`.
+
+    Parameters
+    ----------
+    record
+        The object.
+    file, line
+        Where it stands, for error texts.
+
+    Raises
+    ------
+    RecordingError
+        If a field is missing or of the wrong type, or the file leaves the recording's folder.
+    """
+    place = Place(file, line)
+    check_format(record, place)
+    png = text(record, "file", place)
+    if PurePosixPath(png).is_absolute() or ".." in PurePosixPath(png).parts or "\\" in png or ":" in png:
+        raise place.error(
+            f"is {png!r}", "Write a path within the recording's folder, with forward slashes", "file"
+        )
+    return FrameRecord(
+        camera=text(record, "camera", place),
+        index=integer(record, "index", place),
+        time_s=number(record, "time_s", place),
+        exposure_s=number(record, "exposure_s", place, positive=True),
+        line_time_s=number(record, "line_time_s", place),
+        gain=number(record, "gain", place, positive=True),
+        black_level_dn=number(record, "black_level_dn", place),
+        file=png,
+    )
+
+
+def read_frames(folder: str | Path) -> Iterator[RawFrame]:
+    """Read the frames of a recording, one by one, in the order of `frames.jsonl`.
+
+    Parameters
+    ----------
+    folder
+        A folder with `frames.jsonl` and the PNG files that it names.
+
+    Returns
+    -------
+    Iterator of RawFrame
+        A PNG is opened when its frame is asked for. Empty lines are passed over.
+
+    Raises
+    ------
+    RecordingError
+        At once if `frames.jsonl` is missing; at its frame for a broken line or PNG.
+    """
+    folder = Path(folder)
+    return _frames(folder, read_text(folder / FRAMES_FILE))
+
+
+def _frames(folder: Path, lines: str) -> Iterator[RawFrame]:
+    file = str(folder / FRAMES_FILE)
+    for line, content in enumerate(lines.splitlines(), start=1):
+        if not content.strip():
+            continue
+        place = Place(file, line)
+        record = parse_frame_record(parse_object(content, place), file, line)
+        yield RawFrame(
+            camera=record.camera,
+            index=record.index,
+            time_s=record.time_s,
+            exposure_s=record.exposure_s,
+            data_dn=_read_png16(folder / record.file, place),
+            black_level_dn=record.black_level_dn,
+            line_time_s=record.line_time_s,
+            gain=record.gain,
+        )
+
+
+def read_calibrations(folder: str | Path) -> dict[str, Calibration]:
+    """Read the calibration of every camera of a recording, by the camera's name.
+
+    Raises
+    ------
+    RecordingError
+        If `calibration.json` is missing or broken.
+    """
+    path = Path(folder) / CALIBRATION_FILE
+    return parse_calibration_document(parse_object(read_text(path), Place(str(path))), str(path))
+
+
+def encode_png16(data_dn: NDArray[np.uint16]) -> bytes:
+    """Encode counts as a 16-bit grey PNG, as they are: no scaling, no gamma.
+
+    Raises
+    ------
+    ValueError
+        If the counts are not uint16 of shape (rows, columns).
+    """
+    if data_dn.dtype != np.uint16 or data_dn.ndim != 2 or data_dn.size == 0:
+        raise ValueError(
+            f"raw counts are uint16 of shape (rows, columns), not {data_dn.dtype} of shape {data_dn.shape}"
+        )
+    done, buffer = cv2.imencode(".png", data_dn)
+    if not done:
+        raise RuntimeError("OpenCV could not encode the frame as PNG")
+    return buffer.tobytes()
+
+
+def _read_png16(path: Path, place: Place) -> NDArray[np.uint16]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise place.error(
+            f"the picture {path} cannot be read ({error.strerror})",
+            "Put the PNG there, or remove the line",
+            "file",
+        ) from error
+    mend = "Record raw counts as 16-bit grey PNG"
+    # OpenCV writes to standard error about what it cannot decode; the signature is told here instead.
+    if not content.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise place.error(f"{path} is no PNG", mend, "file")
+    image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise place.error(f"{path} is a damaged PNG", mend, "file")
+    if image.dtype != np.uint16 or image.ndim != 2:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise place.error(
+            f"{path} holds {image.dtype} with {channels} channel(s), not 16-bit grey", mend, "file"
+        )
+    return np.asarray(image, dtype=np.uint16)

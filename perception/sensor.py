@@ -1,0 +1,65 @@
+"""From counts to electrons, and what the sensor adds on the way (EMVA 1288 linear model)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.types import Calibration, RawFrame
+
+
+def check_frame(frame: RawFrame, calibration: Calibration) -> None:
+    """Refuse a frame that the calibration does not describe.
+
+    Raises
+    ------
+    ValueError
+        If the camera's name, the shape or the type of the counts differ, or if exposure or gain are not
+        positive.
+    """
+    where = f"frame {frame.index} of camera {frame.camera!r}"
+    if frame.camera != calibration.camera:
+        raise ValueError(f"{where} came with the calibration of camera {calibration.camera!r}")
+    if frame.data_dn.dtype != np.uint16:
+        raise ValueError(f"{where} holds {frame.data_dn.dtype} counts; raw counts are uint16")
+    expected = (calibration.height_px, calibration.width_px)
+    if frame.data_dn.shape != expected:
+        raise ValueError(
+            f"{where} has shape {frame.data_dn.shape}, its calibration says (rows, columns) = {expected}"
+        )
+    if not (frame.exposure_s > 0.0 and frame.gain > 0.0):
+        raise ValueError(
+            f"{where} has exposure_s = {frame.exposure_s} and gain = {frame.gain}; both must be positive"
+        )
+
+
+def gain_dn_per_e(frame: RawFrame, calibration: Calibration) -> float:
+    """System gain at which the frame was taken, in counts per electron."""
+    return calibration.system_gain_dn_per_e * frame.gain
+
+
+def electrons(frame: RawFrame, calibration: Calibration) -> NDArray[np.float32]:
+    """Turn counts above black level into electrons; float32, same shape as the frame."""
+    scale = 1.0 / gain_dn_per_e(frame, calibration)
+    image = frame.data_dn.astype(np.float32)
+    image -= np.float32(frame.black_level_dn)
+    image *= np.float32(scale)
+    return image
+
+
+def noise_floor_e2(calibration: Calibration, gain: float = 1.0) -> float:
+    """Variance of a dark pixel, in electrons squared: read noise and rounding to whole counts.
+
+    σ_d² + 1 / (12 K²), EMVA 1288 release 4.0 (linear model), K the system gain in DN/e.
+
+    Parameters
+    ----------
+    calibration
+        Read noise and system gain.
+    gain
+        Factor on the calibrated system gain.
+    """
+    return calibration.read_noise_e**2 + 1.0 / (12.0 * (calibration.system_gain_dn_per_e * gain) ** 2)
+
+
+def clip_level_e(calibration: Calibration, black_level_dn: float, gain: float = 1.0) -> float:
+    """Electrons at which a pixel reaches `saturation_dn`."""
+    return (calibration.saturation_dn - black_level_dn) / (calibration.system_gain_dn_per_e * gain)

@@ -1,0 +1,32 @@
+"""Scenes for the physics tests: one observer r1, one source r2, changed at dotted paths."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nir_render import Scene, load_scene
+
+SceneMaker = Callable[[Mapping[str, Any]], Scene]
+
+
+@pytest.fixture
+def scene_with() -> SceneMaker:
+    """Make the one-source scene, changed."""
+    base = load_scene(Path(__file__).parents[2] / "scenes" / "one_source.yaml")
+    still = base.with_({"robots.r2": {"rig": "infra_swarm"}, "clock.frames": 1})
+
+    def make(changes: Mapping[str, Any]) -> Scene:
+        return still.with_(changes)
+
+    return make
+
+
+def source_at(range_m: float, angle_deg: float = 0.0) -> dict[str, Any]:
+    """Place the source of r2 at a range and field angle (to the right, level) before the front camera of r1."""
+    angle = np.radians(angle_deg)
+    # The front camera sits at (0.06, 0, 0.2) m, the source 0.28 m above its robot's origin.
+    x, y, z = 0.06 + range_m * float(np.cos(angle)), -range_m * float(np.sin(angle)), 0.2 - 0.28
+    return {"robots.r2.position": f"[{x!r}, {y!r}, {z!r}] m"}

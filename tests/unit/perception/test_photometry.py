@@ -1,0 +1,172 @@
+import math
+
+import numpy as np
+import pytest
+
+from perception.flare_model import Window, flare_image
+from perception.limits import flare_limit
+from perception.photometry import aperture_flux, core_goodness, fit_flare, grey_levels_paper
+from perception.ranging import angular_radius_rad
+from perception.sensor import noise_floor_e2
+from tests.unit.perception.simulation import calibration, random
+
+TRIALS = 400
+
+
+def test_paper_grey_levels() -> None:
+    """A blob of 2 × 2, a neighbour in the ring that must not count, and clipped pixels that do."""
+    data = np.full((30, 30), 70, dtype=np.uint16)
+    data[10:12, 10:12] = [[4095, 1000], [1000, 905]]
+    data[10, 15] = 4000  # in the ring, but lit itself
+    data[12, 12] = 500  # within the gap
+    data[9:13, 6] = 90  # in the ring: 4 of its pixels
+    lit = data > 600
+    levels = grey_levels_paper(data, np.ones((2, 2), dtype=bool), lit, Window(10, 10, 2, 2))
+    assert levels.mean_dn == 1750.0
+    ring = 12 * 12 - 6 * 6 - 1
+    assert levels.background_dn == pytest.approx(70.0 + 4 * 20.0 / ring, rel=1e-12)
+
+
+def test_paper_background_of_a_blob_that_fills_the_frame() -> None:
+    data = np.full((2, 2), 70, dtype=np.uint16)
+    levels = grey_levels_paper(data, np.ones((2, 2), bool), np.ones((2, 2), bool), Window(0, 0, 2, 2))
+    assert math.isnan(levels.background_dn)
+
+
+def test_aperture_counts_all_of_a_noiseless_flare() -> None:
+    camera = calibration()
+    window = Window.around(300.3, 400.6, 20.0, camera)
+    image = 5e4 * flare_image(300.3, 400.6, 0.002, window, camera).fraction + 7.0
+    measured = aperture_flux(image, 300.3 - window.left, 400.6 - window.top, 6.0, 8.0, 14.0)
+    assert measured.flux == pytest.approx(5e4, rel=1e-5)
+    assert measured.background == pytest.approx(7.0, abs=1e-6)
+    assert measured.flux_sigma == pytest.approx(math.sqrt(5e4), rel=1e-3)
+
+
+def test_aperture_sigma_is_that_of_repeated_measurements() -> None:
+    rng = random(11)
+    camera = calibration()
+    window = Window(380, 280, 41, 41)
+    mean = 3e3 * flare_image(300.0, 400.0, 0.0, window, camera).fraction + 30.0
+    found = [
+        aperture_flux(rng.poisson(mean) + rng.normal(0, 10.0, mean.shape), 20.0, 20.0, 5.0, 6.0, 9.0)
+        for _ in range(TRIALS)
+    ]
+    scatter = np.std([f.flux for f in found], ddof=1)
+    assert scatter == pytest.approx(np.mean([f.flux_sigma for f in found]), rel=4 / math.sqrt(2 * TRIALS))
+
+
+def test_aperture_radii() -> None:
+    with pytest.raises(ValueError, match="ring_outer_px"):
+        aperture_flux(np.zeros((5, 5)), 2.0, 2.0, 3.0, 2.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("range_m", "flux_e", "background_e"), [(10.0, 1.9e4, 5.0), (10.0, 1.5e3, 0.2), (1.0, 3.4e5, 50.0)]
+)
+def test_fit_is_unbiased_and_efficient(range_m: float, flux_e: float, background_e: float) -> None:
+    """400 flares: mean within 4 standard errors of truth, scatter and claim within 4 of the bound.
+
+    The mean flux is so known to 0.03–0.3 %: a gain that is 1 % off would not pass (checked below).
+    """
+    camera = calibration()
+    rng = random(1, int(range_m), int(flux_e))
+    u_px, v_px = 900.3, 320.8
+    window = Window.around(u_px, v_px, 14.0, camera)
+    radius = angular_radius_rad(range_m, camera.source_radius_m)
+    mean = flux_e * flare_image(u_px, v_px, radius, window, camera).fraction + background_e
+    usable = np.ones(mean.shape, dtype=bool)
+    gain = camera.system_gain_dn_per_e
+    estimates, claims, chi2 = [], [], []
+    for _ in range(TRIALS):
+        electrons = rng.poisson(mean) + rng.normal(0.0, camera.read_noise_e, mean.shape)
+        counts = np.rint(electrons * gain + 64.0)
+        fit = fit_flare(
+            (counts - 64.0) / gain,
+            usable,
+            window,
+            camera,
+            start=(u_px + 0.4, v_px - 0.3, 0.7 * flux_e, 0.0),
+            angular_radius_rad=radius,
+        )
+        assert fit.converged
+        estimates.append([fit.u_px, fit.v_px, fit.flux_e, fit.background_e])
+        claims.append(np.sqrt(np.diagonal(fit.covariance)))
+        chi2.append(fit.reduced_chi2)
+    found = np.array(estimates)
+    scatter = found.std(axis=0, ddof=1)
+    error = np.abs(found.mean(axis=0) - [u_px, v_px, flux_e, background_e]) / (scatter / math.sqrt(TRIALS))
+    assert np.all(error < 4.0), error
+    assert 0.01 * flux_e > 8.0 * scatter[2] / math.sqrt(TRIALS), "1 % of gain would go unnoticed"
+
+    limit = flare_limit(camera, u_px, v_px, range_m, flux_e, background_e)
+    bound = np.array([limit.u_sigma_px, limit.v_sigma_px, limit.flux_sigma_e])
+    tolerance = 4.0 / math.sqrt(2 * TRIALS)
+    np.testing.assert_allclose(scatter[:3], bound, rtol=tolerance)
+    np.testing.assert_allclose(np.mean(claims, axis=0)[:3], bound, rtol=0.03)
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.02)
+
+
+def test_fit_of_unclipped_wings_is_unbiased() -> None:
+    """The peak is masked where the model comes within 3 σ of the clip level."""
+    camera = calibration()
+    rng = random(2)
+    window = Window.around(700.2, 500.4, 12.0, camera)
+    mean = 8e4 * flare_image(700.2, 500.4, 0.002, window, camera).fraction + 3.0
+    clip_e = (4095 - 64) / 0.74
+    usable = mean < clip_e - 3.0 * np.sqrt(mean + 100.0)
+    assert 4 < (~usable).sum() < 16
+    fits = []
+    for _ in range(200):
+        data = rng.poisson(mean) + rng.normal(0.0, 10.0, mean.shape)
+        fits.append(
+            fit_flare(
+                np.minimum(data, clip_e),
+                usable,
+                window,
+                camera,
+                start=(700.0, 500.0, 4e4, 0.0),
+                angular_radius_rad=0.002,
+            )
+        )
+    flux = np.array([fit.flux_e for fit in fits])
+    assert abs(flux.mean() - 8e4) < 4.0 * flux.std() / math.sqrt(flux.size)
+    assert flux.std(ddof=1) == pytest.approx(np.mean([f.flux_sigma_e for f in fits]), rel=0.2)
+
+
+def test_a_fit_that_nothing_determines() -> None:
+    camera = calibration()
+    window = Window(100, 100, 9, 9)
+    usable = np.zeros((9, 9), dtype=bool)
+    usable[4, 4:6] = True
+    fit = fit_flare(
+        np.full((9, 9), 5.0), usable, window, camera, start=(104.0, 104.0, 1e3, 0.0), angular_radius_rad=0.0
+    )
+    assert not fit.converged
+    assert np.isnan(fit.covariance).all()
+    with pytest.raises(ValueError, match="match"):
+        fit_flare(
+            np.zeros((3, 3)), usable, window, camera, start=(104.0, 104.0, 1.0, 0.0), angular_radius_rad=0.0
+        )
+
+
+def test_goodness_tells_two_flares_from_one() -> None:
+    camera = calibration()
+    rng = random(3)
+    window = Window.around(600.0, 400.0, 12.0, camera)
+    one = 2e4 * flare_image(600.0, 400.0, 0.001, window, camera).fraction
+    two = one + 1.5e4 * flare_image(601.6, 400.0, 0.001, window, camera).fraction
+    probabilities = []
+    for mean in (one, two):
+        data = rng.poisson(mean + 2.0) + rng.normal(0.0, 10.0, mean.shape)
+        fit = fit_flare(
+            data,
+            np.ones(mean.shape, dtype=bool),
+            window,
+            camera,
+            start=(600.5, 400.0, 2e4, 2.0),
+            angular_radius_rad=0.001,
+        )
+        probabilities.append(core_goodness(data, fit, noise_floor_e2(camera), 0.05).probability)
+    assert probabilities[0] > 1e-3
+    assert probabilities[1] < 1e-9

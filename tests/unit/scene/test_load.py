@@ -1,0 +1,209 @@
+"""Scene files: what they become, and what a careless user is told."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nir_render import InputError, Scene, load_scene
+
+SCENES = Path(__file__).parents[3] / "scenes"
+FRONT = "robots.r1.rig.cameras.front"
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene(SCENES / "one_source.yaml")
+
+
+def _wall(**changes: Any) -> dict[str, Any]:
+    return {"type": "rectangle", "center": "[3, 0, 0] m", "size": "[1, 1] m", "material": "black", **changes}
+
+
+BAD: list[tuple[Mapping[str, Any], str]] = [
+    ({f"{FRONT}.exposur": "1 ms"}, f"{FRONT}: unknown key 'exposur'; did you mean 'exposure'?"),
+    ({"clok": {}}, "'clok' is no part of a scene"),
+    ({f"{FRONT}.exposure": 3}, f"{FRONT}.exposure: 3 is a bare number; write it with its unit, such as '1.5 ms'"),
+    ({"robots.r1.position": "[1, 2, 3] kg"}, "robots.r1.position: '[1, 2, 3] kg' is a mass; wanted a length"),
+    ({"robots.r1.position": [1, 2, 3]}, "robots.r1.position: [1, 2, 3] is a vector without a unit"),
+    ({"robots.r2.rig.sources.top.flux": "-1 W"}, "robots.r2.rig.sources.top.flux: input should be greater than 0"),
+    ({"robots.r2.rig.sources.top.flux": "nan W"}, "'nan W' is not a finite number"),
+    ({"robots.r2.rig": "infra_swrm"}, "no preset 'infra_swrm' in rigs; did you mean 'infra_swarm'?"),
+    ({f"{FRONT}.sensor": "mine.yaml"}, f"{FRONT}.sensor: there is no file 'mine.yaml' beside the scene"),
+    ({"shapes.w": _wall(colour=[1, 0, 0])}, "shapes.w: 'colour': RGB colours have no meaning at 940 nm"),
+    ({"shapes.w": _wall(size="[-1, 1] m")}, "shapes.w.size: each extent must be greater than 0"),
+    ({"shapes.w": _wall(normal=[0, 0, 0])}, "shapes.w.normal: a direction must not be [0, 0, 0]"),
+    ({"shapes.w": _wall(material="blakc")}, "shapes.w.material: there is no material 'blakc'; known: black"),
+    ({"shapes.w": _wall(type="rectangel")}, "shapes.w"),
+    ({"materials.m": {"type": "diffuse", "reflectance": [0.8, 0.1, 0.1]}}, "RGB colours have no meaning at 940 nm"),
+    ({"materials.m": {"type": "diffuse", "reflectance": "#ff0000"}}, "RGB colours have no meaning at 940 nm"),
+    ({"materials.m": {"type": "diffuse", "reflectance": 1.2}}, "materials.m.reflectance: input should be less than"),
+    ({"shapes.m": {"type": "mesh", "file": "no.ply", "material": "black"}}, "there is no file 'no.ply'"),
+    ({"shapes.m": {"type": "mesh", "file": "no.stl", "material": "black"}}, "neither a .ply nor an .obj"),
+    ({f"{FRONT}.sensor.bit_depth": "17 bit"}, f"{FRONT}.sensor.bit_depth: input should be less than or equal to 16"),
+    ({f"{FRONT}.sensor.bit_depth": "10.5 bit"}, "10.5 is not a whole number of bits"),
+    ({f"{FRONT}.sensor.full_well": "-5 e"}, f"{FRONT}.sensor.full_well: input should be greater than 0"),
+    ({f"{FRONT}.sensor.quantum_efficiency": 1.5}, "a quantum efficiency is at most 1"),
+    ({f"{FRONT}.sensor.system_gain": "0.1 DN/e"}, "only to 614 of 4095 DN; check system_gain"),
+    ({f"{FRONT}.sensor.black_level": "5000 DN"}, "not below full scale"),
+    (
+        {f"{FRONT}.sensor.quantum_efficiency": {"points": [["400 nm", 0.5], ["900 nm", 0.1]]}},
+        "sensor.quantum_efficiency: covers 400 to 900 nm, but robots.r1.rig.sources.top.spectrum shines from 835",
+    ),
+    (
+        {"robots.r2.rig.sources.top.spectrum": {"points": [["840 nm", 1.0], ["860 nm", 1.0]]}},
+        "robots.r2.rig.sources.top.spectrum: covers 840 to 860 nm, not 940 nm",
+    ),
+    ({"robots.r2.rig.sources.top.spectrum": {"points": [["960 nm", 1], ["940 nm", 1]]}}, "increasing wavelength"),
+    ({"observe": ["r9"]}, "observe: there is no robot or camera 'r9'; known cameras: r1.front"),
+    ({"observe": []}, "observe"),
+    ({"robots.r1.motion": [{"time": "0 s", "position": "[0, 0, 0] m"}]}, "either 'position' and 'orientation', or"),
+    ({"clock.frames": 0}, "clock.frames: input should be greater than or equal to 1"),
+    ({"robots.r2.motion.7.time": "1 s"}, "'7' is no index of a list of 2"),
+    (
+        {"shapes.b": {"type": "box", "center": "[0, 0, 0.2] m", "size": "[0.2, 0.2, 0.2] m", "material": "black"}},
+        f"{FRONT}: the camera is inside shapes.b at 0 s, at [0.06, 0, 0.2] m",
+    ),
+    (
+        {"shapes.s": {"type": "sphere", "center": "[0.1, 0, 0.2] m", "radius": "0.05 m", "material": "black"}},
+        f"{FRONT}: the camera is inside shapes.s",
+    ),
+    (
+        {
+            "shapes.c": {
+                "type": "cylinder", "start": "[0.06, 0, 0] m", "end": "[0.06, 0, 1] m", "radius": "1 cm",
+                "material": "black",
+            }
+        },
+        f"{FRONT}: the camera is inside shapes.c",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "said"), BAD)
+def test_bad_input_is_named_with_its_place_and_a_fix(scene: Scene, changes: Mapping[str, Any], said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        scene.with_(changes)
+    assert said in str(caught.value)
+
+
+def _write(folder: Path, text: str) -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+GOOD = """format: 1
+observe: [a]
+robots:
+  a: {rig: infra_swarm}
+"""
+
+
+def test_errors_name_file_and_line(tmp_path: Path) -> None:
+    path = _write(tmp_path, GOOD.replace("{rig: infra_swarm}", "{rig: infra_swarm, position: 3}"))
+    with pytest.raises(InputError, match=r"scene\.yaml:4: robots\.a\.position: 3 is not a vector"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("format: 1\nformat: 1\n", "line 2: key 'format' stands twice"),
+        ("a: [1,\n", "scene.yaml"),
+        ("- 1\n", "wanted a mapping"),
+        ("", "wanted a mapping"),
+        (GOOD.replace("format: 1", "format: 2"), "format"),
+        ("include: [nowhere.yaml]\n" + GOOD, "there is no file 'nowhere.yaml'"),
+        ("include: [scene.yaml]\n" + GOOD, "includes itself"),
+        ("include: scene.yaml\n" + GOOD, "wanted a list of file names"),
+        (GOOD.replace("observe: [a]\n", ""), "observe: this key is missing"),
+    ],
+)
+def test_broken_files_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_scene(_write(tmp_path, text))
+    assert said in str(caught.value)
+
+
+def test_a_missing_scene_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no such scene file"):
+        load_scene(tmp_path / "nowhere.yaml")
+
+
+def test_includes_lie_under_the_file_that_includes_them(tmp_path: Path) -> None:
+    (tmp_path / "ground.yaml").write_text(GOOD + "name: ground\nseed: 5\n", encoding="utf-8")
+    scene = load_scene(_write(tmp_path, "include: [ground.yaml]\nname: over\nrobots: {a: {position: '[1, 0, 0] m'}}\n"))
+    assert (scene.document.name, scene.document.seed) == ("over", 5)
+    assert scene.document.robots["a"].position_m == (1.0, 0.0, 0.0)
+    assert list(scene.document.robots["a"].rig.cameras) == ["front", "left", "back", "right"]
+
+
+def test_presets_and_curves_may_be_files_beside_the_scene(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("{preset: mt9m031, read_noise: 3 e, quantum_efficiency: {file: qe.csv}}")
+    (tmp_path / "qe.csv").write_text("wavelength_nm,value\n800,0.3\n940,0.1\n1100,0.02\n")
+    text = GOOD.replace("{rig: infra_swarm}", "{rig: {preset: infra_swarm, cameras: {front: {sensor: mine.yaml}}}}")
+    sensor = load_scene(_write(tmp_path, text)).document.robots["a"].rig.cameras["front"].sensor
+    assert sensor.read_noise_e == 3.0
+    assert sensor.full_well_e == 5500.0
+    assert np.array(sensor.quantum_efficiency.points) == pytest.approx(
+        np.array([[800e-9, 0.3], [940e-9, 0.1], [1100e-9, 0.02]])
+    )
+
+
+def test_an_override_inside_a_preset_changes_that_part_only(scene: Scene) -> None:
+    changed = scene.with_({f"{FRONT}.sensor.read_noise": "5 e"})
+    cameras = changed.document.robots["r1"].rig.cameras
+    assert cameras["front"].sensor.read_noise_e == 5.0
+    assert cameras["front"].sensor.full_well_e == 5500.0
+    assert cameras["left"].sensor.read_noise_e == 10.0
+    assert scene.document.robots["r1"].rig.cameras["front"].sensor.read_noise_e == 10.0
+
+
+def test_the_resolved_document_loads_to_the_same_scene(scene: Scene, tmp_path: Path) -> None:
+    changed = scene.with_({"shapes.w": _wall(), "materials.m": {"type": "mirror", "reflectance": "90 %"}})
+    again = load_scene(_write(tmp_path, changed.resolved_yaml()))
+    assert again.document == changed.document
+    assert again.resolved_yaml() == changed.resolved_yaml()
+
+
+def test_the_world_of_the_models(scene: Scene) -> None:
+    """All bodies, materials and lamps of a scene file load, and keep their figures in SI units."""
+    changed = scene.with_(
+        {
+            "materials": {
+                "paint": {"type": "diffuse", "reflectance": 0.8},
+                "steel": {"type": "rough_conductor", "index": 2.9, "extinction_index": 3.3, "roughness": 0.1},
+                "glass": {"type": "dielectric", "index": 1.51},
+                "floor": {"type": "plastic", "index": 1.5, "reflectance": 0.3, "roughness": 0.2},
+                "silver": {"type": "mirror", "reflectance": 0.95},
+            },
+            "shapes": {
+                "wall": _wall(material="paint"),
+                "box": {"type": "box", "center": "[5, 0, 0] m", "size": "[10, 10, 10] cm", "material": "steel"},
+                "ball": {"type": "sphere", "center": "[5, 1, 0] m", "radius": "5 cm", "material": "glass"},
+                "pole": {
+                    "type": "cylinder", "start": "[5, 2, 0] m", "end": "[5, 2, 1] m", "radius": "5 cm",
+                    "material": "silver",
+                },
+                "ground": _wall(material="floor", center="[0, 0, -1] m"),
+            },
+            "lamps": {
+                "one": {
+                    "center": "[0, 0, 3] m", "size": "[60, 60] cm", "luminous_flux": "4000 lm", "temperature": "2856 K",
+                }
+            },
+        }
+    )  # fmt: skip
+    assert changed.document.lamps["one"].size_m == pytest.approx((0.6, 0.6))
+    assert changed.document.shapes["box"].material == "steel"
+
+
+def test_cameras_are_selected_by_robot_or_by_name(scene: Scene) -> None:
+    assert scene.cameras() == ["r1.front"]
+    assert scene.with_({"observe": ["r1", "r1.front", "r2.back"]}).cameras() == [
+        "r1.front", "r1.left", "r1.back", "r1.right", "r2.back",
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="there is no camera 'r1.fornt'; known: r1.front"):
+        scene.camera("r1.fornt")

@@ -1,0 +1,50 @@
+"""The JSON Schema in the repository is the one that the models make, and the scenes hold by it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from jsonschema import Draft202012Validator
+from nir_render.scene.schema import scene_schema
+
+SCENES = Path(__file__).parents[3] / "scenes"
+
+
+@pytest.fixture(scope="module")
+def validator() -> Draft202012Validator:
+    schema = scene_schema()
+    Draft202012Validator.check_schema(schema)
+    return Draft202012Validator(schema)
+
+
+def test_the_schema_in_the_repository_is_current() -> None:
+    kept = json.loads((SCENES / "scene.schema.json").read_text(encoding="utf-8"))
+    assert kept == scene_schema(), "run: nir-render schema > scenes/scene.schema.json"
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.name)
+def test_scenes_name_the_schema_and_hold_by_it(path: Path, validator: Draft202012Validator) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.startswith("# yaml-language-server: $schema=scene.schema.json\n")
+    validator.validate(yaml.safe_load(text))
+
+
+def _scene(camera: Any) -> dict[str, Any]:
+    return {"format": 1, "observe": ["a"], "robots": {"a": {"rig": {"cameras": {"c": camera}}}}}
+
+
+@pytest.mark.parametrize(
+    ("camera", "holds"),
+    [
+        ("infra_swarm", True),
+        ({"preset": "infra_swarm", "exposure": "1 ms"}, True),
+        ({"preset": "infra_swarm", "exposure": 1}, False),
+        ({"preset": "infra_swarm", "exposur": "1 ms"}, False),
+        ({"exposure": "1 ms"}, False),
+        ({"preset": "infra_swarm", "sensor": {"preset": "mt9m031", "quantum_efficiency": 0.2}}, True),
+    ],
+)
+def test_the_schema_takes_what_the_loader_takes(camera: Any, holds: bool, validator: Draft202012Validator) -> None:
+    assert validator.is_valid(_scene(camera)) is holds
