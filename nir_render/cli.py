@@ -219,9 +219,12 @@ def _yaml_value(text: str) -> Any:
 
 
 def _estimators(names: list[str] | None) -> list[str]:
-    from perception.pipeline import ESTIMATORS
+    from nir_render.run import check_estimators
+    from perception import ESTIMATORS
 
-    return list(dict.fromkeys(names)) if names else list(ESTIMATORS)
+    chosen = list(dict.fromkeys(names)) if names else list(ESTIMATORS)
+    check_estimators(chosen)
+    return chosen
 
 
 def _show_evaluation(result: Any, folder: Path, as_json: bool) -> None:

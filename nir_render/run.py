@@ -14,18 +14,21 @@ from nir_render.evaluate.truth import parse_truth
 from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene
 from nir_render.simulate import simulate
-from perception.pipeline import ESTIMATORS, detect
-from perception.recording import (
+from perception import (
+    ESTIMATORS,
+    Detection,
     RecordingError,
     calibration_document,
+    detect,
     detection_record,
     encode_png16,
     frame_record,
     parse_detection,
     read_calibrations,
+    read_frame,
+    read_frame_records,
     read_frames,
 )
-from perception.types import Detection
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done, and of all."""
@@ -64,7 +67,7 @@ def render_run(scene: Scene, folder: Path, *, seed: int, overwrite: bool, progre
             progress(done + 1, total)
         run_folder.write_lines(aside / "frames.jsonl", records)
         run_folder.write_lines(aside / "truth.jsonl", truth)
-        run_folder.write_json(aside / "calibration.json", calibration_document(calibrations))
+        run_folder.write_json(aside / "calibration.json", calibration_document(calibrations.values()))
         run_folder.write_file(aside / "scene.yaml", scene.resolved_yaml().encode())
         seconds = time.perf_counter() - started
         facts = {
@@ -81,6 +84,13 @@ def render_run(scene: Scene, folder: Path, *, seed: int, overwrite: bool, progre
     return Rendered(total, seconds)
 
 
+def check_estimators(names: Sequence[str]) -> None:
+    """Raise InputError where an estimator is unknown."""
+    for name in names:
+        if name not in ESTIMATORS:
+            raise InputError(f"--estimator {name}: unknown; known: {', '.join(ESTIMATORS)}")
+
+
 def perceive_run(folder: Path, *, estimators: Sequence[str], progress: Progress) -> dict[str, int]:
     """Run the perception stack over the frames of a folder; returns the number of detections by estimator.
 
@@ -89,9 +99,7 @@ def perceive_run(folder: Path, *, estimators: Sequence[str], progress: Progress)
     InputError
         The folder is no recording, or an estimator is unknown.
     """
-    unknown = [name for name in estimators if name not in ESTIMATORS]
-    if unknown:
-        raise InputError(f"--estimator {unknown[0]}: unknown; known: {', '.join(ESTIMATORS)}")
+    check_estimators(estimators)
     started = time.perf_counter()
     found: dict[str, list[Detection]] = {name: [] for name in estimators}
     try:
@@ -156,8 +164,15 @@ def _preview(folder: Path, keys: Sequence[FrameKey], result: Evaluation) -> byte
     records = read_frame_records(folder)
     at = {(record.camera, record.index): record for record in records}
     calibrations = read_calibrations(folder)
-    title = folder.resolve().name
-    return preview_png(keys, result.scores, lambda key: read_frame(folder, at[key]), calibrations, title)
+    estimators = list(result.summary["estimators"])
+    return preview_png(
+        keys=keys,
+        scores=result.scores,
+        estimators=estimators,
+        load=lambda key: read_frame(folder, at[key]),
+        calibrations=calibrations,
+        title=folder.resolve().name,
+    )
 
 
 def versions() -> dict[str, str]:

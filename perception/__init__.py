@@ -22,6 +22,8 @@ from perception.recording import (
     frame_record,
     parse_frame_record,
     read_calibrations,
+    read_frame,
+    read_frame_records,
     read_frames,
 )
 from perception.types import Calibration, Detection, RawFrame
@@ -46,6 +48,8 @@ __all__ = [
     "parse_detection",
     "parse_frame_record",
     "read_calibrations",
+    "read_frame",
+    "read_frame_records",
     "read_frames",
     "regress_paper_range_constant",
 ]

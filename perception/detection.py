@@ -9,7 +9,7 @@ from perception.bearing import bearing_body, bearing_body_paper
 from perception.blobs import Blob, components, split_at_peaks
 from perception.measurement import Measurement, is_extended, measure
 from perception.photometry import grey_levels_paper
-from perception.preparation import prepare
+from perception.preparation import PreparedFrame, prepare
 from perception.ranging import range_paper_m
 from perception.sensor import check_frame, gain_dn_per_e
 from perception.types import Calibration, Detection, RawFrame
@@ -18,6 +18,9 @@ PAPER_MIN_AREA_PX = 5
 """The paper keeps A_k > 4."""
 
 PAPER_ASPECT = (0.8, 1.2)
+
+MAX_FLARES = 100
+"""The robust detector measures no more blobs of a frame than this, the brightest: it bounds the time."""
 
 
 def detect_paper(frame: RawFrame, calibration: Calibration) -> list[Detection]:
@@ -107,7 +110,9 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         clipped flux is given as its lower bound, the range that follows is an upper bound, and
         `range_sigma_m` is NaN. `merged`: the flare shares its component with another, or does not look like
         one source; its sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror
-        image from a source. Blobs much larger than a source of their flux would be are left out.
+        image from a source. Blobs much larger than a source of their flux would be are left out,
+        and so are those that do not stand out from what lies right beside them, and all but the brightest
+        100.
 
     Raises
     ------
@@ -116,17 +121,23 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     """
     check_frame(frame, calibration)
     prepared = prepare(frame, calibration)
-    found = []
-    for component in components(prepared.lit):
-        box = component.box.slices
-        brightness_e = prepared.filtered_e[box]
-        expected_e = np.maximum(brightness_e + prepared.background_e[box], 0.0)
-        noise_e = prepared.filtered_noise * np.sqrt(expected_e + prepared.floor_e2)
-        for blob in split_at_peaks(component, brightness_e, noise_e):
-            if is_extended(blob, prepared):
-                continue
-            found.append(_detection(blob, measure(blob, prepared), frame, calibration))
-    return found
+    blobs = [
+        blob
+        for component in components(prepared.lit)
+        for blob in _parted(component, prepared)
+        if not is_extended(blob, prepared)
+    ]
+    measured = [(blob, measure(blob, prepared)) for blob in _brightest(blobs, prepared.filtered_e)]
+    return [_detection(blob, found, frame, calibration) for blob, found in measured if found.stands_out]
+
+
+def _parted(component: Blob, prepared: PreparedFrame) -> list[Blob]:
+    """Divide a component at maxima that differ by more than their noise."""
+    box = component.box.slices
+    brightness_e = prepared.filtered_e[box]
+    expected_e = np.maximum(brightness_e + prepared.background_e[box], 0.0)
+    noise_e = prepared.filtered_noise * np.sqrt(expected_e + prepared.floor_e2)
+    return split_at_peaks(component, brightness_e, noise_e)
 
 
 def _detection(blob: Blob, measured: Measurement, frame: RawFrame, calibration: Calibration) -> Detection:
@@ -150,6 +161,15 @@ def _detection(blob: Blob, measured: Measurement, frame: RawFrame, calibration: 
         range_sigma_m=measured.range_sigma_m,
         bearing_body=_vector(bearing_body([[measured.u_px, measured.v_px]], calibration)),
     )
+
+
+def _brightest(blobs: list[Blob], brightness: NDArray[np.float32]) -> list[Blob]:
+    """Keep the brightest blobs, in the order in which they are."""
+    if len(blobs) <= MAX_FLARES:
+        return blobs
+    peaks = [float(brightness[blob.box.slices][blob.pixels].max()) for blob in blobs]
+    kept = np.sort(np.argsort(peaks)[-MAX_FLARES:])
+    return [blobs[index] for index in kept]
 
 
 def _vector(rows: NDArray[np.float64]) -> tuple[float, float, float]:

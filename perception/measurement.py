@@ -28,18 +28,33 @@ CLIPPED_FLUX_SIGMA = 0.25
 
 @dataclass(frozen=True)
 class Measurement:
-    """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel."""
+    """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
+
+    `flux_sigma_e` holds for a source of the size found: it says whether there is a flare, not how well its
+    range is known.
+    """
 
     u_px: float
     v_px: float
     u_sigma_px: float
     v_sigma_px: float
     flux_e: float
+    flux_sigma_e: float
     background_e: float
     range_m: float
     range_sigma_m: float
     saturated: bool
     misfit: bool
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether its flux exceeds the background right beside it by 4 σ (a clipped one always does).
+
+        What only the coarse background made look bright, such as the border of a shadow, does not. A blob
+        that does not look like a source must exceed 10 σ: overlapping flares bright enough to show it do.
+        """
+        least = 10.0 if self.misfit else 4.0
+        return self.saturated or (self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e)
 
 
 def is_extended(blob: Blob, prepared: PreparedFrame) -> bool:
@@ -86,13 +101,8 @@ def measure(blob: Blob, prepared: PreparedFrame) -> Measurement:
     too_large = _image_radius_px(u_px, v_px, flux_e, prepared) > MAX_IMAGE_RADIUS_PX
 
     if flux_e > 0.0 and not too_large:
-        # A neighbour of a clipped pixel is left out whatever its value: to choose pixels by their own noise
-        # would bias what remains.
-        usable = free & ~_grown(clipped, 1)
         place = (u_px, v_px, _background_at(u_px, v_px, prepared))
-        fit = _fit(
-            usable, window, prepared, place, _first_fluxes(blob, flux_e, prepared), saturated=saturated
-        )
+        fit = _fit(free, clipped, window, prepared, place, _first_fluxes(blob, flux_e, prepared))
         if fit is not None:
             good = core_goodness(prepared.image_e[window.slices], fit.fit, prepared.floor_e2, MODEL_ERROR)
             misfit = good.probability < MISFIT_PROBABILITY
@@ -117,17 +127,18 @@ def _first_fluxes(blob: Blob, flux_e: float, prepared: PreparedFrame) -> list[fl
 
 
 def _fit(
-    usable: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+    clipped: NDArray[np.bool_],
     window: Window,
     prepared: PreparedFrame,
     place: tuple[float, float, float],
     first_fluxes_e: list[float],
-    *,
-    saturated: bool,
 ) -> SourceFit | None:
     """Fit from (u, v, background) and first guesses of the flux.
 
-    A clipped flare is fitted once more without the pixels that the first fit says may clip.
+    To leave out clipped pixels alone would choose pixels by their own noise and bias what remains. So at
+    first their neighbours are left out too, and then, instead, all pixels that the first fit puts within 3 σ
+    of the clip level.
     """
     frame, calibration = prepared.frame, prepared.calibration
 
@@ -146,13 +157,13 @@ def _fit(
             max_image_radius_px=1.6 * MAX_IMAGE_RADIUS_PX,
         )
 
-    first = attempt(usable, place, first_fluxes_e)
-    if first is None or not saturated:
+    first = attempt(free & ~_grown(clipped, 1), place, first_fluxes_e)
+    if first is None or not clipped.any():
         return first
     fit = first.fit
     noise_e = np.sqrt(np.maximum(fit.expected_e, 0.0) + prepared.floor_e2)
     below_clip = fit.expected_e < clip_level_e(calibration, frame.black_level_dn, frame.gain) - 3.0 * noise_e
-    return attempt(usable & below_clip, (fit.u_px, fit.v_px, fit.background_e), [fit.flux_e])
+    return attempt(free & ~clipped & below_clip, (fit.u_px, fit.v_px, fit.background_e), [fit.flux_e])
 
 
 def _from_fit(
@@ -175,6 +186,7 @@ def _from_fit(
         u_sigma_px=source.u_sigma_px * stretch,
         v_sigma_px=source.v_sigma_px * stretch,
         flux_e=fit.flux_e,
+        flux_sigma_e=fit.flux_sigma_e * stretch,
         background_e=fit.background_e,
         range_m=ranged.range_m,
         range_sigma_m=ranged.range_sigma_m,
@@ -215,6 +227,7 @@ def _from_aperture(
         u_sigma_px=u_sigma_px,
         v_sigma_px=v_sigma_px,
         flux_e=aperture.flux,
+        flux_sigma_e=aperture.flux_sigma,
         background_e=aperture.background,
         range_m=ranged.range_m,
         range_sigma_m=ranged.range_sigma_m,

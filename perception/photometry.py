@@ -17,7 +17,7 @@ from perception.types import Calibration
 PAPER_RING_GAP_PX = 2
 PAPER_RING_WIDTH_PX = 3
 
-_MAX_STEPS = 30
+_MAX_STEPS = 20
 
 
 @dataclass(frozen=True)

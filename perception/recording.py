@@ -101,6 +101,42 @@ def parse_frame_record(
     )
 
 
+def read_frame_records(folder: str | Path) -> list[FrameRecord]:
+    """Read `frames.jsonl`, without the pixels; empty lines are passed over.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing or a line is broken.
+    """
+    path = Path(folder) / FRAMES_FILE
+    return [
+        parse_frame_record(parse_object(content, Place(str(path), line)), str(path), line)
+        for line, content in enumerate(read_text(path).splitlines(), start=1)
+        if content.strip()
+    ]
+
+
+def read_frame(folder: str | Path, record: FrameRecord) -> RawFrame:
+    """Read the frame that a line of `frames.jsonl` describes.
+
+    Raises
+    ------
+    RecordingError
+        If its PNG is missing, damaged, or not 16-bit grey.
+    """
+    return RawFrame(
+        camera=record.camera,
+        index=record.index,
+        time_s=record.time_s,
+        exposure_s=record.exposure_s,
+        data_dn=_read_png16(Path(folder) / record.file),
+        black_level_dn=record.black_level_dn,
+        line_time_s=record.line_time_s,
+        gain=record.gain,
+    )
+
+
 def read_frames(folder: str | Path) -> Iterator[RawFrame]:
     """Read the frames of a recording, one by one, in the order of `frames.jsonl`.
 
@@ -112,34 +148,15 @@ def read_frames(folder: str | Path) -> Iterator[RawFrame]:
     Returns
     -------
     Iterator of RawFrame
-        A PNG is opened when its frame is asked for. Empty lines are passed over.
+        A PNG is opened when its frame is asked for.
 
     Raises
     ------
     RecordingError
-        At once if `frames.jsonl` is missing; at its frame for a broken line or PNG.
+        At once if `frames.jsonl` is missing or broken; at its frame for a PNG.
     """
-    folder = Path(folder)
-    return _frames(folder, read_text(folder / FRAMES_FILE))
-
-
-def _frames(folder: Path, lines: str) -> Iterator[RawFrame]:
-    file = str(folder / FRAMES_FILE)
-    for line, content in enumerate(lines.splitlines(), start=1):
-        if not content.strip():
-            continue
-        place = Place(file, line)
-        record = parse_frame_record(parse_object(content, place), file, line)
-        yield RawFrame(
-            camera=record.camera,
-            index=record.index,
-            time_s=record.time_s,
-            exposure_s=record.exposure_s,
-            data_dn=_read_png16(folder / record.file, place),
-            black_level_dn=record.black_level_dn,
-            line_time_s=record.line_time_s,
-            gain=record.gain,
-        )
+    records = read_frame_records(folder)
+    return (read_frame(folder, record) for record in records)
 
 
 def read_calibrations(folder: str | Path) -> dict[str, Calibration]:
@@ -172,25 +189,23 @@ def encode_png16(data_dn: NDArray[np.uint16]) -> bytes:
     return buffer.tobytes()
 
 
-def _read_png16(path: Path, place: Place) -> NDArray[np.uint16]:
+def _read_png16(path: Path) -> NDArray[np.uint16]:
+    place = Place(str(path))
+    mend = "Record raw counts as 16-bit grey PNG"
     try:
         content = path.read_bytes()
     except OSError as error:
         raise place.error(
-            f"the picture {path} cannot be read ({error.strerror})",
-            "Put the PNG there, or remove the line",
-            "file",
+            f"the picture cannot be read ({error.strerror})",
+            f"Put the PNG there, or remove it from {FRAMES_FILE}",
         ) from error
-    mend = "Record raw counts as 16-bit grey PNG"
     # OpenCV writes to standard error about what it cannot decode; the signature is told here instead.
     if not content.startswith(b"\x89PNG\r\n\x1a\n"):
-        raise place.error(f"{path} is no PNG", mend, "file")
+        raise place.error("is no PNG", mend)
     image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise place.error(f"{path} is a damaged PNG", mend, "file")
+        raise place.error("is a damaged PNG", mend)
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise place.error(
-            f"{path} holds {image.dtype} with {channels} channel(s), not 16-bit grey", mend, "file"
-        )
+        raise place.error(f"holds {image.dtype} with {channels} channel(s), not 16-bit grey", mend)
     return np.asarray(image, dtype=np.uint16)

@@ -15,13 +15,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nir_render.transport.llvm import Choice
 
 ROOT = Path(__file__).resolve().parent.parent
 OLDEST = (3, 11)
 NEWER = ("python3.14", "python3.13", "python3.12", "python3.11")
-GOOD_INTERPRETER = "import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))"
-GOOD_ENVIRONMENT = "import sys, pip; sys.exit(sys.version_info < (3, 11))"
+IS_GOOD = "import sys, {}; sys.exit(sys.version_info < (3, 11))"
 
 
 class SetupError(Exception):
@@ -97,9 +99,7 @@ def write_stamp(root: Path, llvm: "str | None") -> None:
     `llvm` is the library file in use, empty if none is or it is unknown.
     """
     stamp = {"inputs": inputs_hash(root), "root": str(root), "llvm": llvm}
-    aside = stamp_file(root).with_name(".ready.partial")
-    aside.write_text(json.dumps(stamp) + "\n", encoding="utf-8")
-    aside.replace(stamp_file(root))
+    stamp_file(root).write_text(json.dumps(stamp) + "\n", encoding="utf-8")
 
 
 def has_packages(root: Path) -> bool:
@@ -132,24 +132,16 @@ def succeeds(command: "list[str]") -> bool:
 
 
 def find_interpreter(version: "tuple[int, ...]" = tuple(sys.version_info[:3])) -> str:
-    """Return an interpreter that is new enough: this one, of this `version`, or one on the PATH.
-
-    Raises
-    ------
-    SetupError
-        If there is none.
-    """
+    """Return an interpreter that is new enough: this one, of this `version`, or one on the PATH."""
     if version >= OLDEST:
         return sys.executable
-    found = [path for path in map(shutil.which, NEWER) if path]
     # Asked, not believed: a version manager leaves launchers on the PATH for versions that are not active.
-    for path in found:
-        if succeeds([path, "-c", GOOD_INTERPRETER]):
+    for path in filter(None, map(shutil.which, NEWER)):
+        if succeeds([path, "-c", IS_GOOD.format("venv, ensurepip")]):
             return path
     spoken = ".".join(str(part) for part in version)
-    raise SetupError(
-        f"Python 3.11 or newer is needed, and {sys.executable} is {spoken}: {python_advice('3.11')}"
-    )
+    needed = f"Python 3.11 or newer is needed, and {sys.executable} is {spoken}"
+    raise SetupError(f"{needed}: {python_advice('3.11')}")
 
 
 def require_venv_module() -> None:
@@ -178,26 +170,22 @@ def make_environment(root: Path) -> None:
     """Make ``.venv``, unless there is one that works and was made here."""
     python = environment_python(root)
     made_here = read_stamp(root).get("root", str(root)) == str(root)
-    if made_here and succeeds([str(python), "-c", GOOD_ENVIRONMENT]):
+    if made_here and succeeds([str(python), "-c", IS_GOOD.format("pip")]):
         return
     say(f"making .venv with Python {'.'.join(map(str, sys.version_info[:3]))}")
     # The base interpreter: this one may itself be the one in .venv, which is cleared.
     base = getattr(sys, "_base_executable", None) or sys.executable
     if subprocess.call([base, "-m", "venv", "--clear", str(root / ".venv")]) != 0:
-        raise SetupError(
-            f"no environment could be made in {root / '.venv'}, see above; free that folder and try again"
-        )
+        raise SetupError(f"{root / '.venv'} could not be made, see above; free that folder and try again")
 
 
 def install_packages(root: Path) -> None:
     """Install this project, editable, with all that it needs, in the pinned versions."""
     say("installing the pinned packages (a few minutes if they have to be downloaded)")
-    start_s = time.monotonic()
     command = [str(environment_python(root)), "-m", "pip", "install", "-qq", "--no-input"]
     command += ["--disable-pip-version-check", "-c", "constraints.txt", "-e", ".[dev]"]
     if subprocess.call(command, cwd=str(root), env=pip_environment(dict(os.environ))) != 0:
         raise SetupError("pip could not install the packages, see above; the same command tries again")
-    say(f"packages installed in {time.monotonic() - start_s:.0f} s")
 
 
 def pip_environment(environ: "dict[str, str]") -> "dict[str, str]":
@@ -220,52 +208,48 @@ def finish_with_llvm(root: Path) -> None:
         say("Mitsuba has no wheel for this platform: camera and perception work, rendering does not")
         write_stamp(root, "")
         return
-    from nir_render.transport import llvm
-
-    write_stamp(root, ensure_llvm(llvm))
+    write_stamp(root, ensure_llvm())
 
 
-def ensure_llvm(llvm: Any) -> str:
+def ensure_llvm() -> str:
     """Find an LLVM that works or install one; else go on without, and print what would help.
 
-    Parameters
-    ----------
-    llvm : module
-        `nir_render.transport.llvm`, or what stands in for it.
-
-    Returns
-    -------
-    str
-        The library in use, empty if none is or it is unknown.
+    Return the library in use, empty if none is or it is unknown.
     """
-    choice = llvm.cached_choice()
-    if choice is None:
-        say("trying LLVM: one small test render for each library")
-        choice = llvm.choose()
-    report(choice)
-    apt = llvm.apt_command()
+    from nir_render.transport.llvm import install
+
+    choice = choose_aloud()
+    apt = install.apt_command()
     if not choice.usable and apt.prefix is not None:
         say(f"installing LLVM: {apt.command}")
-        problem = llvm.install(apt)
+        problem = install.install(apt)
         if problem:
             say(f"apt did not install it: {problem}")
-        choice = llvm.choose()
-        report(choice)
-        apt = llvm.NO_APT  # it has had its turn
+        choice = choose_aloud()
+        apt = install.NO_APT  # it has had its turn
     if not choice.usable:
         say("going on with Mitsuba's scalar variant, 4 to 6 times slower")
-        say(f"what would help: {llvm.advice(apt)}")
+        say(f"what would help: {install.advice(apt)}")
     return str(choice.loaded or choice.library or "")
 
 
-def report(choice: Any) -> None:
-    """Say which LLVM was chosen, and why not those before it."""
+def choose_aloud() -> "Choice":
+    """Choose an LLVM, and say what is being tried, which was chosen, and why not those before it."""
+    from nir_render.transport import llvm
+    from nir_render.transport.llvm.probe import Answer, probe
+
+    own = "the library that Dr.Jit takes by itself"
+
+    def ask(library: "Path | None") -> Answer:
+        say(f"trying {library or own}: one small test render")
+        return probe(library)
+
+    choice = llvm.choose(ask=ask)
     for answer in choice.tried:
-        say(f"  {answer.library or 'the library that Dr.Jit takes by itself'}: {answer.reason}")
-    if choice.usable:
-        say(f"LLVM {choice.version}, {choice.how}: {choice.loaded or choice.library}")
-    else:
-        say(f"LLVM: {choice.how}")
+        say(f"  {answer.library or own}: {answer.reason}")
+    where = f" {choice.version}, {choice.how}: {choice.loaded or choice.library}"
+    say("LLVM" + (where if choice.usable else f": {choice.how}"))
+    return choice
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ def _rings(
 def _pixel_shares(
     centre_px: NDArray[np.float64], sigma_px: float, count: int
 ) -> tuple[NDArray[np.float64], int]:
-    """Return each node's share of light in each pixel along an axis, shape (nodes, pixels), and the first pixel.
+    """Return each node's shares in the pixels along an axis, shape (nodes, pixels), and the first pixel.
 
     The share of pixel i is Φ((i + ½ − c)/σ) − Φ((i − ½ − c)/σ). Pixels beyond the image are left out.
     """

@@ -30,6 +30,7 @@ _GROUND, _INK = "#101418", "#e6e8ea"
 def preview_png(
     keys: Sequence[FrameKey],
     scores: Sequence[Score],
+    estimators: Sequence[str],
     load: Callable[[FrameKey], RawFrame],
     calibrations: Mapping[str, Calibration],
     title: str,
@@ -42,6 +43,8 @@ def preview_png(
         Camera and index of all frames, at least one, in the order they were taken.
     scores
         All scores of the run.
+    estimators
+        Names of those that were scored.
     load
         Reads one frame; only the frames that are drawn are read.
     calibrations
@@ -75,8 +78,9 @@ def preview_png(
             for axes in grid[len(closes) :]:
                 axes.axis("off")
             for axes, score in zip(grid, closes, strict=False):
-                _draw_close(axes, frames[_key_of(score)], score, calibrations[score.truth.camera])
-            _draw_key(parts[1], sorted({name for score in scores for name in score.detections}))
+                calibration = calibrations[score.truth.camera]
+                _draw_close(axes, frames[_key_of(score)], score, estimators, calibration)
+            _draw_key(parts[1], estimators)
         file = io.BytesIO()
         figure.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
@@ -104,7 +108,9 @@ def _draw_whole(axes: Axes, frame: RawFrame, scores: Sequence[Score], calibratio
     axes.set_title(f"{frame.camera}   frame {frame.index}   {frame.time_s:.2f} s   {exposure}", fontsize=9)
 
 
-def _draw_close(axes: Axes, frame: RawFrame, score: Score, calibration: Calibration) -> None:
+def _draw_close(
+    axes: Axes, frame: RawFrame, score: Score, estimators: Sequence[str], calibration: Calibration
+) -> None:
     truth = score.truth
     _show(axes, frame, calibration)
     axes.set_xlim(truth.u_px - _CLOSE_UP_HALF_PX, truth.u_px + _CLOSE_UP_HALF_PX)
@@ -115,16 +121,18 @@ def _draw_close(axes: Axes, frame: RawFrame, score: Score, calibration: Calibrat
     axes.add_patch(
         Circle((truth.u_px, truth.v_px), radius_px, fill=False, color=_TRUTH_COLOUR, linewidth=1.0)
     )
-    said = []
-    for name, detection in score.detections.items():
+    said = [f"true {truth.range_m:.3f} m"]
+    for name in estimators:
+        detection = score.detections.get(name)
+        if detection is None:
+            said.append(f"{name} not found")
+            continue
         marker, colour = _ESTIMATORS.get(name, _OTHER)
         axes.plot(
             detection.u_px, detection.v_px, marker, color=colour, markersize=11, fillstyle="none", mew=1.2
         )
-        said.append(f"{name} {detection.range_m:.3f}")
-    axes.set_title(
-        f"true {truth.range_m:.3f} m\n" + "\n".join(said or ["not found"]), fontsize=7.5, loc="left"
-    )
+        said.append(f"{name} {detection.range_m:.3f} m")
+    axes.set_title("\n".join(said), fontsize=7.5, loc="left")
 
 
 def _draw_key(part: SubFigure, names: Sequence[str]) -> None:

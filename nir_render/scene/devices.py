@@ -198,7 +198,8 @@ class Sensor(PresetDocument):
         if reached_dn < 0.5 * self.full_scale_dn:
             raise ValueError(
                 f"system_gain {self.system_gain_dn_per_e:g} DN/e takes a full well of "
-                f"{self.full_well_e:g} e only to {reached_dn:.0f} of {self.full_scale_dn} DN; check system_gain, full_well and bit_depth"
+                f"{self.full_well_e:g} e only to {reached_dn:.0f} of {self.full_scale_dn} DN; "
+                "check system_gain, full_well and bit_depth"
             )
         return self
 

@@ -28,5 +28,5 @@ def source_at(range_m: float, angle_deg: float = 0.0) -> dict[str, Any]:
     """Place the source of r2 at a range and field angle (to the right, level) before the front camera of r1."""
     angle = np.radians(angle_deg)
     # The front camera sits at (0.06, 0, 0.2) m, the source 0.28 m above its robot's origin.
-    x, y, z = 0.06 + range_m * float(np.cos(angle)), -range_m * float(np.sin(angle)), 0.2 - 0.28
+    x, y, z = 0.06 + float(range_m * np.cos(angle)), -float(range_m * np.sin(angle)), 0.2 - 0.28
     return {"robots.r2.position": f"[{x!r}, {y!r}, {z!r}] m"}

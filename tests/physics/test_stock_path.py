@@ -20,6 +20,7 @@ from nir_render import expected_electrons, render
 from nir_render.camera.lens import intrinsics_of
 from nir_render.camera.response import LIGHT_SPEED_M_PER_S, PLANCK_J_S, incidence
 from nir_render.spectra.bandpass import transmission
+from nir_render.transport.backend import backend
 from tests.physics.conftest import SceneMaker, source_at
 
 pytestmark = pytest.mark.mitsuba
@@ -34,7 +35,7 @@ import json, sys
 import numpy as np
 import mitsuba as mi
 case = json.loads(sys.stdin.read())
-mi.set_variant("llvm_ad_spectral", "scalar_spectral")
+mi.set_variant(case["variant"])
 film = {"type": "specfilm", "width": case["width"], "height": case["height"], "component_format": "float32",
         "crop_width": case["crop"], "crop_height": case["crop"],
         "crop_offset_x": case["crop_x"], "crop_offset_y": case["crop_y"], "rfilter": {"type": "box"},
@@ -72,6 +73,7 @@ def _stock_electrons(
     radiance = source.flux_w / (4.0 * np.pi**2 * source.radius_m**2) * density_per_nm
     scale = 1e-17  # keeps electrons per joule within float32's comfort
     case = {
+        "variant": "llvm_ad_spectral" if backend().vectorised else "scalar_spectral",
         "width": intrinsics.width_px,
         "height": intrinsics.height_px,
         "crop": _CROP_PX,

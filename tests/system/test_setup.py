@@ -10,13 +10,17 @@ import shutil
 import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import pytest
 
-from nir_render.transport.llvm import NO_APT, Answer, Apt, Choice
+from nir_render.transport import llvm
+from nir_render.transport.llvm import Choice, install, probe
+from nir_render.transport.llvm.install import NO_APT, Apt
+from nir_render.transport.llvm.probe import Answer
 
 ROOT = Path(__file__).resolve().parents[2]
 BOOTSTRAP = ROOT / "tools" / "bootstrap.py"
@@ -234,42 +238,56 @@ WORKS = Choice(Path("/l.so"), True, "19.1.7", "/l.so", "found on this machine")
 NONE = Choice(None, False, "", "", "none that works was found", (Answer("", False, reason="aborted"),))
 
 
-def stand_in(*choices: Choice, apt: Apt = NO_APT, problem: str = "", cached: bool = False) -> Any:
-    """Stand in for `nir_render.transport.llvm`: gives `choices` one after the other."""
-    remaining = list(choices)
-    installed: list[Apt] = []
-
-    def install(apt: Apt) -> str:
-        installed.append(apt)
-        return problem
-
-    return SimpleNamespace(
-        NO_APT=NO_APT,
-        cached_choice=lambda: remaining.pop(0) if cached else None,
-        choose=lambda: remaining.pop(0),
-        apt_command=lambda: apt,
-        install=install,
-        installed=installed,
-        advice=lambda apt: apt.command or "the general advice",
-    )
+StandIn = Callable[..., list[Apt]]
 
 
-def test_a_usable_llvm_is_used(bootstrap: ModuleType, capfd: pytest.CaptureFixture[str]) -> None:
-    llvm = stand_in(WORKS, apt=Apt("apt-get …", ()))
-    assert bootstrap.ensure_llvm(llvm) == "/l.so"
-    assert llvm.installed == []
-    assert "setup: LLVM 19.1.7, found on this machine: /l.so" in capfd.readouterr().err
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> StandIn:
+    """Give the function by which a test says what this machine's LLVM and apt are like.
+
+    The choices are made one after the other; the list returned is of what was installed.
+    """
+
+    def set_machine(*choices: Choice, apt: Apt = NO_APT, problem: str = "", known: bool = False) -> list[Apt]:
+        remaining = list(choices)
+        installed: list[Apt] = []
+
+        def choose(ask: Callable[[Path | None], Answer]) -> Choice:
+            if not known:
+                ask(None)
+            return remaining.pop(0)
+
+        def put(apt: Apt) -> str:
+            installed.append(apt)
+            return problem
+
+        monkeypatch.setattr(llvm, "choose", choose)
+        monkeypatch.setattr(probe, "probe", lambda _: Answer("", True))
+        monkeypatch.setattr(install, "apt_command", lambda: apt)
+        monkeypatch.setattr(install, "install", put)
+        monkeypatch.setattr(install, "advice", lambda apt: apt.command or "the general advice")
+        return installed
+
+    return set_machine
 
 
-def test_a_known_llvm_is_not_tried_again(bootstrap: ModuleType, capfd: pytest.CaptureFixture[str]) -> None:
-    assert bootstrap.ensure_llvm(stand_in(WORKS, cached=True)) == "/l.so"
-    assert "test render" not in capfd.readouterr().err
+@pytest.mark.parametrize("known", [False, True])
+def test_a_usable_llvm_is_used_and_tried_only_where_it_is_not_known(
+    bootstrap: ModuleType, stand_in: StandIn, capfd: pytest.CaptureFixture[str], known: bool
+) -> None:
+    installed = stand_in(WORKS, apt=Apt("apt-get …", ()), known=known)
+    assert bootstrap.ensure_llvm() == "/l.so"
+    assert installed == []
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[-1] == "setup: LLVM 19.1.7, found on this machine: /l.so"
+    trying = "setup: trying the library that Dr.Jit takes by itself: one small test render"
+    assert lines[:-1] == ([] if known else [trying])
 
 
-def test_without_llvm_it_is_installed_where_that_is_allowed(bootstrap: ModuleType) -> None:
-    llvm = stand_in(NONE, WORKS, apt=Apt("apt-get …", ()))
-    assert bootstrap.ensure_llvm(llvm) == "/l.so"
-    assert llvm.installed == [Apt("apt-get …", ())]
+def test_without_llvm_it_is_installed_where_that_is_allowed(bootstrap: ModuleType, stand_in: StandIn) -> None:
+    installed = stand_in(NONE, WORKS, apt=Apt("apt-get …", ()))
+    assert bootstrap.ensure_llvm() == "/l.so"
+    assert installed == [Apt("apt-get …", ())]
 
 
 @pytest.mark.parametrize(
@@ -296,26 +314,31 @@ def test_without_llvm_it_is_installed_where_that_is_allowed(bootstrap: ModuleTyp
     ],
 )
 def test_without_llvm_the_set_up_goes_on_with_scalar_and_says_what_would_help(
-    bootstrap: ModuleType, capfd: pytest.CaptureFixture[str], apt: Apt, problem: str, said: list[str]
+    bootstrap: ModuleType,
+    stand_in: StandIn,
+    capfd: pytest.CaptureFixture[str],
+    apt: Apt,
+    problem: str,
+    said: list[str],
 ) -> None:
-    llvm = stand_in(NONE, NONE, apt=apt, problem=problem)
-    assert bootstrap.ensure_llvm(llvm) == ""
+    installed = stand_in(NONE, NONE, apt=apt, problem=problem)
+    assert bootstrap.ensure_llvm() == ""
     lines = capfd.readouterr().err.splitlines()
     assert "setup:   the library that Dr.Jit takes by itself: aborted" in lines
     assert "setup: going on with Mitsuba's scalar variant, 4 to 6 times slower" in lines
     assert [line.removeprefix("setup: ") for line in lines if "help" in line or "apt did" in line] == said
-    assert bool(llvm.installed) == (apt.prefix is not None)
+    assert bool(installed) == (apt.prefix is not None)
 
 
 def test_the_whole_set_up_without_llvm_succeeds_once(
-    bootstrap: ModuleType, checkout: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    bootstrap: ModuleType,
+    checkout: Path,
+    stand_in: StandIn,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     """Set-up, its second half in the same process: exit 0, scalar, and nothing left for a second call."""
-    from nir_render.transport import llvm
-
-    hidden = stand_in(NONE)
-    for name in ("cached_choice", "choose", "apt_command", "install", "advice"):
-        monkeypatch.setattr(llvm, name, getattr(hidden, name))
+    stand_in(NONE)
     there = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: there("json" if name == "mitsuba" else name)

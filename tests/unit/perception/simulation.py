@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from perception.types import Calibration, RawFrame
 
@@ -66,12 +67,10 @@ def expected_e(
 ) -> NDArray[np.float64]:
     """Mean electrons of sources at (u, v, range): brute force, independent of perception.flare_model.
 
-    The image is sampled on a fine grid *in the image*: a sample is lit if its direction lies within the
-    sphere's cap; it weighs cos θ times its solid angle, cos³ θ. Sampling every 1/8 px or finer, it is spread
-    by a Gaussian sampled alike. Total flux: K t cos θ / d².
+    The image is sampled on a fine grid *in the image* (1/16 px or finer): a sample is lit if its direction
+    lies within the sphere's cap; it weighs cos θ times its solid angle, cos³ θ, and is spread by a Gaussian
+    sampled alike. Total flux: K t cos θ / d².
     """
-    from scipy.ndimage import gaussian_filter
-
     image = np.full((camera.height_px, camera.width_px), background_e)
     for u, v, range_m in sources:
         centre = np.array([(u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px, 1.0])
@@ -87,11 +86,15 @@ def expected_e(
         x = (left + grid - camera.cx_px) / camera.fx_px
         y = (top + grid - camera.cy_px) / camera.fy_px
         norm = np.sqrt(x[None, :] ** 2 + y[:, None] ** 2 + 1.0)
-        inside = (x[None, :] * centre[0] + y[:, None] * centre[1] + centre[2]) / norm >= np.cos(radius_rad)
-        light = inside / norm**4
-        if light.sum() < 200:  # a point: let the Gaussian carry it all
-            gx = np.exp(-0.5 * ((left + grid - u) / camera.psf_sigma_px) ** 2)
-            gy = np.exp(-0.5 * ((top + grid - v) / camera.psf_sigma_px) ** 2)
+        depth = (x[None, :] * centre[0] + y[:, None] * centre[1] + centre[2]) / norm - np.cos(radius_rad)
+        down, across = np.gradient(depth)
+        # A sample on the rim counts by the part of it that lies inside.
+        light = np.clip(0.5 + depth / (abs(down) + abs(across)).clip(1e-300), 0.0, 1.0) / norm**4
+        if radius_px < 0.05:  # a point: let the Gaussian carry it all
+            # A pixel's samples are a comb, narrower than the pixel by the variance of one sample's width.
+            sigma_px = np.hypot(camera.psf_sigma_px, 1.0 / fine / np.sqrt(12.0))
+            gx = np.exp(-0.5 * ((left + grid - u) / sigma_px) ** 2)
+            gy = np.exp(-0.5 * ((top + grid - v) / sigma_px) ** 2)
             light = gy[:, None] * gx[None, :]
         else:
             light = gaussian_filter(light, camera.psf_sigma_px * fine, truncate=6.0, mode="constant")

@@ -16,7 +16,9 @@ def test_paper_equation_1() -> None:
 
 def test_range_follows_cosine_response_exposure_and_gain() -> None:
     """At 45° the flux is K t g cos 45° · 0.8 / d²."""
-    camera = calibration(response_angle_rad=np.array([0.0, np.pi / 2]), response_relative=np.array([1.0, 0.6]))
+    camera = calibration(
+        response_angle_rad=np.array([0.0, np.pi / 2]), response_relative=np.array([1.0, 0.6])
+    )
     flux = camera.range_constant_dn_m2_per_s * 2e-3 * 1.5 * math.sqrt(0.5) * 0.8 / 3.0**2
     found = range_from_flux(flux, 0.0, 639.5, 479.5 + 480.0, 2e-3, 1.5, camera)
     assert found.range_m == pytest.approx(3.0, rel=1e-12)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from nir_render.scene.devices import Orientation
 from nir_render.scene.document import Robot, Waypoint
 from nir_render.scene.motion import Pose, robot_pose, rotation_of
@@ -15,7 +16,9 @@ def _robot(**parts: object) -> Robot:
 
 def test_yaw_is_to_the_left_and_pitch_is_nose_down() -> None:
     ahead = np.array([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(rotation_of(Orientation.model_validate(QUARTER)) @ ahead, [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(
+        rotation_of(Orientation.model_validate(QUARTER)) @ ahead, [0, 1, 0], atol=1e-15
+    )
     down = rotation_of(Orientation.model_validate({"pitch": "90 deg"}))
     np.testing.assert_allclose(down @ ahead, [0, 0, -1], atol=1e-15)
     # Yaw first, pitch about the turned axis: the nose ends below the left side.

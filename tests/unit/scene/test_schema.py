@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import yaml
 from jsonschema import Draft202012Validator
+
 from nir_render.scene.schema import scene_schema
 
 SCENES = Path(__file__).parents[3] / "scenes"
@@ -46,5 +47,7 @@ def _scene(camera: Any) -> dict[str, Any]:
         ({"preset": "infra_swarm", "sensor": {"preset": "mt9m031", "quantum_efficiency": 0.2}}, True),
     ],
 )
-def test_the_schema_takes_what_the_loader_takes(camera: Any, holds: bool, validator: Draft202012Validator) -> None:
+def test_the_schema_takes_what_the_loader_takes(
+    camera: Any, holds: bool, validator: Draft202012Validator
+) -> None:
     assert validator.is_valid(_scene(camera)) is holds

@@ -1,6 +1,7 @@
 import math
 
 import pytest
+
 from nir_render.scene import units
 from nir_render.scene.units import format_quantity, format_vector, parse_quantity, parse_vector
 
@@ -44,7 +45,9 @@ def test_text_with_unit_becomes_si(text: object, quantity: units.Quantity, value
         ("far away", units.LENGTH, "'far away' is not a length"),
     ],
 )
-def test_what_is_no_such_quantity_is_refused_with_a_fix(text: object, quantity: units.Quantity, said: str) -> None:
+def test_what_is_no_such_quantity_is_refused_with_a_fix(
+    text: object, quantity: units.Quantity, said: str
+) -> None:
     with pytest.raises(ValueError) as caught:
         parse_quantity(text, quantity)
     assert said in str(caught.value)

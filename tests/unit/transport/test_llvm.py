@@ -7,14 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from nir_render.transport import llvm
-from nir_render.transport.llvm import Answer, Apt, Choice
+from nir_render.transport.llvm import Choice, choose
+from nir_render.transport.llvm.choice import cache_file, cpu_name
+from nir_render.transport.llvm.install import NO_APT, Apt, advice, apt_command, install
+from nir_render.transport.llvm.libraries import find_libraries, usual_folders
+from nir_render.transport.llvm.probe import Answer, probe
 
 FORCED = "DRJIT_LIBLLVM_PATH"
 
 
 class Prober:
-    """Stands in for `llvm.probe`: knows which libraries work and notes which were asked for."""
+    """Stands in for `probe`: knows which libraries work and notes which were asked for."""
 
     def __init__(self, *working: Path | None) -> None:
         self.working = working
@@ -44,10 +47,10 @@ class Machine:
         library.write_text(f"LLVM {version}")
         return library
 
-    def choose(self, probe: Callable[[Path | None], Answer]) -> Choice:
-        return llvm.choose(
+    def choose(self, ask: Callable[[Path | None], Answer]) -> Choice:
+        return choose(
             find=lambda: self.libraries,
-            ask=probe,
+            ask=ask,
             environ=self.environ,
             cache=self.cache,
             cpu=self.cpu,
@@ -185,18 +188,6 @@ def test_an_answer_that_may_change_is_not_remembered(machine: Machine) -> None:
     assert machine.choose(Prober(None)).usable
 
 
-def test_cached_choice_answers_only_what_is_known(machine: Machine) -> None:
-    def cached() -> Choice | None:
-        return llvm.cached_choice(
-            find=lambda: machine.libraries, environ={}, cache=machine.cache, cpu="c", packages="p"
-        )
-
-    assert cached() is None
-    machine.cpu, machine.packages = "c", "p"
-    chosen = machine.choose(Prober(machine.libraries[0]))
-    assert cached() == chosen
-
-
 @pytest.mark.parametrize(
     ("system", "environ", "expected"),
     [
@@ -212,7 +203,7 @@ def test_cache_file(
     system: str, environ: dict[str, str], expected: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", "/home/u")
-    assert llvm.cache_file(environ, system) == expected
+    assert cache_file(environ, system) == expected
 
 
 def test_cpu_name_tells_processors_apart_by_their_instruction_sets(tmp_path: Path) -> None:
@@ -221,7 +212,7 @@ def test_cpu_name_tells_processors_apart_by_their_instruction_sets(tmp_path: Pat
     names = []
     for mhz, flag in (("1000", "avx2"), ("2000", "avx2"), ("1000", "avx512f")):
         cpuinfo.write_text(text.format(mhz, flag))
-        names.append(llvm.cpu_name(cpuinfo))
+        names.append(cpu_name(cpuinfo))
     assert names[0] == names[1] != names[2]
     assert names[0].endswith("Acme 1 fpu avx2")
 
@@ -250,7 +241,7 @@ def test_libraries_19_first_then_newest_each_once(tmp_path: Path) -> None:
     loader_cache.write_bytes(b"head\0" + b"\0".join(str(n).encode() for n in listed) + b"\0libLLVM.so\0")
 
     patterns = [f"{tmp_path}/{folder}" for folder in ("lib", "llvm*/lib", "Cellar/llvm/*/lib", "bin", "none")]
-    found = llvm.find_libraries(folders=patterns, loader_cache=loader_cache)
+    found = find_libraries(folders=patterns, loader_cache=loader_cache)
 
     assert [path.relative_to(tmp_path).as_posix() for path in found] == [
         "lib/libLLVM.so.19.1",
@@ -268,7 +259,7 @@ def test_libraries_19_first_then_newest_each_once(tmp_path: Path) -> None:
 def test_the_loaders_search_path_is_searched(tmp_path: Path) -> None:
     (tmp_path / "libLLVM.so.19.1").touch()
     environ = {"LD_LIBRARY_PATH": f"/nowhere:{tmp_path}"}
-    assert (tmp_path / "libLLVM.so.19.1") in llvm.find_libraries(environ=environ, system="linux")
+    assert (tmp_path / "libLLVM.so.19.1") in find_libraries(environ=environ, system="linux")
 
 
 @pytest.mark.parametrize(
@@ -276,7 +267,7 @@ def test_the_loaders_search_path_is_searched(tmp_path: Path) -> None:
     [("linux", "/usr/lib/llvm*/lib"), ("darwin", "/opt/homebrew/opt/llvm*/lib"), ("win32", "P/LLVM/bin")],
 )
 def test_usual_folders_of_each_system(system: str, part: str) -> None:
-    assert part in llvm.usual_folders({"PROGRAMFILES": "P", "PATH": "a;b"}, system)
+    assert part in usual_folders({"PROGRAMFILES": "P", "PATH": "a;b"}, system)
 
 
 # The probe
@@ -292,7 +283,7 @@ def result(**changes: object) -> list[str]:
 
 
 def test_a_probe_that_renders_rightly() -> None:
-    answer = llvm.probe(Path("/l.so"), command=result())
+    answer = probe(Path("/l.so"), command=result())
     assert answer == Answer("/l.so", True, version="19.1.7", loaded="/l.so")
 
 
@@ -310,7 +301,7 @@ def test_a_probe_that_renders_rightly() -> None:
 )
 def test_a_probe_that_fails_says_why(command: list[str], reason: str) -> None:
     limit_s = 0.5 if "sleep" in command[-1] else 60.0
-    answer = llvm.probe(None, command=command, time_limit_s=limit_s)
+    answer = probe(None, command=command, time_limit_s=limit_s)
     assert not answer.usable
     assert reason in answer.reason
     assert answer.lasting
@@ -326,16 +317,16 @@ def test_an_abort_is_an_answer_and_a_kill_is_not() -> None:
             "os.kill(os.getpid(), {})",
         ]
     )
-    aborted = llvm.probe(None, command=say(script.format(6)))
+    aborted = probe(None, command=say(script.format(6)))
     assert aborted.reason == "the process ended by SIGABRT: LLVM ERROR: Cannot select: f32 = fminimum"
     assert aborted.lasting
-    killed = llvm.probe(None, command=say(script.format(9)))
+    killed = probe(None, command=say(script.format(9)))
     assert not killed.usable
     assert not killed.lasting
 
 
 def test_a_probe_that_cannot_be_started_is_no_lasting_answer(tmp_path: Path) -> None:
-    answer = llvm.probe(None, command=[str(tmp_path / "no such program")])
+    answer = probe(None, command=[str(tmp_path / "no such program")])
     assert "could not be started" in answer.reason
     assert not answer.lasting
 
@@ -343,7 +334,7 @@ def test_a_probe_that_cannot_be_started_is_no_lasting_answer(tmp_path: Path) -> 
 @pytest.mark.parametrize(("library", "expected"), [(None, "None"), (Path("/l.so"), "/l.so")])
 def test_the_probe_sees_only_the_library_that_it_was_asked_for(library: Path | None, expected: str) -> None:
     command = say(f"import os, sys; sys.exit(str(os.environ.get('{FORCED}')) + ' ' + os.environ['HOME'])")
-    answer = llvm.probe(library, environ={FORCED: "/users.so", "HOME": "/home/u"}, command=command)
+    answer = probe(library, environ={FORCED: "/users.so", "HOME": "/home/u"}, command=command)
     assert answer.reason.split(" ")[0] == expected
     assert "/home/u" not in answer.reason  # where Dr.Jit keeps kernels that another LLVM has compiled
 
@@ -353,7 +344,7 @@ def test_a_real_probe_of_nonsense_fails_with_a_reason(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba")
     nonsense = tmp_path / "libLLVM.so.19.1"
     nonsense.write_text("not a library")
-    answer = llvm.probe(nonsense)
+    answer = probe(nonsense)
     assert not answer.usable
     assert answer.reason
 
@@ -362,11 +353,11 @@ def test_a_real_probe_of_nonsense_fails_with_a_reason(tmp_path: Path) -> None:
 def test_a_real_choice_renders_the_closed_form(tmp_path: Path) -> None:
     """Whatever is chosen on this machine passes the probe; the probe holds it to 0.5 %."""
     pytest.importorskip("mitsuba")
-    choice = llvm.choose(cache=tmp_path / "llvm.json")
+    choice = choose(cache=tmp_path / "llvm.json")
     if not choice.usable:
         pytest.skip(f"no usable LLVM here: {[answer.reason for answer in choice.tried]}")
     assert int(choice.version.split(".")[0]) >= 15
-    assert llvm.cached_choice(cache=tmp_path / "llvm.json") == choice
+    assert choose(ask=Prober(), cache=tmp_path / "llvm.json") == choice
 
 
 # Installation
@@ -400,7 +391,7 @@ def test_apt_command(tools: set[str], is_root: bool, sudo_status: int, expected:
         ran.append(command)
         return sudo_status, ""
 
-    assert llvm.apt_command(which=lambda t: t if t in tools else None, is_root=is_root, run=run) == expected
+    assert apt_command(which=lambda t: t if t in tools else None, is_root=is_root, run=run) == expected
     assert all(command == ["sudo", "-n", "true"] for command in ran)
 
 
@@ -412,7 +403,7 @@ def test_install_updates_first_and_never_asks(prefix: tuple[str, ...]) -> None:
         ran.append(command)
         return (100, "one source is away") if "update" in command else (0, "")
 
-    assert llvm.install(Apt("…", prefix), run=run) == ""
+    assert install(Apt("…", prefix), run=run) == ""
     update, package = ran
     assert "update" in update
     assert "libllvm19" in package
@@ -423,25 +414,23 @@ def test_install_updates_first_and_never_asks(prefix: tuple[str, ...]) -> None:
 
 
 def test_install_says_why_it_failed() -> None:
-    problem = llvm.install(
-        Apt("…", ()), run=lambda _: (100, "Reading…\nE: Unable to locate package libllvm19\n")
-    )
+    problem = install(Apt("…", ()), run=lambda _: (100, "Reading…\nE: Unable to locate package libllvm19\n"))
     assert problem == "E: Unable to locate package libllvm19"
 
 
 def test_install_is_refused_where_apt_would_ask() -> None:
     with pytest.raises(ValueError, match="by hand: sudo apt-get"):
-        llvm.install(Apt("sudo apt-get install x", None), run=lambda _: pytest.fail("nothing may run"))
+        install(Apt("sudo apt-get install x", None), run=lambda _: pytest.fail("nothing may run"))
 
 
 @pytest.mark.parametrize(
     ("apt", "tools", "expected"),
     [
         (Apt("sudo apt-get x", None), {"brew"}, "sudo apt-get x"),
-        (llvm.NO_APT, {"brew"}, "brew install llvm@19"),
-        (llvm.NO_APT, {"dnf"}, "sudo dnf install llvm19-libs"),
-        (llvm.NO_APT, set(), f"install LLVM 19 or newer and set {FORCED} to the path of its library"),
+        (NO_APT, {"brew"}, "brew install llvm@19"),
+        (NO_APT, {"dnf"}, "sudo dnf install llvm19-libs"),
+        (NO_APT, set(), f"install LLVM 19 or newer and set {FORCED} to the path of its library"),
     ],
 )
 def test_advice(apt: Apt, tools: set[str], expected: str) -> None:
-    assert llvm.advice(apt, which=lambda tool: tool if tool in tools else None) == expected
+    assert advice(apt, which=lambda tool: tool if tool in tools else None) == expected

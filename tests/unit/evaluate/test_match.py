@@ -1,0 +1,116 @@
+"""Matching and counting, on cases that can be worked out by hand."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from nir_render.evaluate.match import countable, match
+from nir_render.evaluate.metrics import evaluate
+from nir_render.evaluate.truth import SourceTruth, parse_truth
+from perception.types import Calibration, Detection
+
+CALIBRATION = Calibration(
+    camera="r1.front", width_px=640, height_px=480, fx_px=480.0, fy_px=480.0, cx_px=319.5, cy_px=239.5,
+    rotation_body_camera=np.eye(3), position_body_m=np.zeros(3), system_gain_dn_per_e=1.0, read_noise_e=10.0,
+    black_level_dn=64.0, saturation_dn=4095, bit_depth=12, psf_sigma_px=0.7,
+    response_angle_rad=np.array([0.0, 1.5]), response_relative=np.ones(2), range_constant_dn_m2_per_s=1e9,
+    range_constant_paper_dn_m2_per_s=1e9, source_radius_m=0.01, wavelength_m=940e-9,
+)  # fmt: skip
+
+
+def _truth(u_px: float, v_px: float = 100.0, **changes: object) -> SourceTruth:
+    row = SourceTruth(
+        camera="r1.front", index=0, time_s=0.0, source="top", robot="r2", u_px=u_px, v_px=v_px, range_m=2.0,
+        depth_z_m=2.0, bearing_camera=(0.0, 0.0, 1.0), bearing_body=(1.0, 0.0, 0.0), position_body_m=(2.0, 0.0, 0.0),
+        visible_fraction=1.0, direct_e=1e4, mirrored_e=0.0, scattered_e=0.0, peak_snr=20.0, saturated_px=0,
+        on_fraction=1.0,
+    )  # fmt: skip
+    return dataclasses.replace(row, **changes)  # type: ignore[arg-type]
+
+
+def _detection(u_px: float, v_px: float = 100.0, **changes: object) -> Detection:
+    found = Detection(
+        camera="r1.front", index=0, time_s=0.0, u_px=u_px, v_px=v_px, u_sigma_px=0.1, v_sigma_px=0.1, flux_dn=1e4,
+        mean_dn=500.0, background_dn=64.0, area_px=20, saturated=False, merged=False, ghost=False, range_m=2.0,
+        range_sigma_m=0.01, bearing_body=(1.0, 0.0, 0.0),
+    )  # fmt: skip
+    return dataclasses.replace(found, **changes)  # type: ignore[arg-type]
+
+
+def test_the_gate_is_three_pixels_or_the_radius_of_the_image() -> None:
+    assert match([_truth(100.0)], [_detection(102.99)], CALIBRATION).pairs == ((0, 0),)
+    assert match([_truth(100.0)], [_detection(103.01)], CALIBRATION).pairs == ()
+    # At 0.5 m a source of 10 mm has an image of 9.6 px radius.
+    assert match([_truth(100.0, depth_z_m=0.5)], [_detection(109.5)], CALIBRATION).pairs == ((0, 0),)
+    assert match([_truth(100.0, depth_z_m=0.5)], [_detection(109.7)], CALIBRATION).pairs == ()
+
+
+def test_one_detection_serves_one_source() -> None:
+    """Two detections on one source: the nearer is the hit, the other a false alarm; and the other way round."""
+    both = match([_truth(100.0)], [_detection(101.0), _detection(100.5)], CALIBRATION)
+    assert (both.pairs, both.unmatched) == (((0, 1),), (0,))
+    one = match([_truth(100.0), _truth(102.0)], [_detection(101.5)], CALIBRATION)
+    assert (one.pairs, one.unmatched) == (((1, 0),), ())
+
+
+def test_as_many_pairs_as_possible_come_before_the_nearest() -> None:
+    """Sources at 100 and 104, detections at 102.5 and 98: greedy would give 104–102.5 and 100–98 too; here it must."""
+    found = match([_truth(100.0), _truth(104.0)], [_detection(102.5), _detection(98.0)], CALIBRATION)
+    assert found.pairs == ((0, 1), (1, 0))
+    # The detection at 101.5 is nearest to 100, but only it can serve 104, and 98 serves 100.
+    found = match([_truth(100.0), _truth(104.0)], [_detection(101.5), _detection(98.0)], CALIBRATION)
+    assert found.pairs == ((0, 1), (1, 0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "counts"),
+    [
+        ({}, True),
+        ({"visible_fraction": 0.5}, True),
+        ({"visible_fraction": 0.49}, False),
+        ({"peak_snr": 5.0}, True),
+        ({"peak_snr": 4.99}, False),
+        ({"on_fraction": 0.0}, False),
+        ({"u_px": -0.6}, False),
+        ({"v_px": 479.6}, False),
+    ],
+)
+def test_what_counts_for_recall(changes: dict[str, object], counts: bool) -> None:
+    assert countable(dataclasses.replace(_truth(100.0), **changes), CALIBRATION) is counts  # type: ignore[arg-type]
+
+
+def test_the_summary_of_a_run_worked_out_by_hand() -> None:
+    """Three frames; two countable sources at 2 m, one found 10 cm too far and 1° off; a false alarm; a ghost; a
+    detection on a source that does not count is neither hit nor false alarm."""
+    tilted = (math.cos(math.radians(1.0)), math.sin(math.radians(1.0)), 0.0)
+    truth = [_truth(100.0), _truth(200.0, index=1), _truth(300.0, index=1, peak_snr=2.0)]
+    detections = {
+        "robust": [
+            _detection(100.5, range_m=2.1, bearing_body=tilted),
+            _detection(400.0, index=1),
+            _detection(300.0, index=1),
+            _detection(50.0, index=2, ghost=True),
+        ],
+        "paper": [],
+    }
+    frames = [("r1.front", 0), ("r1.front", 1), ("r1.front", 2)]
+    summary = evaluate(frames, truth, {"r1.front": CALIBRATION}, detections).summary
+    assert (summary["frames"], summary["sources_visible"]) == (3, 2)
+    assert summary["estimators"]["robust"] == {
+        "recall": 0.5,
+        "range_mae_m": pytest.approx(0.1),
+        "range_rmse_m": pytest.approx(0.1),
+        "range_bias_m": pytest.approx(0.1),
+        "ranges_missing": 0,
+        "bearing_rms_deg": pytest.approx(1.0),
+        "false_alarms_per_frame": pytest.approx(1.0 / 3.0),
+        "ghosts_reported": 1,
+    }
+    assert summary["estimators"]["paper"]["recall"] == 0.0
+    assert summary["estimators"]["paper"]["range_mae_m"] is None
+
+
+def test_truth_reads_back_as_it_was_written() -> None:
+    assert parse_truth(_truth(100.0).record()) == _truth(100.0)

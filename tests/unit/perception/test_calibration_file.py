@@ -1,0 +1,89 @@
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perception import RecordingError, calibration_document, parse_calibration_document
+from tests.unit.perception.simulation import calibration
+
+ARRAYS = ("rotation_body_camera", "position_body_m", "response_angle_rad", "response_relative")
+FULL = calibration(
+    rotation_body_camera=Rotation.from_euler("xyz", [0.3, -1.2, 2.1]).as_matrix(),
+    response_angle_rad=np.array([0.0, 0.1, 1.0 / 3.0]),
+    response_relative=np.array([1.0, 0.98, 0.1]),
+    sigma={
+        "fx_px": 0.1,
+        "range_constant_dn_m2_per_s": 1e6 / 3.0,
+        "position_body_m": 1e-3,
+        "rotation_body_camera": 2e-3,
+        "saturation_dn": 0.5,
+    },
+)
+
+
+def test_round_trip_through_text() -> None:
+    document = json.loads(json.dumps(calibration_document([FULL, calibration(camera="r1.left")])))
+    cameras = parse_calibration_document(document)
+    assert list(cameras) == ["r1.front", "r1.left"]
+    back = cameras["r1.front"]
+    for name in FULL.__dataclass_fields__:
+        if name not in ARRAYS:
+            assert getattr(back, name) == getattr(FULL, name), name
+    for name in ARRAYS[1:]:
+        assert np.array_equal(getattr(back, name), getattr(FULL, name)), name
+    np.testing.assert_allclose(back.rotation_body_camera, FULL.rotation_body_camera, atol=1e-15)
+
+
+def test_layout() -> None:
+    camera = calibration_document([FULL])["cameras"]["r1.front"]
+    assert camera["fx_px"] == {"value": 480.0, "sigma": 0.1}
+    assert camera["fy_px"] == 480.0
+    assert camera["quaternion_body_camera_xyzw"]["sigma"] == 2e-3
+    # A quarter turn about z, scalar last.
+    turned = calibration(rotation_body_camera=Rotation.from_euler("z", 90, degrees=True).as_matrix())
+    quaternion = calibration_document([turned])["cameras"]["r1.front"]["quaternion_body_camera_xyzw"]
+    np.testing.assert_allclose(quaternion, [0, 0, math.sqrt(0.5), math.sqrt(0.5)], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "text"),
+    [
+        ("fx_px", None, "the field is missing"),
+        ("fx_px", -1.0, "above 0"),
+        ("fx_px", {"value": 480.0}, "sigma"),
+        ("fx_px", {"value": 480.0, "sigma": -1.0}, "0 or more"),
+        ("fx_px", "480", "finite number"),
+        ("width_px", 1280.5, "whole number"),
+        ("position_body_m", [0.0, 1.0], "3 numbers"),
+        ("quaternion_body_camera_xyzw", [0.0, 0.0, 0.0, 1.1], "unit quaternion"),
+        ("response_angle_rad", [0.0, 0.2, 0.1], "increase"),
+        ("response_angle_rad", [0.0, 0.2], "2 numbers"),
+        ("read_noise_e", -3.0, "0 or more"),
+    ],
+)
+def test_bad_entries_name_camera_and_field(field: str, value: Any, text: str) -> None:
+    document = calibration_document([FULL])
+    camera = document["cameras"]["r1.front"]
+    if value is None:
+        del camera[field]
+    else:
+        camera[field] = value
+    with pytest.raises(RecordingError, match=rf"calibration.json, field 'cameras.r1.front.*{text}"):
+        parse_calibration_document(document)
+
+
+def test_what_cannot_be_written() -> None:
+    with pytest.raises(ValueError, match="two calibrations"):
+        calibration_document([FULL, FULL])
+    with pytest.raises(ValueError, match="no entry"):
+        calibration_document([calibration(sigma={"fx": 1.0})])
+    with pytest.raises(ValueError, match="rotation"):
+        calibration_document([calibration(rotation_body_camera=np.diag([1.0, 1.0, -1.0]))])
+
+
+def test_cameras_must_be_an_object() -> None:
+    with pytest.raises(RecordingError, match="cameras"):
+        parse_calibration_document({"format": 1, "cameras": []})
