@@ -1,7 +1,8 @@
 """The flux of a source in a noise-free frame, as photometry measures it.
 
 Set up: one source of the preset `infra_swarm` before a camera of that preset, the noise-free frame in
-electrons, and a plain sum over a wide window as photometry: neither knows how the frame was made.
+electrons, and perception's aperture photometry about its brightest pixel, which knows nothing of how the frame
+was made.
 
 Why: everything that ranges by light stands on the inverse square law and on the absolute scale.
 """
@@ -13,6 +14,7 @@ import pytest
 from scipy.integrate import dblquad, quad
 
 from nir_render import expected_electrons, render
+from perception.photometry import aperture_flux
 from tests.physics.conftest import SceneMaker, source_at
 
 pytestmark = pytest.mark.mitsuba
@@ -22,7 +24,10 @@ _RANGES_M = np.geomspace(1.0, 10.0, 7)
 
 def _measured_flux_e(scene_with: SceneMaker, changes: dict[str, object], exposure_s: float) -> float:
     scene = scene_with(changes)
-    return float(expected_electrons(render(scene, "r1.front"), scene, exposure_s).sum())
+    image_e = expected_electrons(render(scene, "r1.front"), scene, exposure_s)
+    v_px, u_px = np.unravel_index(int(image_e.argmax()), image_e.shape)
+    # Wide enough for the largest image (6 × 9 px at 40° and 1 m) and the blur: no light on the rim.
+    return aperture_flux(image_e, float(u_px), float(v_px), 20.0, 20.0, 30.0).flux
 
 
 @pytest.mark.parametrize(("radius", "kind"), [("10 mm", "resolved at 1 m, 4.8 px"), ("0.1 mm", "unresolved")])

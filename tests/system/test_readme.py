@@ -30,7 +30,9 @@ def checkout(tmp_path: Path) -> Path:
 def test_the_python_snippets_run_in_order(checkout: Path) -> None:
     code = "\n".join(_blocks("python"))
     assert "nr.render(scene" in code
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=checkout, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=checkout, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     found = re.match(r"([\d.]+) ± ([\d.]+) m at", done.stdout)
     assert found is not None, done.stdout
@@ -54,7 +56,9 @@ def test_every_command_and_target_that_is_named_exists() -> None:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
     shown = set(re.findall(r"^\| `nir-render (\w+)", README, re.MULTILINE))
     run = [sys.executable, "-c", "from nir_render.cli import main; main()", "--help"]
-    help_text = subprocess.run(run, capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "120"}).stdout
+    help_text = subprocess.run(
+        run, capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "120"}
+    ).stdout
     offered = set(re.findall(r"^│ (\w+) ", help_text, re.MULTILINE))
     assert shown == offered
 
