@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.exposure import Beam, beam_window
+from nir_render.camera.exposure_control import next_exposure_s
 from nir_render.camera.psf import Window
 from nir_render.camera.response import response
 from nir_render.camera.sensor import read_out
@@ -19,6 +20,8 @@ from nir_render.randomness import generator
 from nir_render.scene.load import Scene
 from nir_render.transport.light import Light
 from perception.types import RawFrame
+
+_SETTLING_FRAMES = 8  # steps of at most 4: enough for a factor of 65 000
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,21 +71,42 @@ def expose(
 def simulate(scene: Scene, seed: int | None = None) -> Iterator[Shot]:
     """Yield frames with their truth: for each time of the clock, each observing camera.
 
-    `seed` replaces the scene's own.
+    `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
     """
     run_seed = scene.document.seed if seed is None else seed
+    exposures_s: dict[str, float] = {}
     for index, time_s in enumerate(scene.document.frame_times_s()):
         for name in scene.cameras():
             _, camera = scene.camera(name)
-            light = render(scene, name, time_s + 0.5 * camera.exposure_s, run_seed)
-            yield _shoot(light, scene, run_seed, index)
+            if name not in exposures_s:
+                exposures_s[name] = _settled_exposure(scene, name, time_s, run_seed)
+            exposure_s = exposures_s[name]
+            light = render(scene, name, time_s + 0.5 * exposure_s, run_seed)
+            shot = _shoot(light, scene, exposure_s, run_seed, index)
+            yield shot
+            if camera.auto_exposure is not None:
+                data_dn = shot.frame.data_dn
+                exposures_s[name] = next_exposure_s(camera.auto_exposure, camera.sensor, data_dn, exposure_s)
 
 
-def _shoot(light: Light, scene: Scene, seed: int, index: int) -> Shot:
+def _settled_exposure(scene: Scene, name: str, time_s: float, seed: int) -> float:
+    """Return the exposure that a camera has found before its first frame, by frames that are not kept."""
+    _, camera = scene.camera(name)
+    if camera.auto_exposure is None:
+        return camera.exposure_s
+    light = render(scene, name, time_s, seed)
+    exposure_s = camera.exposure_s
+    for frame in range(_SETTLING_FRAMES):
+        data_dn = expose(light, scene, exposure_s, seed, index=-1 - frame).data_dn
+        exposure_s = next_exposure_s(camera.auto_exposure, camera.sensor, data_dn, exposure_s)
+    return exposure_s
+
+
+def _shoot(light: Light, scene: Scene, exposure_s: float, seed: int, index: int) -> Shot:
     _, camera = scene.camera(light.camera)
-    windows = _windows(light, scene, camera.exposure_s)
+    windows = _windows(light, scene, exposure_s)
     expected_e = _sum(windows, camera.sensor.rows, camera.sensor.columns)
-    frame = _frame(light, scene, expected_e, camera.exposure_s, seed, index)
+    frame = _frame(light, scene, expected_e, exposure_s, seed, index)
     return Shot(frame, tuple(truth_of(scene, light, windows, expected_e, frame)))
 
 

@@ -215,8 +215,25 @@ class PointSpread(Document):
     sigma_px: Annotated[Pixels, Field(ge=0.3, le=20)]
 
 
+class AutoExposure(Document):
+    """Exposure that follows the brightest pixel of the last frame, to `target` of the range up to clipping."""
+
+    target: Annotated[Fraction, Field(gt=0, lt=1)] = 0.7
+    shortest_s: Annotated[Time, Positive]
+    longest_s: Annotated[Time, Positive]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.shortest_s > self.longest_s:
+            raise ValueError(f"shortest, {self.shortest_s:g} s, is longer than longest, {self.longest_s:g} s")
+        return self
+
+
 class Camera(PresetDocument):
-    """A camera on a robot. Without orientation it looks along the robot's x axis, upright."""
+    """A camera on a robot. Without orientation it looks along the robot's x axis, upright.
+
+    With `auto_exposure`, `exposure` is only where it starts from before the first frame is taken.
+    """
 
     preset_folder: ClassVar[str] = "cameras"
 
@@ -225,6 +242,7 @@ class Camera(PresetDocument):
     sensor: Sensor
     point_spread: PointSpread
     exposure_s: Annotated[Time, Positive]
+    auto_exposure: AutoExposure | None = None
     position_m: Position = (0.0, 0.0, 0.0)
     orientation: Orientation = Orientation()
 

@@ -16,9 +16,10 @@ Name = Annotated[str, Field(pattern=_NAME_PATTERN)]
 
 
 class Waypoint(Document):
-    """Where a robot is at one time; between two of them it moves evenly."""
+    """Where a robot is from one time on, for as long as `hold`; then it moves evenly to the next."""
 
     time_s: Time
+    hold_s: Annotated[Time, NotNegative] = 0.0
     position_m: Position
     orientation: Orientation = Orientation()
 
@@ -35,9 +36,12 @@ class Robot(Document):
     def _one_way_to_move(self) -> Self:
         if self.motion and self.model_fields_set & {"position_m", "orientation"}:
             raise ValueError("write either 'position' and 'orientation', or 'motion', not both")
-        times = [waypoint.time_s for waypoint in self.motion]
-        if any(later <= earlier for earlier, later in itertools.pairwise(times)):
-            raise ValueError("the times of 'motion' must increase")
+        for earlier, later in itertools.pairwise(self.motion):
+            if later.time_s <= earlier.time_s + earlier.hold_s:
+                raise ValueError(
+                    f"the times of 'motion' must increase: {later.time_s:g} s is not after {earlier.time_s:g} s "
+                    f"and its hold of {earlier.hold_s:g} s"
+                )
         return self
 
 

@@ -43,11 +43,15 @@ def robot_pose(robot: Robot, time_s: float) -> Pose:
     """Return the robot's pose in the world; before its first and after its last waypoint it stands still."""
     if not robot.motion:
         return Pose(rotation_of(robot.orientation), np.array(robot.position_m))
-    times_s = np.array([waypoint.time_s for waypoint in robot.motion])
+    # Each waypoint is two knots, its arrival and the end of its hold; np.interp and Slerp want them to increase.
+    stops = [(way.time_s, way) for way in robot.motion]
+    stops += [(way.time_s + way.hold_s, way) for way in robot.motion if way.hold_s > 0.0]
+    stops.sort(key=lambda stop: stop[0])
+    times_s = np.array([time for time, _ in stops])
     now_s = float(np.clip(time_s, times_s[0], times_s[-1]))
-    positions_m = np.array([waypoint.position_m for waypoint in robot.motion])
+    positions_m = np.array([way.position_m for _, way in stops])
     position_m = np.array([np.interp(now_s, times_s, positions_m[:, axis]) for axis in range(3)])
-    rotations = [rotation_of(waypoint.orientation) for waypoint in robot.motion]
+    rotations = [rotation_of(way.orientation) for _, way in stops]
     if len(rotations) == 1:
         return Pose(rotations[0], position_m)
     return Pose(Slerp(times_s, Rotation.from_matrix(np.array(rotations)))(now_s).as_matrix(), position_m)

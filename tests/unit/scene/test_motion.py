@@ -48,6 +48,24 @@ def test_a_robot_moves_evenly_between_waypoints_and_rests_beyond_them() -> None:
     assert np.degrees(np.arctan2(turned[1], turned[0])) == pytest.approx(45.0)
 
 
+def test_a_robot_stands_still_while_it_holds() -> None:
+    robot = _robot(
+        motion=[
+            {"time": "0 s", "position": "[0, 0, 0] m", "hold": "2 s"},
+            {"time": "3 s", "position": "[1, 0, 0] m", "hold": "1 s"},
+        ]
+    )
+    x_m = [float(robot_pose(robot, time_s).position_m[0]) for time_s in (-1.0, 0.0, 1.9, 2.5, 3.0, 3.9, 9.0)]
+    assert x_m == pytest.approx([0.0, 0.0, 0.0, 0.5, 1.0, 1.0, 1.0])
+    with pytest.raises(ValueError, match=r"3 s is not after 0 s and its hold of 3 s"):
+        _robot(
+            motion=[
+                {"time": "0 s", "position": "[0, 0, 0] m", "hold": "3 s"},
+                {"time": "3 s", "position": "[1, 0, 0] m"},
+            ]
+        )
+
+
 def test_times_of_waypoints_increase() -> None:
     with pytest.raises(ValueError, match="must increase"):
         _robot(motion=[{"time": "1 s", "position": "[0, 0, 0] m"}] * 2)
