@@ -6,12 +6,14 @@ frame = expose(light, scene, exposure_s=2e-4)
 """
 
 from nir_render.errors import InputError
+from nir_render.expected import expected_electrons
 from nir_render.scene.load import Scene, load_scene
-from nir_render.simulate import Shot, expected_electrons, expose, render, simulate
-from nir_render.transport.light import DirectTable, Light
+from nir_render.simulate import Shot, expose, render, simulate
+from nir_render.transport.light import DirectTable, Indirect, Light
 
 __all__ = [
     "DirectTable",
+    "Indirect",
     "InputError",
     "Light",
     "Scene",

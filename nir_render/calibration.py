@@ -1,6 +1,7 @@
 """What perception may know about a camera of a scene: its calibration, exact.
 
-The range constants are those of the scene's sources; where these differ, their mean, with their spread as σ.
+The range constants are those of the sources of the other robots (of its own, where there are no others);
+where these differ, their mean, with their spread as σ.
 """
 
 import math
@@ -33,7 +34,10 @@ def calibration(scene: Scene, camera: str) -> Calibration:
         No such camera, or no source to range to.
     """
     _, device = scene.camera(camera)
-    sources = [source for _, source in scene.sources().values()]
+    own = camera.partition(".")[0] + "."
+    everyone = {name: source for name, (_, source) in scene.sources().items()}
+    others = [source for name, source in everyone.items() if not name.startswith(own)]
+    sources = others or list(everyone.values())
     if not sources:
         raise InputError(f"{scene.path}: robots: no robot has a source, so there is no range constant")
     intrinsics = intrinsics_of(device)
@@ -107,7 +111,7 @@ def _paper_constant(known: Calibration, camera: Camera, source: Source) -> float
 def _beam(camera: Camera, source: Source, range_m: float) -> Beam:
     return Beam(
         direction=np.array([0.0, 0.0, 1.0]),
-        angular_radius_rad=float(np.arcsin(source.radius_m / range_m)),
+        angular_radius_rad=float(np.arcsin(min(source.radius_m / range_m, 1.0))),
         irradiance_w_per_m2=source.flux_w / (4.0 * np.pi * range_m**2),
         response=response(camera, source),
     )

@@ -4,11 +4,13 @@ Exit status: 0 done, 1 the work failed or a check did not hold, 2 the input was 
 """
 
 import json
+import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import yaml
@@ -17,6 +19,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from nir_render.errors import InputError
+
+if TYPE_CHECKING:
+    from perception import Estimator
 
 app = typer.Typer(
     name="nir-render",
@@ -36,7 +41,7 @@ Output = Annotated[
 Settings = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="PATH=VALUE", help='Change the scene: --set robots.r2.position="[3, 0, 0] m".'
+        "--set", metavar="PATH=VALUE", help='Change the scene: --set robots.r2.rig.sources.top.flux="0.1 W".'
     ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the run that the folder holds.")]
@@ -46,7 +51,11 @@ Threads = Annotated[
 ]
 Estimators = Annotated[
     list[str] | None,
-    typer.Option("--estimator", metavar="NAME", help="paper or robust; both by default. Repeatable."),
+    typer.Option(
+        "--estimator",
+        metavar="NAME",
+        help="paper, robust, or one's own as file.py:function; paper and robust by default. Repeatable.",
+    ),
 ]
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else there.")
@@ -55,6 +64,8 @@ Json = Annotated[
 
 def main() -> None:
     """Run the command; turn errors that a user can mend into their text and exit status 2."""
+    # Asked to end, it ends as by Ctrl-C: what was written aside goes.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         app()
     except InputError as error:
@@ -74,14 +85,18 @@ def run(
     threads: Threads = None,
     as_json: Json = False,
 ) -> None:
-    """Render, perceive and evaluate a scene in one go."""
-    from nir_render.run import evaluate_run, perceive_run
+    """Render, perceive, evaluate and report a scene in one go."""
+    from nir_render.run import evaluate_run, perceive_run, report_run
 
-    names = _estimators(estimators)
+    chosen = _estimators(estimators)
     folder = _render(scene, output, settings, overwrite, seed, threads)
     with _progress("perceive") as progress:
-        perceive_run(folder, estimators=names, progress=progress)
-    _show_evaluation(evaluate_run(folder), folder, as_json)
+        perceive_run(folder, estimators=chosen, progress=progress)
+    result = evaluate_run(folder)
+    page = report_run(folder, result)
+    _show_evaluation(result, folder, as_json)
+    if not as_json:
+        typer.echo(f"open {page}")
 
 
 @app.command()
@@ -126,28 +141,80 @@ def evaluate(folder: FolderArgument, as_json: Json = False) -> None:
 
 
 @app.command()
+def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
+    """Fit the range constants to frames at known ranges; judge them on every other range, held out."""
+    from nir_render.calibrate_run import FITTED_FILE, calibrate_run
+    from nir_render.report.calibration_table import calibration_table
+
+    with _progress("calibrate") as progress:
+        cameras = calibrate_run(folder, progress)
+    holds = not any(camera.faults for camera in cameras.values())
+    if as_json:
+        records = {name: camera.record() for name, camera in cameras.items()}
+        _print_json({"format": 1, "folder": str(folder), "holds": holds, "cameras": records})
+    else:
+        console = Console()
+        for name, camera in cameras.items():
+            console.print(calibration_table(name, camera))
+        if holds:
+            console.print(f"{folder / FITTED_FILE}: written", soft_wrap=True, highlight=False)
+    if not holds:
+        for name, camera in cameras.items():
+            for fault in camera.faults:
+                _errors.print(f"[bold red]check failed:[/] {name}: {_escape(fault)}", soft_wrap=True)
+        _errors.print(f"{folder / FITTED_FILE}: not written", soft_wrap=True)
+        raise typer.Exit(1)
+
+
+@app.command()
+def report(folder: FolderArgument, as_json: Json = False) -> None:
+    """Evaluate a run, and show it on a page that opens from disk: report.html."""
+    from nir_render.run import evaluate_run, report_run
+
+    page = report_run(folder, evaluate_run(folder))
+    if as_json:
+        _print_json({"folder": str(folder), "report": str(page)})
+    else:
+        typer.echo(f"open {page}")
+
+
+@app.command()
+def new(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that is new or empty.")],
+    as_json: Json = False,
+) -> None:
+    """Make a folder with commented example scenes to change, and an estimator of one's own."""
+    from nir_render.examples import FIRST_SCENE, new_examples
+
+    files = new_examples(folder)
+    if as_json:
+        _print_json({"folder": str(folder), "files": files})
+    else:
+        typer.echo(f"{', '.join(files)} in {folder}")
+        typer.echo(f"next: nir-render run {shlex.quote(str(folder / FIRST_SCENE))}")
+
+
+@app.command()
 def validate(
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene files.")],
     as_json: Json = False,
 ) -> None:
     """Check scene files: every error names file, line, field and what was wanted."""
     from nir_render.scene.load import load_scene
-    from nir_render.transport.world import not_rendered
 
     problems: list[str] = []
-    warnings: dict[str, list[str]] = {}
+    valid: list[str] = []
     for path in scenes:
         try:
-            warnings[str(path)] = not_rendered(load_scene(path))
+            load_scene(path)
+            valid.append(str(path))
         except InputError as error:
             problems += error.problems
     if as_json:
-        _print_json({"errors": problems, "not_rendered_yet": warnings})
+        _print_json({"valid": valid, "errors": problems})
     else:
-        for path_name, lines in warnings.items():
-            typer.echo(f"{path_name}: valid" + (", but not rendered yet:" if lines else ""))
-            for line in lines:
-                typer.echo(f"  {line}")
+        for name in valid:
+            typer.echo(f"{name}: valid")
     if problems:
         raise InputError(*problems)
 
@@ -195,16 +262,19 @@ def _render(
     check_free(folder, overwrite)
     if threads is not None:
         set_threads(threads)
+    if seed is not None:
+        scene = scene.with_({"seed": seed})
     with _progress("render") as progress:
-        run_seed = scene.document.seed if seed is None else seed
-        render_run(scene, folder, seed=run_seed, overwrite=overwrite, progress=progress)
+        render_run(scene, folder, overwrite=overwrite, progress=progress)
     return folder
 
 
 def _setting(text: str) -> tuple[str, Any]:
     path, equals, value = text.partition("=")
     if not equals or not path:
-        raise InputError(f'--set {text}: wanted PATH=VALUE, such as --set robots.r2.position="[3, 0, 0] m"')
+        raise InputError(
+            f'--set {text}: wanted PATH=VALUE, such as --set robots.r2.rig.sources.top.flux="0.1 W"'
+        )
     try:
         return path.strip(), _yaml_value(value)
     except yaml.YAMLError:
@@ -218,13 +288,11 @@ def _yaml_value(text: str) -> Any:
     return yaml.safe_load(text)
 
 
-def _estimators(names: list[str] | None) -> list[str]:
-    from nir_render.run import check_estimators
+def _estimators(names: list[str] | None) -> "dict[str, Estimator]":
+    from nir_render.run import chosen_estimators
     from perception import ESTIMATORS
 
-    chosen = list(dict.fromkeys(names)) if names else list(ESTIMATORS)
-    check_estimators(chosen)
-    return chosen
+    return chosen_estimators(names or list(ESTIMATORS))
 
 
 def _show_evaluation(result: Any, folder: Path, as_json: bool) -> None:

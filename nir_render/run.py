@@ -1,28 +1,34 @@
-"""The stages of a run, each from folder to folder: render, perceive, evaluate."""
+"""The stages of a run, each from folder to folder: render, perceive, evaluate, report."""
 
 import importlib.metadata
 import platform
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
 
 from nir_render import run_folder
 from nir_render.errors import InputError
 from nir_render.evaluate.metrics import Evaluation, FrameKey, evaluate
-from nir_render.evaluate.truth import parse_truth
+from nir_render.evaluate.truth import SourceTruth, parse_truth
 from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene
 from nir_render.simulate import simulate
 from perception import (
     ESTIMATORS,
+    Calibration,
     Detection,
+    Estimator,
+    EstimatorError,
     RecordingError,
     calibration_document,
     detect,
     detection_record,
     encode_png16,
     frame_record,
+    load_estimator,
     parse_detection,
     read_calibrations,
     read_frame,
@@ -30,19 +36,12 @@ from perception import (
     read_frames,
 )
 
+Item = TypeVar("Item")
 Progress = Callable[[int, int], None]
 """Called with the number of frames done, and of all."""
 
 
-@dataclass(frozen=True)
-class Rendered:
-    """What `render_run` made."""
-
-    frames: int
-    seconds: float
-
-
-def render_run(scene: Scene, folder: Path, *, seed: int, overwrite: bool, progress: Progress) -> Rendered:
+def render_run(scene: Scene, folder: Path, *, overwrite: bool, progress: Progress) -> None:
     """Render the frames of a scene with their truth and calibration into a new run folder.
 
     Raises
@@ -58,12 +57,13 @@ def render_run(scene: Scene, folder: Path, *, seed: int, overwrite: bool, progre
     total = scene.document.clock.frames * len(cameras)
     calibrations = {name: scene.calibration(name) for name in cameras}
     with run_folder.new_run_folder(folder, overwrite) as aside:
-        records, truth = [], []
-        for done, shot in enumerate(simulate(scene, seed)):
+        records, truth, noise_shares = [], [], []
+        for done, shot in enumerate(simulate(scene)):
             file = f"frames/{shot.frame.camera}/{shot.frame.index:06d}.png"
             run_folder.write_file(aside / file, encode_png16(shot.frame.data_dn))
             records.append(frame_record(shot.frame, file))
             truth += [row.record() for row in shot.truth]
+            noise_shares.append(shot.render_noise_share)
             progress(done + 1, total)
         run_folder.write_lines(aside / "frames.jsonl", records)
         run_folder.write_lines(aside / "truth.jsonl", truth)
@@ -72,34 +72,68 @@ def render_run(scene: Scene, folder: Path, *, seed: int, overwrite: bool, progre
         seconds = time.perf_counter() - started
         facts = {
             "scene": scene.document.name,
-            "seed": seed,
+            "seed": scene.document.seed,
             "versions": versions(),
             "variant": backend().variant,
             "variant_reason": backend().reason,
             "seconds": {"render": round(seconds, 3)},
-            # The direct part is closed form: it carries no Monte Carlo noise.
-            "render_noise": {"share_of_temporal_variance": 0.0},
+            "indirect": _indirect_facts(scene),
+            # Variance of the Monte Carlo part over shot and read noise, medians over each frame; the direct
+            # part is closed form and carries none.
+            "render_noise": {
+                "share_of_temporal_variance": round(float(np.median(noise_shares)), 6),
+                "largest_share": round(max(noise_shares), 6),
+            },
         }
         run_folder.write_manifest(aside, facts)
-    return Rendered(total, seconds)
 
 
-def check_estimators(names: Sequence[str]) -> None:
-    """Raise InputError where an estimator is unknown."""
-    for name in names:
-        if name not in ESTIMATORS:
-            raise InputError(f"--estimator {name}: unknown; known: {', '.join(ESTIMATORS)}")
+def _indirect_facts(scene: Scene) -> dict[str, Any]:
+    from nir_render.transport import stock, world
+
+    settings = scene.document.render.indirect
+    samples = stock.samples_of(scene)
+    note = "" if samples == settings.samples else f"{settings.samples} asked for; no usable LLVM"
+    rendered = world.has_indirect_light(scene)
+    return {"rendered": rendered, "scale": settings.scale, "samples": samples, "note": note}
 
 
-def perceive_run(folder: Path, *, estimators: Sequence[str], progress: Progress) -> dict[str, int]:
-    """Run the perception stack over the frames of a folder; returns the number of detections by estimator.
+def chosen_estimators(names: Sequence[str]) -> dict[str, Estimator]:
+    """Return the estimators of these names, by name; `file.py:function` loads one of the user's own.
 
     Raises
     ------
     InputError
-        The folder is no recording, or an estimator is unknown.
+        An estimator is unknown or cannot be loaded, or two of them have the same name.
     """
-    check_estimators(estimators)
+    chosen: dict[str, Estimator] = {}
+    for name in dict.fromkeys(names):
+        if name in ESTIMATORS:
+            chosen[name] = ESTIMATORS[name]
+            continue
+        if ":" not in name and not name.endswith(".py"):
+            known = ", ".join(ESTIMATORS)
+            raise InputError(f"--estimator {name}: unknown; known: {known}, or one's own as file.py:function")
+        try:
+            own = load_estimator(name)
+        except EstimatorError as error:
+            raise InputError(f"--estimator {error}") from None
+        if own.name in chosen:
+            raise InputError(
+                f"--estimator {name}: another estimator is called {own.name!r} too; rename one of them"
+            )
+        chosen[own.name] = own
+    return chosen
+
+
+def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress: Progress) -> dict[str, int]:
+    """Run estimators over the frames of a folder; returns the number of detections by estimator.
+
+    Raises
+    ------
+    InputError
+        The folder is no recording, or one's own estimator fails on a frame.
+    """
     started = time.perf_counter()
     found: dict[str, list[Detection]] = {name: [] for name in estimators}
     try:
@@ -108,14 +142,18 @@ def perceive_run(folder: Path, *, estimators: Sequence[str], progress: Progress)
         for done, frame in enumerate(read_frames(folder)):
             if frame.camera not in calibrations:
                 raise InputError(f"{folder / 'calibration.json'}: knows no camera {frame.camera!r}")
-            for name in estimators:
-                found[name] += detect(frame, calibrations[frame.camera], name)
+            for name, estimator in estimators.items():
+                found[name] += detect(frame, calibrations[frame.camera], estimator)
             progress(done + 1, total)
-    except RecordingError as error:
+    except EstimatorError as error:
+        raise InputError(f"--estimator {error}") from None
+    except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
+    if not any(folder.joinpath("frames.jsonl").read_text(encoding="utf-8").split()):
+        raise InputError(f"{folder / 'frames.jsonl'}: names no frame")
     for name, detections in found.items():
         run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, detections))
-    _note_seconds(folder, "perceive", started)
+    note_seconds(folder, "perceive", started)
     return {name: len(detections) for name, detections in found.items()}
 
 
@@ -138,26 +176,93 @@ def evaluate_run(folder: Path) -> Evaluation:
         raise InputError(f"{folder}: there are no detections; run 'nir-render perceive {folder}' first")
     try:
         calibrations = read_calibrations(folder)
-        keys = [
-            (record["camera"], int(record["index"]))
-            for record in run_folder.read_lines(folder / "frames.jsonl")
-        ]
-        truth = [parse_truth(record) for record in run_folder.read_lines(truth_path)]
+        keys = [(record.camera, record.index) for record in read_frame_records(folder)]
+        if not keys:
+            raise InputError(f"{folder / 'frames.jsonl'}: names no frame")
+        truth = _parse_lines(truth_path, parse_truth)
         detections = {
-            path.name.removeprefix("detections.").removesuffix(".jsonl"): [
-                parse_detection(record) for record in run_folder.read_lines(path)
-            ]
+            path.name.removeprefix("detections.").removesuffix(".jsonl"): _parse_lines(path, parse_detection)
             for path in paths
         }
+        _check_frames_known(keys, truth, detections, calibrations, folder)
         result = evaluate(keys, truth, calibrations, detections)
+        preview = _preview(folder, keys, result)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    run_folder.write_json(folder / "summary.json", result.summary)
+    run_folder.write_file(folder / "preview.png", preview)
+    note_seconds(folder, "evaluate", started)
+    return result
+
+
+def report_run(folder: Path, result: Evaluation) -> Path:
+    """Write `report.html` from what lies in a run folder and its evaluation; returns the page's path.
+
+    Raises
+    ------
+    InputError
+        A frame or the calibration cannot be read.
+    """
+    from nir_render.report.page import report_html
+
+    started = time.perf_counter()
+    has_manifest = (folder / run_folder.MANIFEST).is_file()
+    try:
+        records = {(record.camera, record.index): record for record in read_frame_records(folder)}
+        page = report_html(
+            keys=list(records),
+            result=result,
+            load=lambda key: read_frame(folder, records[key]),
+            calibrations=read_calibrations(folder),
+            manifest=run_folder.read_json(folder / run_folder.MANIFEST) if has_manifest else {},
+            folder_name=folder.resolve().name,
+            files=sorted(
+                path.name
+                for path in folder.iterdir()
+                if path.is_file() and not path.name.startswith(".") and path.name != "report.html"
+            ),
+        )
     except RecordingError as error:
         raise InputError(str(error)) from None
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{folder}: a line of truth, frames or detections is broken ({error})") from None
-    run_folder.write_json(folder / "summary.json", result.summary)
-    run_folder.write_file(folder / "preview.png", _preview(folder, keys, result))
-    _note_seconds(folder, "evaluate", started)
-    return result
+    run_folder.write_file(folder / "report.html", page.encode())
+    note_seconds(folder, "report", started)
+    return folder / "report.html"
+
+
+def _parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
+    """Parse a file of JSON lines; raise InputError with file and line where one is broken."""
+    items = []
+    for number, record in enumerate(run_folder.read_lines(path), 1):
+        try:
+            items.append(parse(record))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"{path}, line {number}: {error}") from None
+    return items
+
+
+def _check_frames_known(
+    keys: Sequence[FrameKey],
+    truth: Sequence[SourceTruth],
+    detections: Mapping[str, Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+    folder: Path,
+) -> None:
+    """Raise InputError where a line speaks of a frame or camera that the recording does not have."""
+    for camera in dict.fromkeys(camera for camera, _ in keys):
+        if camera not in calibrations:
+            raise InputError(f"{folder / 'calibration.json'}: knows no camera {camera!r}")
+    lines: dict[str, Sequence[SourceTruth | Detection]] = {"truth.jsonl": truth}
+    lines |= {f"detections.{name}.jsonl": found for name, found in detections.items()}
+    known = set(keys)
+    for file, items in lines.items():
+        for item in items:
+            if (item.camera, item.index) not in known:
+                raise InputError(
+                    f"{folder / file}: speaks of frame {item.index} of {item.camera}, "
+                    "which frames.jsonl does not name"
+                )
 
 
 def _preview(folder: Path, keys: Sequence[FrameKey], result: Evaluation) -> bytes:
@@ -187,7 +292,8 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), "platform": platform.platform(), **known}
 
 
-def _note_seconds(folder: Path, stage: str, started: float) -> None:
+def note_seconds(folder: Path, stage: str, started: float) -> None:
+    """Add to the manifest, where there is one, how long a stage took, and the hashes of what it wrote."""
     if not (folder / run_folder.MANIFEST).is_file():
         return
     seconds = run_folder.read_json(folder / run_folder.MANIFEST).get("seconds", {})

@@ -164,10 +164,10 @@ def _replace(folder: Path, aside: Path) -> None:
     try:
         aside.rename(folder)
     except OSError:
-        (old / folder.name).rename(folder)
+        (old / folder.name).rename(folder)  # if this fails too, the old run stays where it was put
+        old.rmdir()
         raise
-    finally:
-        shutil.rmtree(old, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _sync_folder(folder: Path) -> None:

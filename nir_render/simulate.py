@@ -4,20 +4,18 @@ Light is rendered once for a geometry; exposing it is arithmetic.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nir_render.camera.exposure import Beam, beam_window
 from nir_render.camera.exposure_control import next_exposure_s
-from nir_render.camera.psf import Window
-from nir_render.camera.response import response
 from nir_render.camera.sensor import read_out
 from nir_render.errors import InputError
 from nir_render.evaluate.truth import SourceTruth, truth_of
+from nir_render.expected import Expected, expected
 from nir_render.randomness import generator
 from nir_render.scene.load import Scene
+from nir_render.scene.motion import robot_pose
 from nir_render.transport.light import Light
 from perception.types import RawFrame
 
@@ -26,46 +24,40 @@ _SETTLING_FRAMES = 8  # steps of at most 4: enough for a factor of 65 000
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame and the truth about the sources in it."""
+    """A frame, the truth about the sources in it, and the share of its noise that comes from rendering."""
 
     frame: RawFrame
     truth: tuple[SourceTruth, ...]
+    render_noise_share: float
 
 
-def render(scene: Scene, camera: str, time_s: float = 0.0, seed: int = 0) -> Light:
+def render(scene: Scene, camera: str, time_s: float = 0.0, seed: int | None = None) -> Light:
     """Return the light that reaches a camera, `robot.camera`, with the scene's geometry at `time_s`.
+
+    `seed` replaces the scene's own.
 
     Raises
     ------
     InputError
-        No such camera, a part of the scene that is not rendered yet, a camera inside a body.
+        No such camera, or the camera is inside a body.
     """
-    from nir_render.transport import direct  # Mitsuba loads only where light is rendered
+    from nir_render.transport import render as transport  # Mitsuba loads only where light is rendered
 
-    return direct.render(scene, camera, time_s, seed)
-
-
-def expected_electrons(light: Light, scene: Scene, exposure_s: float | None = None) -> NDArray[np.float64]:
-    """Return the noise-free frame: mean photoelectrons per pixel, shape (rows, columns).
-
-    Without `exposure_s` the camera's own exposure is used.
-    """
-    _, camera = scene.camera(light.camera)
-    windows = _windows(light, scene, _exposure(camera.exposure_s, exposure_s))
-    return _sum(windows, camera.sensor.rows, camera.sensor.columns)
+    return transport.render(scene, camera, time_s, scene.document.seed if seed is None else seed)
 
 
 def expose(
-    light: Light, scene: Scene, exposure_s: float | None = None, seed: int = 0, index: int = 0
+    light: Light, scene: Scene, exposure_s: float | None = None, seed: int | None = None, index: int = 0
 ) -> RawFrame:
     """Return the raw frame that a camera takes of a light, its noise keyed by (seed, camera, index).
 
-    The light's time is mid-exposure; the frame's `time_s` the start of the exposure.
+    The light's time is mid-exposure; the frame's `time_s` the start of the exposure. `exposure_s` replaces
+    the camera's own exposure, `seed` the one that the light was rendered with.
     """
     _, camera = scene.camera(light.camera)
-    exposure = _exposure(camera.exposure_s, exposure_s)
-    expected_e = expected_electrons(light, scene, exposure)
-    return _frame(light, scene, expected_e, exposure, seed, index)
+    seed = light.seed if seed is None else seed
+    exposure_s = camera.exposure_s if exposure_s is None else exposure_s
+    return _frame(expected(light, scene, exposure_s), scene, seed, index)
 
 
 def simulate(scene: Scene, seed: int | None = None) -> Iterator[Shot]:
@@ -75,83 +67,56 @@ def simulate(scene: Scene, seed: int | None = None) -> Iterator[Shot]:
     """
     run_seed = scene.document.seed if seed is None else seed
     exposures_s: dict[str, float] = {}
+    lights: dict[str, tuple[bytes, Light]] = {}
     for index, time_s in enumerate(scene.document.frame_times_s()):
         for name in scene.cameras():
             _, camera = scene.camera(name)
             if name not in exposures_s:
-                exposures_s[name] = _settled_exposure(scene, name, time_s, run_seed)
+                lights[name] = _light(scene, name, time_s, run_seed, lights.get(name))
+                exposures_s[name] = _settled_exposure(scene, lights[name][1], run_seed)
             exposure_s = exposures_s[name]
-            light = render(scene, name, time_s + 0.5 * exposure_s, run_seed)
-            shot = _shoot(light, scene, exposure_s, run_seed, index)
-            yield shot
+            lights[name] = _light(scene, name, time_s + 0.5 * exposure_s, run_seed, lights.get(name))
+            mean = expected(lights[name][1], scene, exposure_s)
+            frame = _frame(mean, scene, run_seed, index)
+            yield Shot(frame, tuple(truth_of(scene, mean, frame)), mean.render_noise_share)
             if camera.auto_exposure is not None:
-                data_dn = shot.frame.data_dn
-                exposures_s[name] = next_exposure_s(camera.auto_exposure, camera.sensor, data_dn, exposure_s)
+                exposures_s[name] = next_exposure_s(
+                    camera.auto_exposure, camera.sensor, frame.data_dn, exposure_s
+                )
 
 
-def _settled_exposure(scene: Scene, name: str, time_s: float, seed: int) -> float:
+def _light(
+    scene: Scene, name: str, time_s: float, seed: int, last: tuple[bytes, Light] | None
+) -> tuple[bytes, Light]:
+    """Return the light at a time, rendered anew only where something has moved since the last."""
+    poses = [robot_pose(robot, time_s) for robot in scene.document.robots.values()]
+    geometry = b"".join(pose.rotation.tobytes() + pose.position_m.tobytes() for pose in poses)
+    if last is not None and last[0] == geometry:
+        return geometry, replace(last[1], time_s=time_s)
+    return geometry, render(scene, name, time_s, seed)
+
+
+def _settled_exposure(scene: Scene, light: Light, seed: int) -> float:
     """Return the exposure that a camera has found before its first frame, by frames that are not kept."""
-    _, camera = scene.camera(name)
-    if camera.auto_exposure is None:
-        return camera.exposure_s
-    light = render(scene, name, time_s, seed)
+    _, camera = scene.camera(light.camera)
     exposure_s = camera.exposure_s
-    for frame in range(_SETTLING_FRAMES):
-        data_dn = expose(light, scene, exposure_s, seed, index=-1 - frame).data_dn
-        exposure_s = next_exposure_s(camera.auto_exposure, camera.sensor, data_dn, exposure_s)
+    if camera.auto_exposure is not None:
+        for frame in range(_SETTLING_FRAMES):
+            data_dn = expose(light, scene, exposure_s, seed, index=-1 - frame).data_dn
+            exposure_s = next_exposure_s(camera.auto_exposure, camera.sensor, data_dn, exposure_s)
     return exposure_s
 
 
-def _shoot(light: Light, scene: Scene, exposure_s: float, seed: int, index: int) -> Shot:
-    _, camera = scene.camera(light.camera)
-    windows = _windows(light, scene, exposure_s)
-    expected_e = _sum(windows, camera.sensor.rows, camera.sensor.columns)
-    frame = _frame(light, scene, expected_e, exposure_s, seed, index)
-    return Shot(frame, tuple(truth_of(scene, light, windows, expected_e, frame)))
-
-
-def _exposure(own_s: float, asked_s: float | None) -> float:
-    if asked_s is None:
-        return own_s
-    if not (np.isfinite(asked_s) and asked_s > 0):
-        raise InputError(f"exposure_s is {asked_s!r}; wanted seconds greater than 0")
-    return asked_s
-
-
-def _windows(light: Light, scene: Scene, exposure_s: float) -> list[Window]:
-    """Return the expected electrons of each row of the direct table."""
-    _, camera = scene.camera(light.camera)
-    sources = scene.sources()
-    table = light.direct
-    windows = []
-    for row, group in enumerate(table.group):
-        source = sources[light.groups[group]][1]
-        beam = Beam(
-            direction=table.direction[row],
-            angular_radius_rad=float(table.angular_radius_rad[row]),
-            irradiance_w_per_m2=float(table.irradiance_per_w[row, 0]) * source.flux_w,
-            response=response(camera, source),
-        )
-        windows.append(beam_window(camera, beam, exposure_s))
-    return windows
-
-
-def _sum(windows: list[Window], rows: int, columns: int) -> NDArray[np.float64]:
-    image = np.zeros((rows, columns))
-    for window in windows:
-        window.add_to(image)
-    return image
-
-
-def _frame(
-    light: Light, scene: Scene, expected_e: NDArray[np.float64], exposure_s: float, seed: int, index: int
-) -> RawFrame:
-    _, camera = scene.camera(light.camera)
+def _frame(mean: Expected, scene: Scene, seed: int, index: int) -> RawFrame:
+    name = mean.light.camera
+    _, camera = scene.camera(name)
+    if not np.isfinite(mean.electrons).all():
+        raise InputError(f"{scene.path}: the light of {name} is not finite; a body or source is degenerate")
     return RawFrame(
-        camera=light.camera,
+        camera=name,
         index=index,
-        time_s=light.time_s - 0.5 * exposure_s,
-        exposure_s=exposure_s,
-        data_dn=read_out(expected_e, camera.sensor, generator(seed, "read_out", light.camera, index)),
+        time_s=mean.light.time_s - 0.5 * mean.exposure_s,
+        exposure_s=mean.exposure_s,
+        data_dn=read_out(mean.electrons, camera.sensor, generator(seed, "read_out", name, index)),
         black_level_dn=camera.sensor.black_level_dn,
     )

@@ -10,12 +10,20 @@ It needs a frame and a calibration and nothing else, and runs unchanged on a rob
 estimator could do.
 """
 
-from perception.calibrate import PaperRegression, regress_paper_range_constant
+from perception.calibrate import (
+    PaperRegression,
+    RangeConstantFit,
+    regress_paper_range_constant,
+    regress_range_constant,
+)
 from perception.calibration_file import calibration_document, parse_calibration_document
 from perception.detection_file import detection_record, parse_detection
 from perception.json_fields import RecordingError
 from perception.limits import FlareLimit, flare_limit
+from perception.own_estimator import EstimatorError, OwnEstimator, load_estimator
 from perception.pipeline import ESTIMATORS, Estimator, detect
+from perception.rail import RailCalibration, calibrate_rail
+from perception.ranges_file import encode_ranges, read_ranges
 from perception.recording import (
     FrameRecord,
     encode_png16,
@@ -33,17 +41,24 @@ __all__ = [
     "Calibration",
     "Detection",
     "Estimator",
+    "EstimatorError",
     "FlareLimit",
     "FrameRecord",
+    "OwnEstimator",
     "PaperRegression",
+    "RailCalibration",
+    "RangeConstantFit",
     "RawFrame",
     "RecordingError",
+    "calibrate_rail",
     "calibration_document",
     "detect",
     "detection_record",
     "encode_png16",
+    "encode_ranges",
     "flare_limit",
     "frame_record",
+    "load_estimator",
     "parse_calibration_document",
     "parse_detection",
     "parse_frame_record",
@@ -51,5 +66,7 @@ __all__ = [
     "read_frame",
     "read_frame_records",
     "read_frames",
+    "read_ranges",
     "regress_paper_range_constant",
+    "regress_range_constant",
 ]

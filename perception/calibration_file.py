@@ -5,13 +5,14 @@ as `quaternion_body_camera_xyzw` and `position_body_m`. An entry whose standard 
 as {"value": v, "sigma": s}; that of the quaternion is an angle in radians.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perception.json_fields import Place, as_number, check_format, get, integer, number, numbers
+from perception.json_fields import Place, as_number, check_format, get, integer, number, number_or_nan, numbers
 from perception.types import Calibration
 
 _WHOLE = ("width_px", "height_px", "saturation_dn", "bit_depth")
@@ -62,6 +63,8 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     ):
         raise ValueError(f"rotation_body_camera of {calibration.camera!r} is no rotation matrix")
     record: dict[str, Any] = {name: getattr(calibration, name) for name in (*_WHOLE, *_POSITIVE, *_REAL)}
+    if math.isnan(calibration.range_constant_paper_dn_m2_per_s):
+        record["range_constant_paper_dn_m2_per_s"] = None  # its detector found too little to calibrate with
     record[_QUATERNION] = Rotation.from_matrix(matrix).as_quat(canonical=True).tolist()
     for name in ("position_body_m", "response_angle_rad", "response_relative"):
         record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
@@ -143,7 +146,7 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
         response_angle_rad=angles,
         response_relative=response,
         range_constant_dn_m2_per_s=real("range_constant_dn_m2_per_s"),
-        range_constant_paper_dn_m2_per_s=real("range_constant_paper_dn_m2_per_s"),
+        range_constant_paper_dn_m2_per_s=number_or_nan(values, "range_constant_paper_dn_m2_per_s", place),
         source_radius_m=real("source_radius_m"),
         wavelength_m=real("wavelength_m"),
         sigma=sigma,

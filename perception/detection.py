@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from perception.bearing import bearing_body, bearing_body_paper
 from perception.blobs import Blob, components, split_at_peaks
+from perception.contrast import stands_above_surroundings
 from perception.measurement import Measurement, is_extended, measure
 from perception.photometry import grey_levels_paper
 from perception.preparation import PreparedFrame, prepare
@@ -125,7 +126,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         blob
         for component in components(prepared.lit)
         for blob in _parted(component, prepared)
-        if not is_extended(blob, prepared)
+        if stands_above_surroundings(blob, prepared) and not is_extended(blob, prepared)
     ]
     measured = [(blob, measure(blob, prepared)) for blob in _brightest(blobs, prepared.filtered_e)]
     return [_detection(blob, found, frame, calibration) for blob, found in measured if found.stands_out]

@@ -40,6 +40,10 @@ class Window:
         right = min(calibration.width_px, math.floor(u_px + half_px + 0.5) + 1)
         return cls(top, left, max(0, bottom - top), max(0, right - left))
 
+    def grown(self, by_px: int) -> "Window":
+        """Return the window with a margin all around, which may reach beyond the image."""
+        return Window(self.top - by_px, self.left - by_px, self.height + 2 * by_px, self.width + 2 * by_px)
+
     @property
     def slices(self) -> tuple[slice, slice]:
         """Index of the window in an image."""

@@ -12,6 +12,10 @@ from perception.sensor import clip_level_e, noise_floor_e2
 from perception.types import Calibration
 
 
+WIDE_PX = 64.0
+"""Images larger than this, sources within arm's length, have their limit in closed form."""
+
+
 @dataclass(frozen=True)
 class FlareLimit:
     """Least standard deviations of one flare; infinite where the pixels cannot tell.
@@ -69,6 +73,20 @@ def covariance(information: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))
 
 
+def _wide_limit(
+    calibration: Calibration, range_m: float, flux_e: float, background_e: float, angular_radius: float
+) -> FlareLimit:
+    """Bound of a disc so wide that its rim tells nothing more: σ_F² = F + n (B + σ²) over its n pixels.
+
+    Its place is not asked for (NaN). A disc that is clipped all over tells nothing.
+    """
+    pixels = math.pi * (calibration.fx_px * math.tan(min(angular_radius, 1.5))) ** 2
+    if flux_e / pixels + background_e >= clip_level_e(calibration, calibration.black_level_dn):
+        return FlareLimit(math.nan, math.nan, math.inf, math.inf)
+    flux_sigma = math.sqrt(flux_e + pixels * (max(background_e, 0.0) + noise_floor_e2(calibration)))
+    return FlareLimit(math.nan, math.nan, flux_sigma, 0.5 * range_m * flux_sigma / flux_e)
+
+
 def flare_limit(
     calibration: Calibration,
     u_px: float,
@@ -111,6 +129,8 @@ def flare_limit(
     if not (range_m > 0.0 and flux_e > 0.0):
         raise ValueError(f"range_m and flux_e must be positive, not {range_m} and {flux_e}")
     angular_radius = angular_radius_rad(range_m, calibration.source_radius_m)
+    if image_radius_px(u_px, v_px, angular_radius, calibration) > WIDE_PX:
+        return _wide_limit(calibration, range_m, flux_e, background_e, angular_radius)
     # Beyond 8 σ the pixels tell about the background only, and a ring that wide tells it well enough.
     half_px = image_radius_px(u_px, v_px, angular_radius, calibration) + 8.0 * calibration.psf_sigma_px + 8.0
     window = Window.around(u_px, v_px, half_px, calibration)

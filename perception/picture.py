@@ -7,7 +7,12 @@ from numpy.typing import NDArray
 from perception.types import RawFrame
 
 
-def tone_map(data_dn: NDArray[np.uint16], black_level_dn: float, full_scale_dn: float) -> NDArray[np.uint8]:
+def tone_map(
+    data_dn: NDArray[np.uint16] | NDArray[np.float32],
+    black_level_dn: float,
+    full_scale_dn: float,
+    softening: float = 0.01,
+) -> NDArray[np.uint8]:
     """Map counts to 8 bits by an asinh curve, so that noise, faint and bright flares all show.
 
     Parameters
@@ -18,12 +23,13 @@ def tone_map(data_dn: NDArray[np.uint16], black_level_dn: float, full_scale_dn: 
         The count that becomes black.
     full_scale_dn
         The count that becomes white.
+    softening
+        Share of the range below which the curve is linear.
 
     Returns
     -------
     Grey values, uint8, same shape.
     """
-    softening = 0.01
     signal = np.clip(
         (data_dn.astype(np.float64) - black_level_dn) / (full_scale_dn - black_level_dn), 0.0, 1.0
     )

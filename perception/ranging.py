@@ -44,14 +44,14 @@ def range_paper_m(mean_dn: float, background_dn: float, exposure_s: float, calib
     return math.sqrt(calibration.range_constant_paper_dn_m2_per_s * exposure_s / signal_dn)  # eq. 1
 
 
-def flux_at_one_metre_dn(
+def effective_exposure_s(
     u_px: float, v_px: float, exposure_s: float, gain: float, calibration: Calibration
 ) -> float:
-    """Integrated flux, in counts, that a source one metre away in the direction of a pixel would give.
+    """Exposure that would give as much flux at unit gain on the axis: t g cos θ · response(θ).
 
-    K t g cos θ · response(θ): the lens's aperture is seen tilted, and the response (filter, vignetting)
-    changes with the field angle θ. The response is taken at the centre of the source. NaN beyond the last
-    angle of the response table: it is not extrapolated.
+    The lens's aperture is seen tilted, and the response (filter, vignetting) changes with the field angle θ.
+    The response is taken at the centre of the source. NaN beyond the last angle of the response table: it is
+    not extrapolated.
     """
     theta = float(field_angle_rad([[u_px, v_px]], calibration)[0])
     response = float(
@@ -63,7 +63,19 @@ def flux_at_one_metre_dn(
             right=math.nan,
         )
     )
-    return calibration.range_constant_dn_m2_per_s * exposure_s * gain * math.cos(theta) * response
+    return exposure_s * gain * math.cos(theta) * response
+
+
+def flux_at_one_metre_dn(
+    u_px: float, v_px: float, exposure_s: float, gain: float, calibration: Calibration
+) -> float:
+    """Integrated flux, in counts, that a source one metre away in the direction of a pixel would give.
+
+    K times `effective_exposure_s`; NaN where that is.
+    """
+    return calibration.range_constant_dn_m2_per_s * effective_exposure_s(
+        u_px, v_px, exposure_s, gain, calibration
+    )
 
 
 def range_from_flux(

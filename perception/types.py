@@ -60,7 +60,8 @@ class Calibration:
     range_constant_dn_m2_per_s
         K of the *integrated* flux: flux_dn = K · exposure · cos θ · response(θ) / range².
     range_constant_paper_dn_m2_per_s
-        K of the paper's mean grey value (its eq. 1), from the paper's own regression (Exp1).
+        K of the paper's mean grey value (its eq. 1), from the paper's own regression (Exp1); NaN where its
+        detector finds too little to calibrate with.
     source_radius_m
         Radius of a source, a sphere.
     wavelength_m

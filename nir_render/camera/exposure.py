@@ -3,12 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
+from nir_render.camera.emission import Emitter
 from nir_render.camera.lens import aperture_area_m2, intrinsics_of
 from nir_render.camera.psf import Window, source_window
-from nir_render.camera.response import Response
+from nir_render.camera.response import Response, response_map
 from nir_render.scene.devices import Camera
 
 
@@ -30,17 +33,59 @@ def beam_window(camera: Camera, beam: Beam, exposure_s: float) -> Window:
     """Return the expected electrons of one beam.
 
     A beam from field angle θ gives E · A_ap cos θ · C(θ) · t electrons in all: the aperture is seen tilted.
+    E is L ∫ cos ψ dΩ over the angles ψ from the source's centre, and each of its directions is weighted with
+    its own cos θ, which holds that cos ψ already; so L Ω = 2 E / (1 + cos α) is what is spread over the disc.
     The cos⁴ θ of the irradiance of an extended image is this cos θ and the cos³ θ by which the solid angle
     of a pixel shrinks, which the projection of the directions brings about.
     """
-    collected_j = beam.irradiance_w_per_m2 * aperture_area_m2(camera) * exposure_s
+    obliquity = 0.5 * (1.0 + np.cos(beam.angular_radius_rad))
+    collected_j = beam.irradiance_w_per_m2 / obliquity * aperture_area_m2(camera) * exposure_s
 
     def electrons(cos_angle: NDArray[np.float64]) -> NDArray[np.float64]:
         angle_rad = np.arccos(np.clip(cos_angle, -1.0, 1.0))
-        return collected_j * cos_angle * beam.response(angle_rad)
+        return np.asarray(collected_j * cos_angle * beam.response(angle_rad))
 
     sigma_px = camera.point_spread.sigma_px
     return source_window(intrinsics_of(camera), sigma_px, beam.direction, beam.angular_radius_rad, electrons)
+
+
+def diffuse_electrons(
+    camera: Camera, radiance_w_per_m2_sr: NDArray[np.float64], emitter: Emitter, exposure_s: float
+) -> NDArray[np.float64]:
+    """Return the expected electrons, before the blur, of light of one spectrum from everywhere.
+
+    A pixel of area A gets L · A_ap cos θ · (A/f²) cos³ θ · C(θ) · t electrons.
+
+    Parameters
+    ----------
+    radiance_w_per_m2_sr
+        Mean radiance, shape (rows / scale, columns / scale); pixels between are interpolated.
+    emitter
+        Whose spectrum the light has.
+
+    Returns
+    -------
+    Electrons, shape (rows, columns).
+    """
+    radiance = enlarge(radiance_w_per_m2_sr, camera.sensor.rows, camera.sensor.columns)
+    return radiance * (_collected_per_radiance(camera) * exposure_s) * response_map(camera, emitter)
+
+
+def enlarge(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
+    """Return an image at the size of the sensor, linear between the centres of its own pixels."""
+    if values.shape == (rows, columns):
+        return values
+    return np.asarray(cv2.resize(values, (columns, rows), interpolation=cv2.INTER_LINEAR))
+
+
+def blur(camera: Camera, image_e: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an image spread by the camera's point spread function, the edge pixels continued outside."""
+    return np.asarray(gaussian_filter(image_e, camera.point_spread.sigma_px, mode="nearest", truncate=6.0))
+
+
+def _collected_per_radiance(camera: Camera) -> float:
+    """Return aperture area × solid angle of the pixel on the axis, in m² sr."""
+    return aperture_area_m2(camera) * (camera.sensor.pixel_pitch_m / camera.lens.focal_length_m) ** 2
 
 
 def expected_electrons(camera: Camera, beams: Sequence[Beam], exposure_s: float) -> NDArray[np.float64]:

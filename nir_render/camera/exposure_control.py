@@ -35,5 +35,7 @@ def next_exposure_s(
     """
     range_dn = saturation_dn(sensor) - sensor.black_level_dn
     level = (float(data_dn.max()) - sensor.black_level_dn) / range_dn
-    step = 1.0 / _LARGEST_STEP if level >= 1.0 else control.target / max(level, control.target / _LARGEST_STEP)
+    step = control.target / max(level, control.target / _LARGEST_STEP)
+    if level >= 1.0:
+        step = 1.0 / _LARGEST_STEP
     return float(np.clip(exposure_s * step, control.shortest_s, control.longest_s))

@@ -39,11 +39,15 @@ def cone_nodes(
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A part of an image: its values, shape (rows, columns), and where its first pixel lies."""
+    """A part of an image: its values, shape (rows, columns), and where its first pixel lies.
+
+    `total` is the sum over the whole image of the source, what falls beyond the sensor included.
+    """
 
     values: NDArray[np.float64]
     row: int
     column: int
+    total: float
 
     def add_to(self, image: NDArray[np.float64]) -> None:
         """Add the values to the image, in place."""
@@ -76,13 +80,13 @@ def source_window(
         directions, shares = cone_nodes(direction, angular_radius_rad, rings)
     in_front = directions[:, 2] > 1e-6
     if not in_front.any():
-        return Window(np.empty((0, 0)), 0, 0)
+        return Window(np.empty((0, 0)), 0, 0, 0.0)
     directions, shares = directions[in_front], shares[in_front]
     power = shares * power_at(directions[:, 2])
     pixels = intrinsics.project(directions)
     u_shares, column = _pixel_shares(pixels[:, 0], sigma_px, intrinsics.width_px)
     v_shares, row = _pixel_shares(pixels[:, 1], sigma_px, intrinsics.height_px)
-    return Window((v_shares * power[:, None]).T @ u_shares, row, column)
+    return Window((v_shares * power[:, None]).T @ u_shares, row, column, float(power.sum()))
 
 
 def _rings(

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 
+from nir_render.camera.emission import Emitter, curve_of, emission_spectrum
 from nir_render.camera.lens import intrinsics_of
-from nir_render.scene.devices import Camera, CurveDocument, Source
+from nir_render.scene.devices import Camera, Orientation
+from nir_render.scene.world import Lamp
 from nir_render.spectra.bandpass import transmission
-from nir_render.spectra.curve import Curve, constant_curve, curve_from_points
-from nir_render.spectra.led import gaussian_spectrum
+from nir_render.spectra.curve import Curve
 
 PLANCK_J_S = 6.62607015e-34
 LIGHT_SPEED_M_PER_S = 299_792_458.0
@@ -27,8 +28,6 @@ _ANGLES = 129
 _COSINES = 257
 _PUPIL_RINGS = 6
 _PUPIL_SPOKES = 12  # over half the pupil; the other half mirrors it
-# A quantum efficiency given as one number is taken as flat over what silicon sees.
-_SILICON_M = (300e-9, 1200e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,26 +46,68 @@ class Response:
         return np.asarray(PchipInterpolator(self.angle_rad, self.electrons_per_j)(angle))
 
 
-@lru_cache(maxsize=256)
-def response(camera: Camera, source: Source) -> Response:
-    """Return how a camera responds to the light of a source.
+def response(camera: Camera, emitter: Emitter) -> Response:
+    """Return how a camera responds to the light of a source or lamp.
 
     Raises
     ------
     InputError
-        The quantum efficiency does not cover the whole spectrum of the source.
+        The quantum efficiency does not cover the whole spectrum of the emitter.
     """
+    return _response(_optics(camera), _kind(emitter))
+
+
+def response_map(camera: Camera, emitter: Emitter) -> NDArray[np.float64]:
+    """Return cos⁴ θ · C(θ) at each pixel's centre, in electrons per joule, shape (rows, columns)."""
+    return _response_map(_optics(camera), _kind(emitter))
+
+
+def _optics(camera: Camera) -> Camera:
+    """Return the camera without what its response does not depend on, so that equal ones share a table."""
+    return camera.model_copy(
+        update={
+            "position_m": (0.0, 0.0, 0.0),
+            "orientation": Orientation(),
+            "exposure_s": 1.0,
+            "auto_exposure": None,
+        }
+    )
+
+
+def _kind(emitter: Emitter) -> Emitter:
+    """Return the emitter without its place, likewise."""
+    where = "center_m" if isinstance(emitter, Lamp) else "position_m"
+    return emitter.model_copy(update={where: (0.0, 0.0, 0.0)})
+
+
+@lru_cache(maxsize=16)
+def _response_map(camera: Camera, emitter: Emitter) -> NDArray[np.float64]:
+    lens = intrinsics_of(camera)
+    x = (np.arange(lens.width_px) - lens.cx_px) / lens.fx_px
+    y = (np.arange(lens.height_px) - lens.cy_px) / lens.fy_px
+    tan_squared = x**2 + y[:, None] ** 2
+    of_angle = _response(camera, emitter)
+    # C is smooth in the angle: a table of it, finer than a pixel, read linearly, keeps 1e-6.
+    angle_rad = np.linspace(0.0, lens.corner_angle_rad, 4096)
+    at_pixel = np.interp(np.arctan(np.sqrt(tan_squared)), angle_rad, of_angle(angle_rad))
+    return np.asarray(at_pixel / (1.0 + tan_squared) ** 2)
+
+
+@lru_cache(maxsize=256)
+def _response(camera: Camera, emitter: Emitter) -> Response:
     # A little beyond the corner, for sources that are centred outside the image and reach into it.
     angle_rad = np.linspace(0.0, min(1.2 * intrinsics_of(camera).corner_angle_rad, 0.5 * np.pi), _ANGLES)
     cosines, weights = incidence(camera, angle_rad)
     nodes = np.linspace(cosines.min(), 1.0, _COSINES)
-    at_nodes = PchipInterpolator(nodes, _electrons_per_j(camera, source, nodes))
+    at_nodes = PchipInterpolator(nodes, _electrons_per_j(camera, emitter, nodes))
     return Response(angle_rad, np.asarray(at_nodes(cosines)) @ weights)
 
 
-def _electrons_per_j(camera: Camera, source: Source, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
+def _electrons_per_j(
+    camera: Camera, emitter: Emitter, cosines: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return electrons per joule of parallel light that meets the filter at given cosines, shape (n,)."""
-    spectrum = spectrum_of(source.spectrum, "the source's spectrum").normalised()
+    spectrum = emission_spectrum(emitter)
     wavelength_m = _merged_grid(spectrum, camera)
     efficiency = efficiency_of(camera)(wavelength_m)
     photons_per_j = wavelength_m / (PLANCK_J_S * LIGHT_SPEED_M_PER_S)
@@ -77,19 +118,9 @@ def _electrons_per_j(camera: Camera, source: Source, cosines: NDArray[np.float64
     return np.asarray(np.trapezoid(passed * integrand, wavelength_m, axis=1))
 
 
-def spectrum_of(document: CurveDocument, name: str) -> Curve:
-    """Return the curve that a document describes."""
-    if document.gaussian is not None:
-        return gaussian_spectrum(document.gaussian.centroid_m, document.gaussian.fwhm_m, name)
-    if document.points is not None:
-        return curve_from_points(document.points, name)
-    assert document.constant is not None  # noqa: S101 (the model admits no fourth form)
-    return constant_curve(document.constant, *_SILICON_M, name)
-
-
 def efficiency_of(camera: Camera) -> Curve:
     """Return the quantum efficiency of a camera's sensor."""
-    return spectrum_of(camera.sensor.quantum_efficiency, "quantum_efficiency")
+    return curve_of(camera.sensor.quantum_efficiency, "quantum_efficiency")
 
 
 def incidence(

@@ -18,7 +18,9 @@ def read_out(
     Photoelectrons are Poisson; the full well clips them; the read-out adds Gaussian noise, gain and black
     level; the ADC rounds and clips. EMVA 1288: μ_y = K μ_e + offset, σ_y² = K²(σ_d² + σ_e²) + 1/12 DN².
     """
-    electrons = np.minimum(random.poisson(expected_e), sensor.full_well_e)
+    # Far beyond the well the draw makes no difference, but numpy's Poisson has a largest mean.
+    photoelectrons = random.poisson(np.minimum(expected_e, 1e3 * sensor.full_well_e))
+    electrons = np.minimum(photoelectrons, sensor.full_well_e)
     electrons = electrons + sensor.read_noise_e * random.standard_normal(expected_e.shape)
     return quantise(electrons, sensor)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from nir_render.evaluate.match import countable, match
 from nir_render.evaluate.truth import SourceTruth
+from perception.bearing import direction_camera
 from perception.limits import flare_limit
 from perception.types import Calibration, Detection
 
@@ -19,19 +20,21 @@ Item = TypeVar("Item", SourceTruth, Detection)
 
 @dataclass(frozen=True)
 class Score:
-    """One source in one frame: its truth, the radiometric limit, and what each estimator said of it."""
+    """One source in one frame: its truth, its limits (see `source_limits`), and what each estimator said."""
 
     truth: SourceTruth
     countable: bool
     range_limit_m: float
+    bearing_limit_deg: float
     detections: Mapping[str, Detection]
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All scores, and the numbers of `summary.json`."""
+    """All scores, each estimator's detections that belong to no source, and the numbers of `summary.json`."""
 
     scores: tuple[Score, ...]
+    false_alarms: Mapping[str, tuple[Detection, ...]]
     summary: Mapping[str, Any]
 
 
@@ -57,7 +60,7 @@ def evaluate(
     truth_in = _by_frame(truth)
     found_in = {name: _by_frame(found) for name, found in detections.items()}
     scores: list[Score] = []
-    false_alarms = dict.fromkeys(detections, 0)
+    false_alarms: dict[str, list[Detection]] = {name: [] for name in detections}
     ghosts = dict.fromkeys(detections, 0)
     for key in frames:
         calibration = calibrations[key[0]]
@@ -67,11 +70,11 @@ def evaluate(
             real = [detection for detection in found_in[name].get(key, []) if not detection.ghost]
             ghosts[name] += len(found_in[name].get(key, [])) - len(real)
             pairing = match(rows, real, calibration)
-            false_alarms[name] += len(pairing.unmatched)
+            false_alarms[name] += [real[j] for j in pairing.unmatched]
             for i, j in pairing.pairs:
                 matched[i][name] = real[j]
         scores += [
-            Score(row, countable(row, calibration), range_limit_m(row, calibration), said)
+            Score(row, countable(row, calibration), *source_limits(row, calibration), said)
             for row, said in zip(rows, matched, strict=True)
         ]
     counted = [score for score in scores if score.countable]
@@ -80,41 +83,55 @@ def evaluate(
         "frames": len(frames),
         "sources_visible": len(counted),
         "range_limit_rmse_m": _rms([score.range_limit_m for score in counted]),
+        "bearing_limit_rms_deg": _rms([score.bearing_limit_deg for score in counted]),
         "estimators": {
             name: {
                 **_estimator_numbers(counted, name),
-                "false_alarms_per_frame": false_alarms[name] / len(frames) if frames else None,
+                "false_alarms_per_frame": len(false_alarms[name]) / len(frames) if frames else None,
                 "ghosts_reported": ghosts[name],
             }
             for name in detections
         },
     }
-    return Evaluation(tuple(scores), summary)
+    return Evaluation(tuple(scores), {name: tuple(found) for name, found in false_alarms.items()}, summary)
 
 
-def range_limit_m(truth: SourceTruth, calibration: Calibration) -> float:
-    """Return the Cramér–Rao bound (1 σ) of a source's range from its flux; NaN without light."""
+def source_limits(truth: SourceTruth, calibration: Calibration) -> tuple[float, float]:
+    """Return the Cramér–Rao bounds (1 σ) of a source's range from its flux, in metres, and of its bearing.
+
+    The bearing's, in degrees, is the root of the mean squared angle, both directions together. NaN without
+    light.
+    """
     if not truth.direct_e > 0.0:
-        return math.nan
-    limit = flare_limit(calibration, truth.u_px, truth.v_px, truth.range_m, truth.direct_e, 0.0)
-    return limit.range_sigma_m
+        return math.nan, math.nan
+    limit = flare_limit(
+        calibration, truth.u_px, truth.v_px, truth.range_m, truth.direct_e, truth.background_e
+    )
+    steps_px = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+    left, right, above, below = direction_camera(steps_px + np.array([truth.u_px, truth.v_px]), calibration)
+    along_u_rad = float(np.linalg.norm(right - left)) * limit.u_sigma_px
+    along_v_rad = float(np.linalg.norm(below - above)) * limit.v_sigma_px
+    return limit.range_sigma_m, math.degrees(math.hypot(along_u_rad, along_v_rad))
 
 
 def _estimator_numbers(counted: Sequence[Score], name: str) -> dict[str, Any]:
     found = [(score, score.detections[name]) for score in counted if name in score.detections]
     errors_m = [said.range_m - score.truth.range_m for score, said in found if math.isfinite(said.range_m)]
-    angles_deg = [_angle_deg(said.bearing_body, score.truth.bearing_body) for score, said in found]
+    angles_deg = [angle_deg(said.bearing_body, score.truth.bearing_body) for score, said in found]
     return {
         "recall": len(found) / len(counted) if counted else None,
         "range_mae_m": float(np.mean(np.abs(errors_m))) if errors_m else None,
         "range_rmse_m": _rms(errors_m),
         "range_bias_m": float(np.mean(errors_m)) if errors_m else None,
+        # The limit over the same sources, so that the two can be compared.
+        "range_limit_rmse_m": _rms([s.range_limit_m for s, said in found if math.isfinite(said.range_m)]),
+        "saturated": sum(said.saturated for _, said in found),
         "ranges_missing": len(found) - len(errors_m),
         "bearing_rms_deg": _rms(angles_deg),
     }
 
 
-def _angle_deg(one: Sequence[float], other: Sequence[float]) -> float:
+def angle_deg(one: Sequence[float], other: Sequence[float]) -> float:
     """Return the angle between unit vectors, exact also where it is tiny."""
     cross = float(np.linalg.norm(np.cross(one, other)))
     return math.degrees(math.atan2(cross, float(np.dot(one, other))))

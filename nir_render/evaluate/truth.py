@@ -1,6 +1,6 @@
 """What is true about each source in a frame."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from nir_render.camera.lens import intrinsics_of
 from nir_render.camera.psf import Window
 from nir_render.camera.sensor import saturation_dn
+from nir_render.expected import Expected, group_electrons
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import camera_pose_on_robot
-from nir_render.transport.light import Light
 from perception.types import RawFrame
 
 Vector = tuple[float, float, float]
@@ -24,9 +24,11 @@ class SourceTruth:
 
     `u_px, v_px` is the projection of the source's centre; `range_m` the straight distance from the lens to
     it, `depth_z_m` its part along the optical axis; bearings are unit vectors from the camera's centre;
-    `position_body_m` counts from the observing robot's origin. `direct_e` are the expected electrons on the
-    sensor that came straight; `mirrored_e` and `scattered_e` are 0 in scenes that reflect nothing.
-    `peak_snr` is the source's brightest pixel over the noise there.
+    `position_body_m` counts from the observing robot's origin. `direct_e` are the expected electrons that
+    came straight, those beyond the sensor's edge included; `scattered_e` those of the source's own light that
+    came by way of bodies into the pixels of the flare, mirrored light included (`mirrored_e` is 0 until
+    ghosts are told apart). `background_e` is the mean of all other light per pixel there, `peak_snr` the
+    source's brightest pixel over the noise there.
     """
 
     camera: str
@@ -45,6 +47,7 @@ class SourceTruth:
     direct_e: float
     mirrored_e: float
     scattered_e: float
+    background_e: float
     peak_snr: float
     saturated_px: int
     on_fraction: float
@@ -62,34 +65,23 @@ def parse_truth(record: Mapping[str, Any]) -> SourceTruth:
     return SourceTruth(**fields)
 
 
-def truth_of(
-    scene: Scene, light: Light, windows: Sequence[Window], expected_e: NDArray[np.float64], frame: RawFrame
-) -> Iterator[SourceTruth]:
-    """Yield the truth about each source whose centre is in the image, or of whose light some falls on it.
-
-    Parameters
-    ----------
-    windows
-        Expected electrons of each row of the light's direct table.
-    expected_e
-        Expected electrons of the whole frame, shape (rows, columns).
-    """
+def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTruth]:
+    """Yield the truth about each source whose centre is in the image, or of whose light some falls on it."""
+    light = mean.light
     _, camera = scene.camera(light.camera)
     intrinsics = intrinsics_of(camera)
     mount = camera_pose_on_robot(camera)
     table = light.direct
     pixels = intrinsics.project(table.direction)
-    for row, window in enumerate(windows):
+    for row, window in enumerate(mean.windows):
         u_px, v_px = pixels[row]
-        in_image = intrinsics.contains(u_px, v_px)
-        direct_e = float(window.values.sum())
-        if not in_image and not direct_e >= 1.0:
+        lit = float(window.values.sum()) >= 1.0
+        if not intrinsics.contains(u_px, v_px) and not (lit and np.isfinite([u_px, v_px]).all()):
             continue
-        robot, _, source = light.groups[table.group[row]].partition(".")
+        group = int(table.group[row])
+        robot, _, source = light.groups[group].partition(".")
         direction, distance_m = table.direction[row], float(table.distance_m[row])
-        peak_snr, saturated_px = _signal(
-            window, expected_e, frame, camera.sensor.read_noise_e, saturation_dn(camera.sensor)
-        )
+        flare = _flare(scene, mean, frame, window, group)
         yield SourceTruth(
             camera=light.camera,
             index=frame.index,
@@ -104,28 +96,46 @@ def truth_of(
             bearing_body=_vector(mount.rotation @ direction),
             position_body_m=_vector(mount.rotation @ (distance_m * direction) + mount.position_m),
             visible_fraction=float(table.visible_fraction[row]),
-            direct_e=direct_e,
+            direct_e=window.total,
             mirrored_e=0.0,
-            scattered_e=0.0,
-            peak_snr=peak_snr,
-            saturated_px=saturated_px,
+            scattered_e=flare.scattered_e,
+            background_e=flare.background_e,
+            peak_snr=flare.peak_snr,
+            saturated_px=flare.saturated_px,
             on_fraction=1.0,
         )
 
 
-def _signal(
-    window: Window, expected_e: NDArray[np.float64], frame: RawFrame, read_noise_e: float, clipped_dn: int
-) -> tuple[float, int]:
-    """Return the peak signal-to-noise ratio, and how many clipped pixels owe most of their light to it."""
-    if window.values.size == 0:
-        return 0.0, 0
-    rows, columns = window.values.shape
+@dataclass(frozen=True)
+class _Flare:
+    """What the pixels of a flare hold."""
+
+    peak_snr: float = 0.0
+    saturated_px: int = 0
+    scattered_e: float = 0.0
+    background_e: float = 0.0
+
+
+def _flare(scene: Scene, mean: Expected, frame: RawFrame, window: Window, group: int) -> _Flare:
+    """Return what is in the flare: its pixels are those that hold 1 % of its brightest one's own light."""
+    own = window.values
+    if own.size == 0 or not own.max() > 0.0:
+        return _Flare()
+    _, camera = scene.camera(mean.light.camera)
+    rows, columns = own.shape
     place = np.s_[window.row : window.row + rows, window.column : window.column + columns]
-    noise_e = np.sqrt(expected_e[place] + read_noise_e**2)
+    all_e = mean.electrons[place]
     # A noiseless sensor has no noise where there is no light, and no signal either.
-    snr = np.divide(window.values, noise_e, out=np.zeros_like(noise_e), where=noise_e > 0.0)
-    own = window.values > 0.5 * expected_e[place]
-    return float(snr.max()), int((own & (frame.data_dn[place] >= clipped_dn)).sum())
+    noise_e = np.sqrt(all_e + camera.sensor.read_noise_e**2)
+    snr = np.divide(own, noise_e, out=np.zeros_like(own), where=noise_e > 0.0)
+    pixels = own > 0.01 * own.max()
+    clipped = (own > 0.5 * all_e) & (frame.data_dn[place] >= saturation_dn(camera.sensor))
+    return _Flare(
+        peak_snr=float(snr.max()),
+        saturated_px=int(clipped.sum()),
+        scattered_e=float(group_electrons(mean, scene, group)[place][pixels].sum()),
+        background_e=float((all_e - own)[pixels].mean()),
+    )
 
 
 def _vector(values: NDArray[np.float64]) -> Vector:

@@ -51,7 +51,9 @@ class Document(BaseModel):
         if not isinstance(data, Mapping):
             return data
         known = [document_key(name) for name in cls.model_fields]
-        for key in data:
+        for key, value in data.items():
+            if isinstance(value, bool):  # Python counts true as 1
+                raise ValueError(f"{key!r} is {str(value).lower()}; nothing here is true or false")
             if key in known:
                 continue
             if str(key).lower() in _COLOUR_KEYS:
@@ -100,29 +102,34 @@ def preset_names(folder: str) -> list[str]:
     return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
 
 
-def expand_preset(data: Any, kind: str, folder: Path) -> Any:
-    """Replace a preset's name by what it stands for, with the keys beside `preset` laid over it."""
+def expand_preset(data: Any, kind: str, folder: Path, trail: tuple[str, ...] = ()) -> Any:
+    """Replace a preset's name by what it stands for, with the keys beside `preset` laid over it.
+
+    `trail` holds the presets on the way here, so that none stands on itself.
+    """
     if isinstance(data, str):
-        return _load_preset(data, kind, folder)
+        return _load_preset(data, kind, folder, trail)
     if isinstance(data, Mapping) and "preset" in data:
-        base = _load_preset(data["preset"], kind, folder)
+        base = _load_preset(data["preset"], kind, folder, trail)
         return merge(base, {key: value for key, value in data.items() if key != "preset"})
     return data
 
 
-def _load_preset(name: Any, kind: str, folder: Path) -> Any:
+def _load_preset(name: Any, kind: str, folder: Path, trail: tuple[str, ...]) -> Any:
+    if name in trail:
+        raise ValueError(f"the preset {name!r} stands on itself")
     if isinstance(name, str) and name.endswith(".yaml"):
         path = folder / name
         if not path.is_file():
             raise ValueError(f"there is no file {name!r} beside the scene (looked for {path})")
-        return expand_preset(read_yaml(path), kind, folder)
+        return expand_preset(read_yaml(path), kind, folder, (*trail, name))
     known = preset_names(kind)
     if name not in known:
         near = difflib.get_close_matches(str(name), known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
         raise ValueError(f"there is no preset {name!r} in {kind}; {hint}")
     text = resources.files("nir_render").joinpath("data", kind, f"{name}.yaml").read_text(encoding="utf-8")
-    return expand_preset(parse_yaml(text, f"preset {kind}/{name}"), kind, folder)
+    return expand_preset(parse_yaml(text, f"preset {kind}/{name}"), kind, folder, (*trail, name))
 
 
 def merge(base: Any, change: Any) -> Any:
@@ -145,8 +152,12 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         seen = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
+            line = key_node.start_mark.line + 1
+            if not isinstance(key, str):
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"line {line}: the key {key!r} is not a name; write it as text"
+                )
             if key in seen:
-                line = key_node.start_mark.line + 1
                 raise yaml.constructor.ConstructorError(None, None, f"line {line}: key {key!r} stands twice")
             seen.add(key)
         return super().construct_mapping(node, deep)
@@ -160,6 +171,8 @@ def parse_yaml(text: str, name: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
         raise ValueError(f"{name}{where}: {getattr(error, 'problem', error)}") from None
+    except RecursionError:
+        raise ValueError(f"{name}: an alias refers to what holds it") from None
 
 
 def read_yaml(path: Path) -> Any:

@@ -3,12 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.response import efficiency_of, spectrum_of
+from nir_render.camera.emission import emission_spectrum
+from nir_render.camera.response import efficiency_of
 from nir_render.scene.document import SceneDocument
 from nir_render.scene.motion import camera_pose, rotation_of
 from nir_render.scene.world import Box, Cylinder, ShapeDocument, Sphere
 
 _BAND_M = 940e-9
+_SLACK_M = 1e-15  # what float64 rounds away
 
 
 def check(document: SceneDocument) -> list[str]:
@@ -27,18 +29,19 @@ def _flat_cylinders(document: SceneDocument) -> list[str]:
 def _uncovered_curves(document: SceneDocument) -> list[str]:
     problems = []
     spectra = {
-        f"robots.{name}.rig.sources.{source_name}.spectrum": spectrum_of(source.spectrum, "spectrum")
+        f"robots.{name}.rig.sources.{source_name}.spectrum": emission_spectrum(source)
         for name, robot in document.robots.items()
         for source_name, source in robot.rig.sources.items()
     }
+    spectra |= {f"lamps.{name}": emission_spectrum(lamp) for name, lamp in document.lamps.items()}
     for place, spectrum in spectra.items():
-        if not spectrum.low_m <= _BAND_M <= spectrum.high_m:
+        if not spectrum.low_m - _SLACK_M <= _BAND_M <= spectrum.high_m + _SLACK_M:
             problems.append(f"{place}: covers {spectrum.range_nm()}, not 940 nm")
     for name, robot in document.robots.items():
         for camera_name, camera in robot.rig.cameras.items():
             efficiency = efficiency_of(camera)
             for place, spectrum in spectra.items():
-                if efficiency.low_m > spectrum.low_m or efficiency.high_m < spectrum.high_m:
+                if efficiency.low_m > spectrum.low_m + _SLACK_M or efficiency.high_m < spectrum.high_m - _SLACK_M:
                     problems.append(
                         f"robots.{name}.rig.cameras.{camera_name}.sensor.quantum_efficiency: covers "
                         f"{efficiency.range_nm()}, but {place} shines from "
@@ -54,18 +57,22 @@ def _cameras_inside_solids(document: SceneDocument) -> list[str]:
         for camera_name, camera in robot.rig.cameras.items():
             for time_s in document.frame_times_s():
                 point_m = camera_pose(robot, camera, time_s).position_m
-                inside = [shape for shape, body in document.shapes.items() if _contains(body, point_m)]
-                if inside:
+                inside = solid_around(document, point_m)
+                if inside is not None:
                     problems.append(
-                        f"robots.{name}.rig.cameras.{camera_name}: the camera is inside shapes.{inside[0]} "
+                        f"robots.{name}.rig.cameras.{camera_name}: the camera is inside shapes.{inside} "
                         f"at {time_s:g} s, at [{', '.join(f'{x:.4g}' for x in point_m)}] m; move one of them"
                     )
                     break
     return problems
 
 
+def solid_around(document: SceneDocument, point_m: NDArray[np.float64]) -> str | None:
+    """Return the name of a closed shape that holds a point, or None. Meshes are tested where they are built."""
+    return next((name for name, body in document.shapes.items() if _contains(body, point_m)), None)
+
+
 def _contains(body: ShapeDocument, point_m: NDArray[np.float64]) -> bool:
-    """Tell whether a closed shape holds a point. Meshes are tested where they are built."""
     match body:
         case Sphere():
             return float(np.linalg.norm(point_m - body.center_m)) < body.radius_m

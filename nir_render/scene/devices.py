@@ -27,6 +27,8 @@ from nir_render.scene.units import (
 
 Positive = Field(gt=0)
 NotNegative = Field(ge=0)
+# Names become parts of dotted paths and of file names.
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 
 
 class Orientation(Document):
@@ -194,6 +196,11 @@ class Sensor(PresetDocument):
             raise ValueError(
                 f"black_level {self.black_level_dn:g} DN is not below full scale, {self.full_scale_dn} DN"
             )
+        if self.full_well_e < 10.0 * self.read_noise_e:
+            raise ValueError(
+                f"read_noise {self.read_noise_e:g} e leaves less than ten steps of noise below the full well of "
+                f"{self.full_well_e:g} e"
+            )
         reached_dn = self.black_level_dn + self.system_gain_dn_per_e * self.full_well_e
         if reached_dn < 0.5 * self.full_scale_dn:
             raise ValueError(
@@ -252,5 +259,5 @@ class Rig(PresetDocument):
 
     preset_folder: ClassVar[str] = "rigs"
 
-    sources: dict[str, Source] = {}
-    cameras: dict[str, Camera] = {}
+    sources: dict[Name, Source] = {}
+    cameras: dict[Name, Camera] = {}

@@ -4,16 +4,12 @@ import itertools
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from nir_render.scene.base import Document, expand_preset, preset_names
-from nir_render.scene.devices import NotNegative, Orientation, Positive, Rig
+from nir_render.scene.devices import Name, NotNegative, Orientation, Positive, Rig
 from nir_render.scene.units import Frequency, Position, Time
 from nir_render.scene.world import Lamp, MaterialDocument, ShapeDocument
-
-_NAME_PATTERN = r"^[A-Za-z_][A-Za-z0-9_-]*$"
-Name = Annotated[str, Field(pattern=_NAME_PATTERN)]
-
 
 class Waypoint(Document):
     """Where a robot is from one time on, for as long as `hold`; then it moves evenly to the next."""
@@ -53,9 +49,25 @@ class Clock(Document):
     start_s: Time = 0.0
 
 
+class IndirectSettings(Document):
+    """How finely light by way of walls and lamps is sampled: pixels of scale × scale, samples in each."""
+
+    scale: Annotated[int, Field(ge=1, le=16)] = 2
+    samples: Annotated[int, Field(ge=4, le=65536)] = 16
+    max_depth: Annotated[int, Field(ge=2, le=64)] = 8
+
+    @field_validator("samples")
+    @classmethod
+    def _power_of_two(cls, samples: int) -> int:
+        if samples & (samples - 1):
+            raise ValueError(f"{samples} is no power of two: only these render to the same bits on any machine")
+        return samples
+
+
 class RenderSettings(Document):
     """How finely the transport of light is sampled."""
 
+    indirect: IndirectSettings = IndirectSettings()
     visibility_rays: Annotated[int, Field(ge=16, le=65536)] = 1024
 
 
@@ -63,7 +75,7 @@ class SceneDocument(Document):
     """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom."""
 
     format: Literal[1]
-    name: str = "scene"
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]*$")] = "scene"
     seed: Annotated[int, NotNegative] = 0
     clock: Clock = Clock()
     render: RenderSettings = RenderSettings()

@@ -42,12 +42,12 @@ def scene_schema() -> dict[str, Any]:
 
 
 def _or_preset(definition: dict[str, Any], folder: str) -> dict[str, Any]:
-    """Return a definition that also takes a preset's name, alone or as the ground under changes."""
+    """Return a definition that also takes a preset's name, alone or as the ground under changes.
+
+    No key is required: a preset further up may hold it. What is missing in the end, the loader tells.
+    """
     names = preset_names(folder)
     name = {"type": "string", "description": "a preset, or a .yaml file beside the scene", "examples": names}
     whole = {**definition, "properties": {**definition["properties"], "preset": name}}
-    required = whole.pop("required", [])
-    conditional = (
-        {"if": {"not": {"required": ["preset"]}}, "then": {"required": required}} if required else {}
-    )
-    return {"title": definition["title"], "anyOf": [name, {**whole, **conditional}]}
+    whole.pop("required", None)
+    return {"title": definition["title"], "anyOf": [name, whole]}

@@ -12,31 +12,12 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError
 from nir_render.geometry import cone_directions, cone_versine
 from nir_render.scene.load import Scene
-from nir_render.scene.motion import Pose, camera_pose
+from nir_render.scene.motion import Pose
 from nir_render.transport import world
 from nir_render.transport.backend import blocked
-from nir_render.transport.light import DirectTable, Light
+from nir_render.transport.light import DirectTable
 
 _GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
-
-
-def render(scene: Scene, camera: str, time_s: float, seed: int) -> Light:
-    """Return the light that reaches a camera, `robot.camera`, with the geometry at a time.
-
-    Raises
-    ------
-    InputError
-        The scene holds what this version does not render, or the camera is inside a body.
-    """
-    missing = world.not_rendered(scene)
-    if missing:
-        raise InputError(*[f"{scene.path}: {line}" for line in missing])
-    robot, device = scene.camera(camera)
-    pose = camera_pose(robot, device, time_s)
-    world.check_meshes(scene, pose.position_m, f"the camera {camera} at {time_s:g} s")
-    groups = tuple(scene.sources())
-    table = direct_table(scene, pose, time_s)
-    return Light(camera, time_s, seed, groups, (940e-9,), table)
 
 
 def direct_table(scene: Scene, pose: Pose, time_s: float) -> DirectTable:

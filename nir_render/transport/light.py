@@ -40,10 +40,34 @@ class DirectTable:
 
 
 @dataclass(frozen=True, eq=False)
+class Indirect:
+    """All other light: off walls and floor, in mirrors, through glass, from lamps, seen or not.
+
+    Attributes
+    ----------
+    radiance_per_w
+        Mean radiance over each pixel for one watt of each group, in 1/(m² sr), float32, shape
+        (group, node, row, column).
+    variance
+        Variance of that mean, from batches, same shape.
+    scale
+        Camera pixels per pixel of these arrays, along each axis.
+    samples
+        Samples per pixel of these arrays.
+    """
+
+    radiance_per_w: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    scale: int
+    samples: int
+
+
+@dataclass(frozen=True, eq=False)
 class Light:
     """The light that reaches one camera with the scene's geometry at one time.
 
-    `groups` are the names of what can be switched apart (`robot.source`); `wavelengths_m` the nodes.
+    `groups` are the names of what can be switched apart: `robot.source`, `lamps.name`; `wavelengths_m` the
+    nodes. `indirect` is None where nothing reflects and no lamp shines.
     """
 
     camera: str
@@ -52,6 +76,7 @@ class Light:
     groups: tuple[str, ...]
     wavelengths_m: tuple[float, ...]
     direct: DirectTable
+    indirect: Indirect | None
 
     def _repr_html_(self) -> str:
         """Show the direct table in a notebook."""

@@ -9,27 +9,34 @@ from nir_render.errors import InputError
 from nir_render.geometry import perpendiculars
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import robot_pose, rotation_of
-from nir_render.scene.world import Box, Cylinder, Diffuse, Mesh, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.units import LENGTH, format_vector
+from nir_render.scene.world import (
+    Box,
+    Cylinder,
+    Dielectric,
+    Diffuse,
+    MaterialDocument,
+    Mesh,
+    Mirror,
+    Plastic,
+    Rectangle,
+    RoughConductor,
+    ShapeDocument,
+    Sphere,
+)
 from nir_render.transport.backend import backend
 
 
-def not_rendered(scene: Scene) -> list[str]:
-    """Return a line for each part of the scene whose light this version does not render yet.
+def groups(scene: Scene) -> tuple[str, ...]:
+    """Return the light groups: each source, `robot.source`, then each lamp, `lamps.name`."""
+    return (*scene.sources(), *(f"lamps.{name}" for name in scene.document.lamps))
 
-    Bodies that reflect nothing are rendered: they hide what is behind them.
-    """
-    lines = [
-        f"lamps.{name}: the light of lamps is not rendered yet; remove the lamp"
-        for name in scene.document.lamps
-    ]
-    for name, shape in scene.document.shapes.items():
-        material = scene.document.materials[shape.material]
-        if not (isinstance(material, Diffuse) and material.reflectance == 0.0):
-            lines.append(
-                f"shapes.{name}: light by way of the material {shape.material!r} ({material.type}) is not "
-                "rendered yet; use the preset 'black', which only hides what is behind it"
-            )
-    return lines
+
+def has_indirect_light(scene: Scene) -> bool:
+    """Tell whether any light comes other than straight from sources: a lamp shines or a body does not absorb."""
+    materials = {scene.document.materials[shape.material] for shape in scene.document.shapes.values()}
+    absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in materials)
+    return bool(scene.document.lamps) or not absorbing
 
 
 def source_positions_m(scene: Scene, time_s: float) -> dict[str, NDArray[np.float64]]:
@@ -41,18 +48,38 @@ def source_positions_m(scene: Scene, time_s: float) -> dict[str, NDArray[np.floa
     return positions
 
 
-def build(scene: Scene, time_s: float) -> Any:
-    """Return the Mitsuba scene of all bodies, the spheres of the sources included, at one time."""
+def build(scene: Scene, time_s: float, emitting: str | None = None) -> Any:
+    """Return the Mitsuba scene of all bodies at one time, lamps and the spheres of the sources included.
+
+    The light group `emitting` sends one watt; nothing else shines. Sources and lamps absorb what falls on
+    them.
+    """
     bodies: dict[str, Any] = {"type": "scene"}
     for name, shape in scene.document.shapes.items():
+        bsdf = _bsdf(scene.document.materials[shape.material])
         for part, body in enumerate(_bodies(shape)):
-            bodies[f"shape_{name}_{part}"] = body
+            bodies[f"shape_{name}_{part}"] = {**body, "bsdf": bsdf}
     sources = scene.sources()
     for index, (name, centre_m) in enumerate(source_positions_m(scene, time_s).items()):
         radius_m = sources[name][1].radius_m
-        bodies[f"source_{index}"] = {"type": "sphere", "center": centre_m.tolist(), "radius": radius_m}
+        sphere = {"type": "sphere", "center": centre_m.tolist(), "radius": radius_m, "bsdf": _BLACK}
+        # One watt from the whole sphere: L = 1 / (4π² r²).
+        shine = {"emitter": _area_light(1.0 / (4.0 * np.pi**2 * radius_m**2))} if name == emitting else {}
+        bodies[f"source_{index}"] = {**sphere, **shine}
+    for name, lamp in scene.document.lamps.items():
+        panel = Rectangle(
+            type="rectangle", material="", center=format_vector(lamp.center_m, LENGTH),
+            size=format_vector(lamp.size_m, LENGTH), normal=lamp.normal,
+        )  # fmt: skip
+        # One watt from one side: L = 1 / (π A).
+        area_m2 = lamp.size_m[0] * lamp.size_m[1]
+        shine = {"emitter": _area_light(1.0 / (np.pi * area_m2))} if f"lamps.{name}" == emitting else {}
+        bodies[f"lamp_{name}"] = {**_bodies(panel)[0], "bsdf": _BLACK, **shine}
     # optimize=False: merging equal spectra would tie sources together that must be changed apart.
-    return backend().mi.load_dict(bodies, optimize=False)
+    try:
+        return backend().mi.load_dict(bodies, optimize=False)
+    except RuntimeError as error:
+        raise InputError(f"{scene.path}: a mesh cannot be read: {' '.join(str(error).split())}") from None
 
 
 def source_spheres(bodies: Any) -> list[Any]:
@@ -70,7 +97,10 @@ def check_meshes(scene: Scene, point_m: NDArray[np.float64], what: str) -> None:
 
 def _crossings(shape: Mesh, point_m: NDArray[np.float64]) -> int:
     mi = backend().mi
-    body = mi.load_dict({"type": "scene", "mesh": _bodies(shape)[0]})
+    try:
+        body = mi.load_dict({"type": "scene", "mesh": _bodies(shape)[0]})
+    except RuntimeError as error:
+        raise InputError(f"{shape.file}: cannot be read as a mesh: {' '.join(str(error).split())}") from None
     direction = mi.Vector3f(
         0.2672612, 0.5345225, 0.8017837
     )  # a direction that axis-aligned edges do not share
@@ -103,6 +133,48 @@ def _bodies(shape: ShapeDocument) -> list[dict[str, Any]]:
             kind = shape.file.rsplit(".", 1)[1].lower()
             placed = _matrix(rotation_of(shape.orientation) * shape.scale, shape.position_m)
             return [{"type": kind, "filename": shape.file, "to_world": placed}]
+
+
+def _uniform(value: float) -> dict[str, Any]:
+    """Return a spectrum of one value; Mitsuba's other spectra are zero or undefined at 940 nm."""
+    return {"type": "uniform", "value": float(value)}
+
+
+_BLACK = {"type": "diffuse", "reflectance": _uniform(0.0)}
+
+
+def _area_light(radiance: float) -> dict[str, Any]:
+    return {"type": "area", "radiance": _uniform(radiance)}
+
+
+def _bsdf(material: MaterialDocument) -> dict[str, Any]:
+    match material:
+        case Diffuse():
+            surface: dict[str, Any] = {"type": "diffuse", "reflectance": _uniform(material.reflectance)}
+        case RoughConductor():
+            surface = {
+                "type": "roughconductor",
+                "distribution": "ggx",
+                "alpha": material.roughness,
+                "eta": _uniform(material.index),
+                "k": _uniform(material.extinction_index),
+            }
+        case Mirror():
+            surface = {
+                "type": "conductor",
+                "material": "none",
+                "specular_reflectance": _uniform(material.reflectance),
+            }
+        case Plastic():
+            rough = {"type": "roughplastic", "distribution": "ggx", "alpha": material.roughness}
+            surface = {
+                **(rough if material.roughness > 0.0 else {"type": "plastic"}),
+                "int_ior": material.index,
+                "diffuse_reflectance": _uniform(material.reflectance),
+            }
+        case Dielectric():
+            return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
+    return {"type": "twosided", "nested": surface}
 
 
 def _rectangle_frame(shape: Rectangle) -> tuple[NDArray[np.float64], tuple[float, float, float]]:

@@ -41,12 +41,12 @@ def test_a_run_leaves_all_that_the_design_names(run_folder: Path) -> None:
     frames = [f"frames/r1.front/{index:06d}.png" for index in range(10)]
     assert _files(run_folder) == sorted(
         ["calibration.json", "detections.paper.jsonl", "detections.robust.jsonl", *frames, "frames.jsonl",
-         "manifest.json", "preview.png", "scene.yaml", "summary.json", "truth.jsonl"]
+         "manifest.json", "preview.png", "report.html", "scene.yaml", "summary.json", "truth.jsonl"]
     )  # fmt: skip
     manifest = json.loads((run_folder / "manifest.json").read_text())
     assert sorted(manifest["sha256"]) == [name for name in _files(run_folder) if name != "manifest.json"]
     assert manifest["format"] == 1
-    assert set(manifest["seconds"]) == {"render", "perceive", "evaluate"}
+    assert set(manifest["seconds"]) == {"render", "perceive", "evaluate", "report"}
 
 
 def test_robust_ranging_is_right_and_near_the_limit(run_folder: Path) -> None:

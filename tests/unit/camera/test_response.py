@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nir_render import InputError
+from nir_render.camera import response as response_module
 from nir_render.camera.response import response
 from nir_render.scene.devices import Source
 from tests.unit.camera.conftest import CameraMaker
@@ -46,7 +47,7 @@ def test_interpolation_over_the_field_agrees_with_a_finer_table(
         coarse = response(camera, source)
         monkeypatch.setattr("nir_render.camera.response._ANGLES", 1290)
         monkeypatch.setattr("nir_render.camera.response._COSINES", 2570)
-        fine = response.__wrapped__(camera, source)
+        fine = response_module._response.__wrapped__(camera, source)
         monkeypatch.undo()
         np.testing.assert_allclose(coarse(angle_rad), fine(angle_rad), atol=1e-4 * float(fine(0.0)))
 

@@ -24,7 +24,7 @@ def _truth(u_px: float, v_px: float = 100.0, **changes: object) -> SourceTruth:
     row = SourceTruth(
         camera="r1.front", index=0, time_s=0.0, source="top", robot="r2", u_px=u_px, v_px=v_px, range_m=2.0,
         depth_z_m=2.0, bearing_camera=(0.0, 0.0, 1.0), bearing_body=(1.0, 0.0, 0.0), position_body_m=(2.0, 0.0, 0.0),
-        visible_fraction=1.0, direct_e=1e4, mirrored_e=0.0, scattered_e=0.0, peak_snr=20.0, saturated_px=0,
+        visible_fraction=1.0, direct_e=1e4, mirrored_e=0.0, scattered_e=0.0, background_e=0.0, peak_snr=20.0, saturated_px=0,
         on_fraction=1.0,
     )  # fmt: skip
     return dataclasses.replace(row, **changes)  # type: ignore[arg-type]
@@ -42,9 +42,13 @@ def _detection(u_px: float, v_px: float = 100.0, **changes: object) -> Detection
 def test_the_gate_is_three_pixels_or_the_radius_of_the_image() -> None:
     assert match([_truth(100.0)], [_detection(102.99)], CALIBRATION).pairs == ((0, 0),)
     assert match([_truth(100.0)], [_detection(103.01)], CALIBRATION).pairs == ()
-    # At 0.5 m a source of 10 mm has an image of 9.6 px radius.
-    assert match([_truth(100.0, depth_z_m=0.5)], [_detection(109.5)], CALIBRATION).pairs == ((0, 0),)
-    assert match([_truth(100.0, depth_z_m=0.5)], [_detection(109.7)], CALIBRATION).pairs == ()
+    # At 0.5 m a source of 10 mm has an image of 9.6 px radius on the axis; 45° off, twice that along the radius.
+    near = _truth(319.5, 239.5, range_m=0.5)
+    assert match([near], [_detection(329.0, 239.5)], CALIBRATION).pairs == ((0, 0),)
+    assert match([near], [_detection(329.3, 239.5)], CALIBRATION).pairs == ()
+    off = _truth(319.5 + 480.0, 239.5, range_m=0.5)
+    assert match([off], [_detection(799.5 + 19.0, 239.5)], CALIBRATION).pairs == ((0, 0),)
+    assert match([off], [_detection(799.5 + 19.4, 239.5)], CALIBRATION).pairs == ()
 
 
 def test_one_detection_serves_one_source() -> None:
@@ -103,6 +107,9 @@ def test_the_summary_of_a_run_worked_out_by_hand() -> None:
         "range_mae_m": pytest.approx(0.1),
         "range_rmse_m": pytest.approx(0.1),
         "range_bias_m": pytest.approx(0.1),
+        # Of the one that was found, at another place in its pixel than the other.
+        "range_limit_rmse_m": pytest.approx(summary["range_limit_rmse_m"], rel=0.02),
+        "saturated": 0,
         "ranges_missing": 0,
         "bearing_rms_deg": pytest.approx(1.0),
         "false_alarms_per_frame": pytest.approx(1.0 / 3.0),

@@ -43,11 +43,11 @@ def _scene(camera: Any) -> dict[str, Any]:
         ({"preset": "infra_swarm", "exposure": "1 ms"}, True),
         ({"preset": "infra_swarm", "exposure": 1}, False),
         ({"preset": "infra_swarm", "exposur": "1 ms"}, False),
-        ({"exposure": "1 ms"}, False),
+        ({"exposure": "1 ms"}, True),  # a preset of the rig may hold the rest; the loader tells where none does
         ({"preset": "infra_swarm", "sensor": {"preset": "mt9m031", "quantum_efficiency": 0.2}}, True),
     ],
 )
-def test_the_schema_takes_what_the_loader_takes(
+def test_the_schema_takes_what_editors_should_take(
     camera: Any, holds: bool, validator: Draft202012Validator
 ) -> None:
     assert validator.is_valid(_scene(camera)) is holds

@@ -141,44 +141,6 @@ def test_a_camera_inside_a_source_is_refused(scene: Scene) -> None:
         render(scene.with_({"robots.r2.position": "[0.07, 0, -0.08] m"}), "r1.front")
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        (
-            {
-                "lamps.one": {
-                    "center": "[0, 0, 3] m",
-                    "size": "[1, 1] m",
-                    "luminous_flux": "4000 lm",
-                    "temperature": "2856 K",
-                }
-            },
-            "lamps.one: the light of lamps is not rendered yet",
-        ),
-        (
-            {
-                "materials.paint": {"type": "diffuse", "reflectance": 0.8},
-                "shapes.wall": _panel("[5, 0, 0] m", material="paint"),
-            },
-            "shapes.wall: light by way of the material 'paint' (diffuse) is not rendered yet",
-        ),
-        (
-            {
-                "materials.glass": {"type": "dielectric", "index": 1.5},
-                "shapes.pane": _panel("[5, 0, 0] m", material="glass"),
-            },
-            "shapes.pane: light by way of the material 'glass' (dielectric) is not rendered yet",
-        ),
-    ],
-)
-def test_what_is_not_rendered_yet_is_refused_by_name(
-    scene: Scene, changes: dict[str, Any], said: str
-) -> None:
-    with pytest.raises(InputError) as caught:
-        render(scene.with_(changes), "r1.front")
-    assert said in str(caught.value)
-
-
 def test_the_scalar_variant_gives_the_same_table(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no LLVM works, rays go one by one; the edge case decides the same for all but a ray or two in 1024."""
     import subprocess

@@ -1,0 +1,150 @@
+"""Light to the noise-free frame: the mean number of electrons in each pixel, and whose they are."""
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.emission import Emitter, radiant_flux_w
+from nir_render.camera.exposure import Beam, beam_window, blur, diffuse_electrons
+from nir_render.camera.psf import Window
+from nir_render.camera.response import response
+from nir_render.errors import InputError
+from nir_render.scene.devices import Camera
+from nir_render.scene.load import Scene
+from nir_render.scene.world import Lamp
+from nir_render.transport.light import Indirect, Light
+
+_TINY_E2 = 1e-12  # a noiseless sensor in the dark has no noise to compare with
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """A noise-free frame.
+
+    Attributes
+    ----------
+    electrons
+        Mean photoelectrons per pixel, shape (rows, columns).
+    windows
+        The part of it that each row of the light's direct table brings.
+    render_noise_share
+        Variance of the Monte Carlo render over the sensor's own temporal variance, median over the frame.
+    """
+
+    light: Light
+    exposure_s: float
+    electrons: NDArray[np.float64]
+    windows: tuple[Window, ...]
+    render_noise_share: float
+
+
+def expected_electrons(light: Light, scene: Scene, exposure_s: float | None = None) -> NDArray[np.float64]:
+    """Return the noise-free frame: mean photoelectrons per pixel, shape (rows, columns).
+
+    Without `exposure_s` the camera's own exposure is used.
+    """
+    _, camera = scene.camera(light.camera)
+    return expected(light, scene, camera.exposure_s if exposure_s is None else exposure_s).electrons
+
+
+def expected(light: Light, scene: Scene, exposure_s: float) -> Expected:
+    """Return the noise-free frame of an exposure, and what it is made of."""
+    if not (np.isfinite(exposure_s) and exposure_s > 0):
+        raise InputError(f"exposure_s is {exposure_s!r}; wanted seconds greater than 0")
+    _, camera = scene.camera(light.camera)
+    electrons = np.zeros((camera.sensor.rows, camera.sensor.columns))
+    flux = _fluxes(light, scene)
+    share = 0.0
+    if light.indirect is not None:
+        electrons += blur(camera, _diffuse(light, scene, light.indirect.radiance_per_w, flux, exposure_s))
+    windows = tuple(_windows(light, scene, camera, exposure_s))
+    for window in windows:
+        window.add_to(electrons)
+    electrons = np.maximum(electrons, 0.0)
+    if light.indirect is not None:
+        noise_e2 = _render_variance(light, light.indirect, scene, flux, exposure_s)
+        share = float(np.median(noise_e2 / (electrons + camera.sensor.read_noise_e**2 + _TINY_E2)))
+    return Expected(light, exposure_s, electrons, windows, share)
+
+
+def group_electrons(mean: Expected, scene: Scene, group: int) -> NDArray[np.float64]:
+    """Return the electrons that one group's indirect light brings, shape (rows, columns)."""
+    _, camera = scene.camera(mean.light.camera)
+    if mean.light.indirect is None:
+        return np.zeros_like(mean.electrons)
+    only = np.zeros(len(mean.light.groups))
+    only[group] = _fluxes(mean.light, scene)[group]
+    per_w = mean.light.indirect.radiance_per_w
+    return blur(camera, _diffuse(mean.light, scene, per_w, only, mean.exposure_s))
+
+
+def emitters(light: Light, scene: Scene) -> list[Emitter]:
+    """Return what each group of a light is."""
+    sources = scene.sources()
+    return [
+        sources[name][1] if name in sources else scene.document.lamps[name.removeprefix("lamps.")]
+        for name in light.groups
+    ]
+
+
+def _fluxes(light: Light, scene: Scene) -> NDArray[np.float64]:
+    return np.array([radiant_flux_w(emitter) for emitter in emitters(light, scene)])
+
+
+def _spectrum_key(emitter: Emitter) -> Hashable:
+    return emitter.temperature_k if isinstance(emitter, Lamp) else emitter.spectrum
+
+
+def _diffuse(
+    light: Light, scene: Scene, per_w: NDArray[np.float32], flux_w: NDArray[np.float64], exposure_s: float
+) -> NDArray[np.float64]:
+    """Return the electrons of indirect light before the blur; groups of one spectrum are summed first."""
+    _, camera = scene.camera(light.camera)
+    summed: dict[Hashable, tuple[Emitter, NDArray[np.float64]]] = {}
+    for group, emitter in enumerate(emitters(light, scene)):
+        if flux_w[group] == 0.0:
+            continue
+        key = _spectrum_key(emitter)
+        part = flux_w[group] * per_w[group, 0].astype(np.float64)
+        summed[key] = (emitter, summed[key][1] + part if key in summed else part)
+    image = np.zeros((camera.sensor.rows, camera.sensor.columns))
+    for emitter, radiance in summed.values():
+        image += diffuse_electrons(camera, radiance, emitter, exposure_s)
+    return image
+
+
+def _render_variance(
+    light: Light, indirect: Indirect, scene: Scene, flux_w: NDArray[np.float64], exposure_s: float
+) -> NDArray[np.float64]:
+    """Return the variance per pixel that rendering adds, in e², the blur's averaging left out.
+
+    Groups are rendered apart, so their variances add up. Each group's electrons are linear in its radiance;
+    its standard deviation goes the way of the radiance.
+    """
+    _, camera = scene.camera(light.camera)
+    total = np.zeros((camera.sensor.rows, camera.sensor.columns))
+    deviation = np.sqrt(indirect.variance)
+    for group in range(len(light.groups)):
+        only = np.zeros(len(light.groups))
+        only[group] = flux_w[group]
+        total += _diffuse(light, scene, deviation, only, exposure_s) ** 2
+    return total
+
+
+def _windows(light: Light, scene: Scene, camera: Camera, exposure_s: float) -> list[Window]:
+    """Return the expected electrons of each row of the direct table."""
+    known = emitters(light, scene)
+    table = light.direct
+    windows = []
+    for row, group in enumerate(table.group):
+        emitter = known[group]
+        beam = Beam(
+            direction=table.direction[row],
+            angular_radius_rad=float(table.angular_radius_rad[row]),
+            irradiance_w_per_m2=float(table.irradiance_per_w[row, 0]) * radiant_flux_w(emitter),
+            response=response(camera, emitter),
+        )
+        windows.append(beam_window(camera, beam, exposure_s))
+    return windows

@@ -1,0 +1,208 @@
+"""The plots of a report, as SVG: errors against true range, with the limit drawn in."""
+
+import io
+from collections.abc import Mapping
+from typing import Literal
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, NullLocator
+
+from nir_render.report.samples import Samples, Values, limit_curve
+from nir_render.report.style import BAD, FAINT, LIMIT, MATPLOTLIB, look
+from nir_render.report.wording import metres
+
+_WIDTH_IN = 11.0
+_RASTER_BEYOND = 1500
+"""More points than these become a bitmap within the SVG: it bounds the size of the page."""
+
+_PULL_SHOWN = 5.0
+
+
+def range_error_plot(samples: Mapping[str, Samples]) -> str:
+    """Draw signed range errors against true range on a symmetric log scale, and below what was missed."""
+    strip_in = 0.35 + 0.22 * len(samples)
+    with mpl.rc_context(MATPLOTLIB):
+        figure = _figure(4.6 + strip_in)
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[4.6, strip_in])
+        some = next(iter(samples.values()))
+        x, limit_m = _band(some.range_m, some.range_limit_m)
+        if x.size:
+            above.fill_between(x, -limit_m, limit_m, color=LIMIT, alpha=0.22, linewidth=0, label="limit ±1 σ")
+            for sign in (-1.0, 1.0):
+                above.plot(x, sign * limit_m, color=LIMIT, linewidth=0.9)
+        above.axhline(0.0, color=FAINT, linewidth=0.7)
+        for name, own in samples.items():
+            _scatter(above, own.range_m, own.error_m, name, list(samples))
+        linear_m = _rounded_up(float(limit_m.max())) if x.size and limit_m.max() > 0.0 else 0.1
+        ticks_m = linear_m * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+        _symmetric_log(above, linear_m, ticks_m, [own.error_m for own in samples.values()] + [limit_m])
+        above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _metres_tick(value)))
+        above.set_ylabel("range error, estimated − true")
+        _legend(above)
+        _found_strip(below, samples)
+        below.set_xlabel("true range, m")
+        return _svg(figure)
+
+
+def pull_plot(samples: Mapping[str, Samples]) -> str:
+    """Draw range errors in units of their own limit: against true range, and as a histogram."""
+    with mpl.rc_context(MATPLOTLIB):
+        figure = _figure(4.2)
+        left, right = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
+        for reach, alpha in ((2.0, 0.10), (1.0, 0.16)):
+            left.axhspan(-reach, reach, color=LIMIT, alpha=alpha, linewidth=0)
+        left.axhline(0.0, color=FAINT, linewidth=0.7)
+        for name, own in samples.items():
+            _scatter(left, own.range_m, own.pull, name, list(samples))
+        _symmetric_log(left, 3.0, np.arange(-3.0, 4.0), [own.pull for own in samples.values()])
+        left.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
+        left.set_ylabel("range error / limit σ")
+        left.set_xlabel("true range, m")
+        _legend(left)
+        _pull_histogram(right, samples)
+        return _svg(figure)
+
+
+def bearing_plot(samples: Mapping[str, Samples]) -> str:
+    """Draw the angle between estimated and true bearing against true range, on a log scale."""
+    with mpl.rc_context(MATPLOTLIB):
+        figure = _figure(3.8)
+        axes = figure.subplots()
+        some = next(iter(samples.values()))
+        x, limit_deg = _band(some.range_m, some.bearing_limit_deg)
+        if x.size:
+            axes.plot(x, limit_deg, color=LIMIT, linewidth=1.4, label="limit, RMS")
+        for name, own in samples.items():
+            # An angle of exactly zero has no place on a log scale, and says nothing but that.
+            _scatter(
+                axes,
+                own.range_m,
+                np.where(own.bearing_deg > 0.0, own.bearing_deg, np.nan),
+                name,
+                list(samples),
+            )
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}°"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylabel("angle between estimated and true bearing")
+        axes.set_xlabel("true range, m")
+        _legend(axes)
+        return _svg(figure)
+
+
+def _band(range_m: Values, limit: Values) -> tuple[Values, Values]:
+    """Return the limit as a line; one flare alone gets a line wide enough to be seen."""
+    x, y = limit_curve(range_m, limit)
+    return (np.array([0.98, 1.02]) * x[0], np.repeat(y, 2)) if x.size == 1 else (x, y)
+
+
+def _scatter(axes: Axes, x: Values, y: Values, name: str, names: list[str]) -> None:
+    marker, colour = look(name, names)
+    known = np.isfinite(x) & np.isfinite(y)
+    many = int(known.sum()) > _RASTER_BEYOND
+    axes.plot(
+        x[known],
+        y[known],
+        marker,
+        color=colour,
+        markersize=3.5 if many else 6.0,
+        fillstyle="none",
+        markeredgewidth=0.7 if many else 1.1,
+        alpha=0.5 if many else 0.9,
+        rasterized=many,
+        label=name,
+    )
+
+
+def _found_strip(axes: Axes, samples: Mapping[str, Samples]) -> None:
+    """One row per estimator: which sources it found, and which it missed."""
+    for row, (name, own) in enumerate(samples.items()):
+        colour = look(name, list(samples)).colour
+        many = own.found.size > _RASTER_BEYOND
+        for chosen, drawn, size in ((own.found, colour, 6.0), (~own.found, BAD, 9.0)):
+            place = own.range_m[chosen]
+            axes.plot(
+                place, np.full(place.shape, row), "|" if drawn is colour else "x", color=drawn,
+                markersize=size if drawn is colour else 5.0, rasterized=many,
+                label="missed" if drawn is BAD and row == 0 else None,
+            )  # fmt: skip
+    axes.set_ylim(len(samples) - 0.4, -0.6)
+    labels = [f"{_short(name)}  {int(own.found.sum())}/{own.found.size}" for name, own in samples.items()]
+    axes.set_yticks(range(len(samples)), labels)
+    axes.grid(visible=False)
+    axes.set_title("found |  missed ×", fontsize=8, loc="right", color=FAINT, pad=3)
+
+
+def _pull_histogram(axes: Axes, samples: Mapping[str, Samples]) -> None:
+    x = np.linspace(-_PULL_SHOWN, _PULL_SHOWN, 201)
+    axes.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), color=LIMIT, linewidth=1.2, label="at the limit")
+    for name, own in samples.items():
+        known = own.pull[np.isfinite(own.pull)]
+        within = known[np.abs(known) <= _PULL_SHOWN]
+        label = f"{name}: {within.size} of {known.size} within ±{_PULL_SHOWN:g}"
+        # As many steps as the flares fill: 12 at least, one per 0.2 σ at most.
+        edges = np.linspace(-_PULL_SHOWN, _PULL_SHOWN, int(np.clip(2.0 * np.sqrt(known.size), 12, 50)) + 1)
+        count, _ = np.histogram(within, edges)
+        density = count / (max(known.size, 1) * (edges[1] - edges[0]))
+        colour = look(name, list(samples)).colour
+        axes.stairs(density, edges, color=colour, linewidth=1.3, label=label)
+    axes.set_xlabel("range error / limit σ")
+    axes.set_ylabel("share of flares per σ")
+    axes.set_xlim(-_PULL_SHOWN, _PULL_SHOWN)
+    top = max(axes.get_ylim()[1], 0.45)
+    axes.set_ylim(0.0, top * (1.12 + 0.09 * len(samples)))
+    _legend(axes, loc="upper left")
+
+
+def _symmetric_log(axes: Axes, linear: float, ticks: Values, values: list[Values]) -> None:
+    """Scale y linearly within ±`linear`, by decades beyond, and reach as far as the values do."""
+    axes.set_yscale("symlog", linthresh=linear, linscale=1.2)
+    known = np.concatenate([value[np.isfinite(value)] for value in values])
+    low, high = (float(known.min()), float(known.max())) if known.size else (-linear, linear)
+    low, high = 1.6 * min(low, -linear), 1.6 * max(high, linear)
+    axes.set_ylim(low, high)
+    decades = 10.0 ** np.arange(np.floor(np.log10(linear)) + 1.0, np.log10(max(-low, high)) + 1.0)
+    beyond = np.concatenate([-decades, decades])
+    # Next to the linear part's own last tick a decade's would be written over it.
+    beyond = beyond[(abs(beyond) > 1.5 * linear) & (beyond >= low) & (beyond <= high)]
+    axes.set_yticks(np.sort(np.concatenate([ticks, beyond])))
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+def _rounded_up(value: float) -> float:
+    """Return the next number of 1, 2, 5, 10, 20, …."""
+    decade = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= value))
+
+
+def _legend(axes: Axes, loc: Literal["best", "upper left"] = "best") -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        shown = [_short(label, 60) for label in labels]
+        axes.legend(handles, shown, loc=loc, fontsize=8, frameon=True, framealpha=0.75, edgecolor="none")
+
+
+def _metres_tick(value: float) -> str:
+    return "0" if value == 0.0 else metres(value, signed=True).replace(".00", "").replace(".0 ", " ")
+
+
+def _short(name: str, most: int = 18) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def _figure(height_in: float) -> Figure:
+    figure = Figure((_WIDTH_IN, height_in), layout="constrained", dpi=130)
+    FigureCanvasSVG(figure)
+    return figure
+
+
+def _svg(figure: Figure) -> str:
+    for axes in figure.axes:
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=12, steps=[1, 2, 5, 10]))
+    file = io.StringIO()
+    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    return file.getvalue()

@@ -1,0 +1,130 @@
+"""The page: what it says, that it needs no network, and that nothing of the user's becomes markup."""
+
+import math
+import re
+from collections.abc import Sequence
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nir_render.evaluate.metrics import FrameKey, evaluate
+from nir_render.evaluate.truth import SourceTruth
+from nir_render.report.page import report_html
+from perception.types import Detection
+from tests.unit.report.cases import calibration, detection, frame, truth
+
+HOSTILE = "<script>alert('$x$ & y')</script>"
+
+
+class _Page(HTMLParser):
+    """Collects tags, addresses and text, and holds that every tag is closed."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(html)
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("href", "src")]
+        if tag not in ("meta", "br", "img"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def _page(
+    keys: Sequence[FrameKey],
+    rows: Sequence[SourceTruth],
+    detections: dict[str, list[Detection]],
+    manifest: dict[str, Any] | None = None,
+) -> tuple[_Page, str]:
+    cameras = {camera: calibration(camera) for camera, _ in keys}
+    html = report_html(
+        keys=keys, result=evaluate(keys, rows, cameras, detections), load=lambda key: frame(*key),
+        calibrations=cameras, manifest=manifest or {}, folder_name="folder", files=["truth.jsonl", "a b<.json"],
+    )  # fmt: skip
+    return _Page(html), html
+
+
+ONE = [("r1.front", 0)]
+
+
+@pytest.mark.parametrize(
+    ("keys", "rows", "detections", "said"),
+    [
+        (ONE, [truth()], {"robust": []}, "Missed 1 of 1 source that could be seen"),
+        (ONE, [], {"robust": []}, "No source was there to be ranged."),
+        (ONE, [], {"robust": [detection()]}, "1 false alarm"),
+        (ONE, [truth()], {"robust": [detection(range_m=math.nan)]}, "No source was ranged."),
+        (ONE, [truth()], {"robust": [detection()]}, "Found the one source"),
+        (ONE, [truth()], {}, "estimators: none"),
+        ([], [], {"robust": []}, "0 frames of 0 cameras"),
+    ],
+)
+def test_pages_of_little(
+    keys: list[FrameKey], rows: list[SourceTruth], detections: dict[str, list[Detection]], said: str
+) -> None:
+    page, _ = _page(keys, rows, detections)
+    assert said in page.text
+
+
+def test_the_page_carries_all_it_shows_and_loads_nothing() -> None:
+    page, html = _page(ONE, [truth()], {"paper": [detection(range_m=1.0)], "robust": [detection()]})
+    inside = [address for address in page.addresses if address.startswith("data:")]
+    assert len(inside) == 1 + 1 + 3  # a frame, a close-up, three plots
+    assert sorted(set(page.addresses) - set(inside)) == ["a%20b%3C.json", "truth.jsonl"]
+    assert "script" not in page.tags
+    assert "http" not in re.sub(r'"data:[^"]*"', "", html)
+    assert "url(" not in html
+
+
+def test_whatever_comes_from_the_user_is_text() -> None:
+    page, html = _page(
+        [(HOSTILE, 0)],
+        [truth(camera=HOSTILE, robot=HOSTILE, source=HOSTILE)],
+        {HOSTILE: [detection(camera=HOSTILE), detection(camera=HOSTILE, u_px=200.0)]},
+        {"scene": HOSTILE, "versions": {"nir-render": HOSTILE}, HOSTILE: HOSTILE},
+    )
+    assert "script" not in page.tags
+    assert HOSTILE not in html
+    assert page.text.count(HOSTILE) > 8
+
+
+def test_many_cameras_are_cut_at_eight_and_said() -> None:
+    keys = [(f"r{i}.front", 0) for i in range(11)]
+    page, _ = _page(keys, [truth(camera=camera) for camera, _ in keys], {"robust": []})
+    assert page.text.count("3 more cameras not shown.") == 2  # of pictures, and of the table
+
+
+def test_the_same_run_gives_the_same_page() -> None:
+    def page() -> str:
+        return _page(ONE, [truth()], {"mine": [detection()]})[1]
+
+    assert page() == page()
+
+
+def test_a_long_run_stays_a_small_page() -> None:
+    """4000 flares, two estimators; as vectors the marks alone would take megabytes."""
+    keys = [("r1.front", index) for index in range(1000)]
+    ranges_m = np.linspace(1.0, 10.0, 4000)
+    rows = [
+        truth(index=i // 4, u_px=40.0 + 60.0 * (i % 4), range_m=float(ranges_m[i]), depth_z_m=float(ranges_m[i]))
+        for i in range(4000)
+    ]  # fmt: skip
+    said = {
+        name: [detection(index=row.index, u_px=row.u_px, range_m=factor * row.range_m) for row in rows]
+        for name, factor in (("paper", 0.5), ("robust", 1.01))
+    }
+    _, html = _page(keys, rows, said)
+    assert len(html) < 2_000_000

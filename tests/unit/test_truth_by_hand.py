@@ -1,0 +1,124 @@
+"""Truth and calibration of a robot that is turned, with a camera off its middle, worked out by hand.
+
+The observer stands at (1, 2, 0) m, turned 90° to the left (+y of the world is ahead). Its left camera sits at
+(0, 0.06, 0.2) m on it and looks along its +y, the world's −x. The source is 3 m along that, 0.5 m up, 0.4 m to
+the world's +y.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nir_render import Scene, load_scene, simulate
+from nir_render.evaluate.truth import SourceTruth
+from perception.types import RawFrame
+
+pytestmark = pytest.mark.mitsuba
+
+EXPOSURE_S = 4e-4
+GAIN_DN_PER_E = 0.74
+APERTURE_M2 = math.pi * 0.9e-3**2 / 4.0
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    base = load_scene(Path(__file__).parents[2] / "scenes" / "one_source.yaml")
+    return base.with_(
+        {
+            "observe": ["r1.left"],
+            "clock": {"frames": 1, "frame_rate": "1 Hz"},
+            "robots.r1": {"rig": "infra_swarm", "position": "[1, 2, 0] m", "orientation": {"yaw": "90 deg"}},
+            # Camera in the world: (1 − 0.06, 2, 0.2). Source: 3 m along −x, 0.4 m along y, 0.5 m up.
+            "robots.r2": {"rig": "infra_swarm", "position": "[-2.06, 2.4, 0.42] m"},
+            "robots.r1.rig.cameras.left.exposure": "0.4 ms",
+            # Without a filter C(θ) is the same everywhere: 0.9 · 0.15 photons that 1 J of the LED's light holds.
+            "robots.r1.rig.cameras.left.filter": None,
+            "robots.r1.rig.sources.top.flux": "5 W",  # its own source must not matter
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def shot(scene: Scene) -> tuple[RawFrame, SourceTruth]:
+    (only,) = simulate(scene)
+    (truth,) = only.truth
+    return only.frame, truth
+
+
+def _electrons_per_j() -> float:
+    """0.9 · 0.15 · mean wavelength / (h c); the mean wavelength of the LED is its centroid, 940 nm."""
+    return 0.9 * 0.15 * 940e-9 / (6.62607015e-34 * 299_792_458.0)
+
+
+def test_geometry(shot: tuple[RawFrame, SourceTruth]) -> None:
+    _, truth = shot
+    range_m = math.sqrt(3.0**2 + 0.4**2 + 0.5**2)
+    assert truth.range_m == pytest.approx(range_m, rel=1e-12)
+    assert truth.depth_z_m == pytest.approx(3.0, rel=1e-12)
+    # The camera looks along the world's −x; its right is the world's +y, its down −z.
+    assert truth.bearing_camera == pytest.approx((0.4 / range_m, -0.5 / range_m, 3.0 / range_m), rel=1e-9)
+    assert truth.u_px == pytest.approx(639.5 + 480.0 * 0.4 / 3.0, abs=1e-9)
+    assert truth.v_px == pytest.approx(479.5 - 480.0 * 0.5 / 3.0, abs=1e-9)
+    # Body axes: x is the world's +y, y the world's −x.
+    assert truth.bearing_body == pytest.approx((0.4 / range_m, 3.0 / range_m, 0.5 / range_m), rel=1e-9)
+    assert truth.position_body_m == pytest.approx((0.4, 3.06, 0.7), rel=1e-9)
+    assert (truth.camera, truth.robot, truth.source) == ("r1.left", "r2", "top")
+
+
+def test_photometry(shot: tuple[RawFrame, SourceTruth]) -> None:
+    """F = Φ/(4π d²) · A_ap · cos θ · C · t, and the peak over its noise for a disc of 1.6 px radius."""
+    frame, truth = shot
+    range2_m2 = 3.0**2 + 0.4**2 + 0.5**2
+    cos_angle = 3.0 / math.sqrt(range2_m2)
+    flux_e = 0.2 / (4.0 * math.pi * range2_m2) * APERTURE_M2 * cos_angle * _electrons_per_j() * EXPOSURE_S
+    assert truth.direct_e == pytest.approx(flux_e, rel=1e-4)
+    assert (truth.visible_fraction, truth.on_fraction, truth.scattered_e, truth.background_e) == (1.0, 1.0, 0.0, 0.0)
+    peak_e = (float(frame.data_dn.max()) - 64.0) / GAIN_DN_PER_E
+    if truth.saturated_px == 0:
+        assert truth.peak_snr == pytest.approx(math.sqrt(peak_e**2 / (peak_e + 100.0)), rel=0.05)
+    assert frame.time_s == 0.0
+    assert frame.exposure_s == EXPOSURE_S
+
+
+def test_calibration(scene: Scene) -> None:
+    """Everything that perception is told, from the data sheets alone; the other robots' sources set K."""
+    calibration = scene.calibration("r1.left")
+    constant = GAIN_DN_PER_E * APERTURE_M2 * _electrons_per_j() * 0.2 / (4.0 * math.pi)
+    assert calibration.range_constant_dn_m2_per_s == pytest.approx(constant, rel=1e-4)
+    assert calibration.sigma == {}
+    assert calibration.position_body_m == pytest.approx([0.0, 0.06, 0.2])
+    # Columns: the camera's right, down and ahead in body axes.
+    np.testing.assert_allclose(calibration.rotation_body_camera, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-15)
+    np.testing.assert_allclose(calibration.response_relative, 1.0, rtol=1e-12)
+    assert (calibration.fx_px, calibration.fy_px) == pytest.approx((480.0, 480.0))
+    assert (calibration.cx_px, calibration.cy_px) == (639.5, 479.5)
+    assert (calibration.width_px, calibration.height_px, calibration.bit_depth) == (1280, 960, 12)
+    assert (calibration.system_gain_dn_per_e, calibration.read_noise_e, calibration.black_level_dn) == (0.74, 10, 64)
+    assert (calibration.psf_sigma_px, calibration.source_radius_m) == (0.7, 0.01)
+    assert calibration.wavelength_m == 940e-9
+    # floor(64 + 0.74 · (5500 − 4 · 10)) is below full scale: read noise may show a full well up to there.
+    assert calibration.saturation_dn == min(4095, math.floor(64 + 0.74 * 5460))
+
+
+def test_the_papers_constant_is_the_slope_of_its_regression(scene: Scene) -> None:
+    """On its own rail, 1 m, the paper's estimator with its own K must come near: within 15 % of 1 m.
+
+    Its slope is set by the nearest ranges, where m = (N − N̄)/t is largest.
+    """
+    from nir_render import expose, render
+    from perception import detect
+
+    near = scene.with_({"robots.r2.position": "[-0.06, 2.0, -0.08] m", "robots.r1.rig.cameras.left.exposure": "0.05 ms"})
+    (found,) = detect(expose(render(near, "r1.left"), near), near.calibration("r1.left"), "paper")
+    assert found.range_m == pytest.approx(1.0, rel=0.15)
+
+
+def test_sources_that_differ_show_in_the_sigma(scene: Scene) -> None:
+    """A third robot with half the flux: K is the mean of both, its σ half their difference."""
+    dim = {"rig": {"preset": "infra_swarm", "sources": {"top": {"flux": "0.1 W"}}}, "position": "[9, 9, 9] m"}
+    both = scene.with_({"robots.r3": dim}).calibration("r1.left")
+    one = scene.calibration("r1.left").range_constant_dn_m2_per_s
+    assert both.range_constant_dn_m2_per_s == pytest.approx(0.75 * one, rel=1e-9)
+    assert both.sigma["range_constant_dn_m2_per_s"] == pytest.approx(0.25 * one, rel=1e-9)
