@@ -24,7 +24,7 @@ from perception import (
     read_frame_records,
     read_ranges,
 )
-from perception.rail import IDEAL_MAE, HeldOut, faults
+from perception.rail_result import IDEAL_MAE, HeldOut, faults
 from perception.ranges_file import RANGES_FILE
 
 FITTED_FILE = "calibration.fitted.json"

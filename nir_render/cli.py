@@ -3,6 +3,7 @@
 Exit status: 0 done, 1 the work failed or a check did not hold, 2 the input was wrong.
 """
 
+import dataclasses
 import json
 import shlex
 import signal
@@ -21,6 +22,7 @@ from rich.table import Table
 from nir_render.errors import InputError
 
 if TYPE_CHECKING:
+    from nir_render.scene.load import Scene
     from perception import Estimator
 
 app = typer.Typer(
@@ -57,6 +59,9 @@ Estimators = Annotated[
         help="paper, robust, or one's own as file.py:function; paper and robust by default. Repeatable.",
     ),
 ]
+KeepLight = Annotated[
+    bool, typer.Option("--keep-light", help="Keep the light of each frame: spectral EXR and direct table.")
+]
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else there.")
 ]
@@ -83,13 +88,14 @@ def run(
     overwrite: Overwrite = False,
     seed: Seed = None,
     threads: Threads = None,
+    keep_light: KeepLight = False,
     as_json: Json = False,
 ) -> None:
     """Render, perceive, evaluate and report a scene in one go."""
     from nir_render.run import evaluate_run, perceive_run, report_run
 
     chosen = _estimators(estimators)
-    folder = _render(scene, output, settings, overwrite, seed, threads)
+    folder = _render(scene, output, settings, overwrite, seed, threads, keep_light)
     with _progress("perceive") as progress:
         perceive_run(folder, estimators=chosen, progress=progress)
     result = evaluate_run(folder)
@@ -107,10 +113,17 @@ def render(
     overwrite: Overwrite = False,
     seed: Seed = None,
     threads: Threads = None,
+    keep_light: KeepLight = False,
+    only_estimate: Annotated[
+        bool, typer.Option("--estimate", help="Only say how long it will take, from small trials.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Render the frames of a scene, with truth and calibration."""
-    folder = _render(scene, output, settings, overwrite, seed, threads)
+    if only_estimate:
+        _show_estimate(_load(scene, settings, seed), as_json)
+        return
+    folder = _render(scene, output, settings, overwrite, seed, threads, keep_light)
     frames = len((folder / "frames.jsonl").read_text(encoding="utf-8").splitlines())
     if as_json:
         _print_json({"folder": str(folder), "frames": frames})
@@ -244,6 +257,26 @@ def doctor(as_json: Json = False) -> None:
         raise typer.Exit(1)
 
 
+def _load(path: Path, settings: list[str] | None, seed: int | None) -> "Scene":
+    from nir_render.scene.load import load_scene
+
+    overrides = dict(map(_setting, settings or []))
+    return load_scene(path, overrides if seed is None else {**overrides, "seed": seed})
+
+
+def _show_estimate(scene: "Scene", as_json: bool) -> None:
+    from nir_render.estimate import estimate
+
+    guess = estimate(scene)
+    if as_json:
+        _print_json({**dataclasses.asdict(guess), "seconds": guess.seconds})
+        return
+    typer.echo(
+        f"about {guess.seconds:.0f} s: light for {guess.lights} views at {guess.seconds_per_light:.2f} s, "
+        f"{guess.frames} frames at {guess.seconds_per_frame:.2f} s"
+    )
+
+
 def _render(
     path: Path,
     output: Path | None,
@@ -251,21 +284,19 @@ def _render(
     overwrite: bool,
     seed: int | None,
     threads: int | None,
+    keep_light: bool,
 ) -> Path:
     from nir_render.run import render_run
     from nir_render.run_folder import check_free
-    from nir_render.scene.load import load_scene
     from nir_render.transport.backend import set_threads
 
-    scene = load_scene(path, dict(map(_setting, settings or [])))
+    scene = _load(path, settings, seed)
     folder = output if output is not None else Path("outputs") / scene.document.name
     check_free(folder, overwrite)
     if threads is not None:
         set_threads(threads)
-    if seed is not None:
-        scene = scene.with_({"seed": seed})
     with _progress("render") as progress:
-        render_run(scene, folder, overwrite=overwrite, progress=progress)
+        render_run(scene, folder, overwrite=overwrite, progress=progress, keep_light=keep_light)
     return folder
 
 

@@ -16,6 +16,7 @@ from nir_render.evaluate.truth import SourceTruth, parse_truth
 from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene
 from nir_render.simulate import simulate
+from nir_render.transport.light import Light
 from perception import (
     ESTIMATORS,
     Calibration,
@@ -41,8 +42,12 @@ Progress = Callable[[int, int], None]
 """Called with the number of frames done, and of all."""
 
 
-def render_run(scene: Scene, folder: Path, *, overwrite: bool, progress: Progress) -> None:
+def render_run(
+    scene: Scene, folder: Path, *, overwrite: bool, progress: Progress, keep_light: bool = False
+) -> None:
     """Render the frames of a scene with their truth and calibration into a new run folder.
+
+    `keep_light` adds the light of each frame, as spectral EXR and direct table.
 
     Raises
     ------
@@ -64,6 +69,8 @@ def render_run(scene: Scene, folder: Path, *, overwrite: bool, progress: Progres
             records.append(frame_record(shot.frame, file))
             truth += [row.record() for row in shot.truth]
             noise_shares.append(shot.render_noise_share)
+            if keep_light:
+                _write_light(aside / "light" / shot.frame.camera / f"{shot.frame.index:06d}", shot.light)
             progress(done + 1, total)
         run_folder.write_lines(aside / "frames.jsonl", records)
         run_folder.write_lines(aside / "truth.jsonl", truth)
@@ -86,6 +93,17 @@ def render_run(scene: Scene, folder: Path, *, overwrite: bool, progress: Progres
             },
         }
         run_folder.write_manifest(aside, facts)
+
+
+def _write_light(stem: Path, light: Light) -> None:
+    from nir_render.export.spectral_exr import direct_document, write_light
+
+    table = direct_document(light.direct, light.groups)
+    run_folder.write_json(stem.with_suffix(".direct.json"), table)
+    try:
+        write_light(stem.with_suffix(".exr"), light)
+    except RuntimeError as error:  # how OpenEXR says that the disk is full
+        raise InputError(f"{stem}.exr: cannot be written ({error})") from None
 
 
 def _indirect_facts(scene: Scene) -> dict[str, Any]:

@@ -24,9 +24,10 @@ _SETTLING_FRAMES = 8  # steps of at most 4: enough for a factor of 65 000
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame, the truth about the sources in it, and the share of its noise that comes from rendering."""
+    """A frame, the light it is made of, the truth about its sources, and the render's share of its noise."""
 
     frame: RawFrame
+    light: Light
     truth: tuple[SourceTruth, ...]
     render_noise_share: float
 
@@ -78,7 +79,8 @@ def simulate(scene: Scene, seed: int | None = None) -> Iterator[Shot]:
             lights[name] = _light(scene, name, time_s + 0.5 * exposure_s, run_seed, lights.get(name))
             mean = expected(lights[name][1], scene, exposure_s)
             frame = _frame(mean, scene, run_seed, index)
-            yield Shot(frame, tuple(truth_of(scene, mean, frame)), mean.render_noise_share)
+            truth = tuple(truth_of(scene, mean, frame))
+            yield Shot(frame, mean.light, truth, mean.render_noise_share)
             if camera.auto_exposure is not None:
                 exposures_s[name] = next_exposure_s(
                     camera.auto_exposure, camera.sensor, frame.data_dn, exposure_s
@@ -89,11 +91,16 @@ def _light(
     scene: Scene, name: str, time_s: float, seed: int, last: tuple[bytes, Light] | None
 ) -> tuple[bytes, Light]:
     """Return the light at a time, rendered anew only where something has moved since the last."""
-    poses = [robot_pose(robot, time_s) for robot in scene.document.robots.values()]
-    geometry = b"".join(pose.rotation.tobytes() + pose.position_m.tobytes() for pose in poses)
+    geometry = geometry_key(scene, time_s)
     if last is not None and last[0] == geometry:
         return geometry, replace(last[1], time_s=time_s)
     return geometry, render(scene, name, time_s, seed)
+
+
+def geometry_key(scene: Scene, time_s: float) -> bytes:
+    """Return what tells two geometries of a scene apart: where all that can move is at a time."""
+    poses = [robot_pose(robot, time_s) for robot in scene.document.robots.values()]
+    return b"".join(pose.rotation.tobytes() + pose.position_m.tobytes() for pose in poses)
 
 
 def _settled_exposure(scene: Scene, light: Light, seed: int) -> float:

@@ -22,7 +22,8 @@ from perception.json_fields import RecordingError
 from perception.limits import FlareLimit, flare_limit
 from perception.own_estimator import EstimatorError, OwnEstimator, load_estimator
 from perception.pipeline import ESTIMATORS, Estimator, detect
-from perception.rail import RailCalibration, calibrate_rail
+from perception.rail import calibrate_rail
+from perception.rail_result import RailCalibration
 from perception.ranges_file import encode_ranges, read_ranges
 from perception.recording import (
     FrameRecord,

@@ -54,7 +54,7 @@ class OwnEstimator:
             # A generator raises only while it is being read.
             found = self.function(own, calibration)
             listed = list(found) if isinstance(found, Iterable) else None
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             raise EstimatorError(f"{where}: {_said(error, self.path)}") from error
         if listed is None:
             raise EstimatorError(f"{where}: returned {_a(found)}; wanted a list of detections")

@@ -26,21 +26,27 @@ def brightest_spot(frame: RawFrame, calibration: Calibration) -> list[Detection]
     # Counts become electrons above black level: photons arrive as electrons, noise is counted in them.
     image_e = electrons(frame, calibration)
 
-    # Where: from the brightest pixel to the centroid of the 7×7 pixels around it.
+    # Where: from the brightest pixel to the centroid of what stands out of the noise around it. Twice,
+    # because the brightest pixel of a wide flare may lie anywhere in it.
+    noise_e = noise_floor_e2(calibration, frame.gain) ** 0.5
     row, column = np.unravel_index(np.argmax(image_e), image_e.shape)
-    top, left = max(0, int(row) - 3), max(0, int(column) - 3)
-    near_e = np.clip(image_e[top : top + 7, left : left + 7] - np.median(image_e), 0.0, None)
-    rows, columns = np.indices(near_e.shape)
-    total_e = float(near_e.sum())
-    if total_e == 0.0:
-        return []
-    u_px = left + float((columns * near_e).sum()) / total_e
-    v_px = top + float((rows * near_e).sum()) / total_e
+    u_px, v_px = float(column), float(row)
+    reach = round(APERTURE_PX)
+    for _ in range(2):
+        top, left = max(0, round(v_px) - reach), max(0, round(u_px) - reach)
+        near_e = image_e[top : round(v_px) + reach + 1, left : round(u_px) + reach + 1] - np.median(image_e)
+        bright_e = np.where(near_e > 4.0 * noise_e, near_e, 0.0).astype(np.float64)
+        rows, columns = np.indices(bright_e.shape)
+        total_e = bright_e.sum()
+        if total_e == 0.0:
+            return []  # noise has a brightest pixel too
+        u_px = left + float((columns * bright_e).sum() / total_e)
+        v_px = top + float((rows * bright_e).sum() / total_e)
 
     # How much light: everything within the aperture, above the mean of the ring around it.
     light = aperture_flux(image_e, u_px, v_px, APERTURE_PX, *RING_PX)
     if light.flux < 5.0 * light.flux_sigma:
-        return []  # noise has a brightest pixel too
+        return []
 
     # How far: a source's light falls with the square of its distance; the calibration knows it at one metre.
     gain = gain_dn_per_e(frame, calibration)
@@ -51,7 +57,7 @@ def brightest_spot(frame: RawFrame, calibration: Calibration) -> list[Detection]
     # In which direction, seen from the robot: x forward, y left, z up.
     x, y, z = bearing_body([[u_px, v_px]], calibration)[0]
 
-    bright = near_e > 3.0 * noise_floor_e2(calibration, frame.gain) ** 0.5
+    lit_e = image_e[top : top + len(bright_e), left : left + bright_e.shape[1]][bright_e > 0.0]
     return [
         Detection(
             camera=frame.camera,
@@ -62,9 +68,9 @@ def brightest_spot(frame: RawFrame, calibration: Calibration) -> list[Detection]
             u_sigma_px=np.nan,  # NaN: no claim is made
             v_sigma_px=np.nan,
             flux_dn=light.flux * gain,
-            mean_dn=frame.black_level_dn + float(near_e[bright].mean()) * gain if bright.any() else np.nan,
+            mean_dn=frame.black_level_dn + float(lit_e.mean()) * gain,
             background_dn=frame.black_level_dn + light.background * gain,
-            area_px=int(bright.sum()),
+            area_px=lit_e.size,
             saturated=bool(frame.data_dn[row, column] >= calibration.saturation_dn),
             merged=False,
             ghost=False,

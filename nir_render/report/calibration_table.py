@@ -5,7 +5,7 @@ import math
 from rich.table import Table
 
 from nir_render.calibrate_run import CameraCalibration
-from perception.rail import IDEAL_MAE, HeldOut
+from perception.rail_result import IDEAL_MAE, HeldOut
 
 
 def calibration_table(name: str, camera: CameraCalibration) -> Table:

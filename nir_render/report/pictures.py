@@ -28,12 +28,12 @@ def whole_figures(
     load: Callable[[FrameKey], RawFrame],
     calibrations: Mapping[str, Calibration],
 ) -> str:
-    """Show of each camera, of eight at most, the frame with the most sources that count.
+    """Show of each camera, of eight at most, the frame with the most sources that count and false alarms.
 
     Of one camera alone, the first frame and the last.
     """
     cameras = cameras_of(keys)
-    chosen = spread(keys, 2) if len(cameras) == 1 else [_fullest(keys, result.scores, c) for c in cameras]
+    chosen = spread(keys, 2) if len(cameras) == 1 else [_fullest(keys, result, c) for c in cameras]
     names = list(result.summary["estimators"])
     figures = []
     for key in chosen[:MOST_CAMERAS]:
@@ -135,9 +135,10 @@ def _close_up(frame: RawFrame, calibration: Calibration, score: Score, names: Se
     crop = tone_map(
         frame.data_dn[top:bottom, left:right], frame.black_level_dn, float(calibration.saturation_dn)
     )
+    place = f'cx="{truth.u_px:.2f}" cy="{truth.v_px:.2f}" r="{radius:.2f}"'
     parts = [
         _image(crop, ".png", left - 0.5, top - 0.5, right - left, bottom - top),
-        f'<circle cx="{truth.u_px:.2f}" cy="{truth.v_px:.2f}" r="{radius:.2f}" class="mark" stroke="{TRUTH}"/>',
+        f'<circle {place} class="mark" stroke="{TRUTH}"/>',
     ]
     lines = [f'<span style="color:{TRUTH}">true {truth.range_m:.3f} m</span>']
     for name in names:
@@ -159,12 +160,14 @@ def _said_mark(name: str, names: Sequence[str], said: Detection, size: float, pr
     return f"<g><title>{escape(hint)}</title>{marker_svg(name, names, said.u_px, said.v_px, size)}</g>"
 
 
-def _fullest(keys: Sequence[FrameKey], scores: Sequence[Score], camera: str) -> FrameKey:
-    """Return the camera's frame with the most sources that count; the first among equals."""
+def _fullest(keys: Sequence[FrameKey], result: Evaluation, camera: str) -> FrameKey:
+    """Return the camera's frame with the most sources that count and false alarms; the first among equals."""
     count = {key: 0 for key in keys if key[0] == camera}
-    for score in scores:
-        if score.countable and key_of(score) in count:
-            count[key_of(score)] += 1
+    told = [key_of(score) for score in result.scores if score.countable]
+    told += [(said.camera, said.index) for alarms in result.false_alarms.values() for said in alarms]
+    for key in told:
+        if key in count:
+            count[key] += 1
     return max(count, key=lambda key: count[key])
 
 

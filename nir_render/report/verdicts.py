@@ -18,12 +18,12 @@ NEES_SLACK = 1.21
 NEES_FAIR = 4.0
 
 RULES = {
-    "Recall": f"good: every countable source found; fair: at least {LEAST_RECALL_FAIR:.0%}. Countable: in "
-    "the image, lit, at least half visible, and its brightest pixel at least 5 σ above the noise.",
+    "Recall": f"good: every countable source found; fair: at least {100.0 * LEAST_RECALL_FAIR:.0f} %. "
+    "Countable: in the image, lit, at least half visible, brightest pixel at least 5 σ above the noise.",
     "False alarms": f"good: at most {FALSE_ALARMS_GOOD} per frame; fair: at most {FALSE_ALARMS_FAIR}.",
-    "Range and bearing": "root-mean-square error over the limit of the same flares. Good: at "
-    f"most {EXCESS_GOOD} (or what chance allows so few flares, 97.5 %); fair: at most {EXCESS_FAIR:.0f}.",
-    "Limit": "the Cramér–Rao bound: the light that truly arrives, the point spread and the calibration known; "
+    "Range and bearing": "root-mean-square error over the limit of the same flares. Good: at most "
+    f"{EXCESS_GOOD} (or what chance allows so few, 97.5 %); fair: at most {EXCESS_FAIR:.0f}.",
+    "Limit": "the Cramér–Rao bound: the light that truly arrives, point spread and calibration known; "
     "place, flux and background of each flare unknown. No unbiased estimator does better on single frames.",
     "Claimed σ": "mean of (range error / claimed σ)², 1 if the claims are right. Good: within the 95 % "
     "interval of that many flares, or σ right to 10 %; fair: σ right to a factor of 2.",
@@ -127,7 +127,8 @@ def _claims(samples: Samples) -> Verdict:
         too = "too small" if root > 1.0 else "too large"
         factor = f"{times(max(root, 1.0 / root))} × " if root > 0.0 else ""
         said = f"The σ it claims are {factor}{too}."
-    interval = f"95 % of {counted(held.count, 'flare')}: {held.low:.2f} to {held.high:.2f}."
+    expected = "gives" if held.count == 1 else "give"
+    interval = f"By chance {counted(held.count, 'flare')} {expected} {held.low:.2f} to {held.high:.2f}."
     return Verdict("Claimed σ", f"NEES {times(held.mean_square)}", level, f"{said} {interval}")
 
 

@@ -40,8 +40,9 @@ def _detection(u_px: float, v_px: float = 100.0, **changes: object) -> Detection
 
 
 def test_the_gate_is_three_pixels_or_the_radius_of_the_image() -> None:
-    assert match([_truth(100.0)], [_detection(102.99)], CALIBRATION).pairs == ((0, 0),)
-    assert match([_truth(100.0)], [_detection(103.01)], CALIBRATION).pairs == ()
+    middle = _truth(319.5, 239.5)
+    assert match([middle], [_detection(322.49, 239.5)], CALIBRATION).pairs == ((0, 0),)
+    assert match([middle], [_detection(322.51, 239.5)], CALIBRATION).pairs == ()
     # At 0.5 m a source of 10 mm has an image of 9.6 px radius on the axis; 45° off, twice that along the radius.
     near = _truth(319.5, 239.5, range_m=0.5)
     assert match([near], [_detection(329.0, 239.5)], CALIBRATION).pairs == ((0, 0),)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from perception.json_fields import RecordingError
-from perception.rail import IDEAL_MAE, calibrate_rail, faults
+from perception.rail import calibrate_rail
+from perception.rail_result import IDEAL_MAE, faults
 from perception.types import RawFrame
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 

@@ -1,0 +1,1 @@
+"""Light and frames in other people's formats."""

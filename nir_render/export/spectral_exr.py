@@ -1,0 +1,54 @@
+"""Indirect light as spectral OpenEXR, after A. Fichet, R. Pacanowski, A. Wilkie, "An OpenEXR Layout for Spectral
+Images", JCGT 10(3), 2021: float32 channels named by Stokes component and wavelength, such as S0.940,000000nm.
+
+One part per light group, and one more, `GROUP.variance`, with the variance of each mean. The direct part has no
+pixels; it goes beside the image as a table.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+
+from nir_render.transport.light import DirectTable, Light
+
+
+def write_light(path: Path, light: Light) -> None:
+    """Write the indirect light of a `Light`, in radiance per watt of each group, 1/(m² sr).
+
+    Nothing is written where there is no indirect light.
+    """
+    if light.indirect is None:
+        return
+    channels = [f"S0.{wavelength_m * 1e9:.6f}nm".replace(".", ",").replace("S0,", "S0.") for wavelength_m in light.wavelengths_m]
+    parts = []
+    for group, name in enumerate(light.groups):
+        for part, arrays in ((name, light.indirect.radiance_per_w), (f"{name}.variance", light.indirect.variance)):
+            header: dict[str, Any] = {
+                "compression": OpenEXR.ZIP_COMPRESSION,
+                "type": OpenEXR.scanlineimage,
+                "spectralLayoutVersion": "1.0",
+                "emissiveUnits": "W.m^-2.sr^-1",
+                "perWattOf": name,
+                "scale": light.indirect.scale,
+            }
+            layers = {channel: np.ascontiguousarray(arrays[group, node]) for node, channel in enumerate(channels)}
+            parts.append(OpenEXR.Part(header, layers, part))
+    OpenEXR.File(parts).write(str(path))
+
+
+def direct_document(table: DirectTable, groups: tuple[str, ...]) -> dict[str, Any]:
+    """Return a direct table as a JSON document: one row per source and way."""
+    rows = [
+        {
+            "group": groups[table.group[row]],
+            "direction_camera": table.direction[row].tolist(),
+            "distance_m": float(table.distance_m[row]),
+            "angular_radius_rad": float(table.angular_radius_rad[row]),
+            "visible_fraction": float(table.visible_fraction[row]),
+            "irradiance_per_w": table.irradiance_per_w[row].tolist(),
+        }
+        for row in range(len(table.group))
+    ]
+    return {"format": 1, "visibility_rays": table.visibility_rays, "rows": rows}

@@ -1,0 +1,44 @@
+"""The limits that a source's errors are held against."""
+
+import math
+
+import pytest
+
+from nir_render.evaluate.metrics import evaluate, source_limits
+from perception.limits import flare_limit
+from tests.unit.report.cases import calibration, truth
+
+CAMERA = calibration()
+
+
+def test_on_the_axis_a_pixel_is_one_focal_length_th_of_a_radian_in_both_directions() -> None:
+    """480 px focal length: the two equal pixel errors make √2 σ / 480 rad."""
+    row = truth(u_px=159.5, v_px=119.5)
+    limit = flare_limit(CAMERA, 159.5, 119.5, 2.0, 1e4, 0.0)
+    range_m, bearing_deg = source_limits(row, CAMERA)
+    assert range_m == limit.range_sigma_m
+    assert limit.u_sigma_px == pytest.approx(limit.v_sigma_px)
+    assert bearing_deg == pytest.approx(math.degrees(math.sqrt(2.0) * limit.u_sigma_px / 480.0), rel=1e-5)
+
+
+def test_off_the_axis_pixels_cover_smaller_angles() -> None:
+    """At tan θ = 0.3 along u a pixel is cos² θ / f in the field's direction, cos θ / f across it."""
+    u_px = 159.5 + 0.3 * 480.0
+    limit = flare_limit(CAMERA, u_px, 119.5, 2.0, 1e4, 0.0)
+    _, bearing_deg = source_limits(truth(u_px=u_px, v_px=119.5), CAMERA)
+    cos = 1.0 / math.hypot(1.0, 0.3)
+    along_rad, across_rad = cos**2 * limit.u_sigma_px / 480.0, cos * limit.v_sigma_px / 480.0
+    assert bearing_deg == pytest.approx(math.degrees(math.hypot(along_rad, across_rad)), rel=1e-5)
+
+
+def test_light_from_elsewhere_costs_accuracy() -> None:
+    dark, bright = (source_limits(truth(background_e=e), CAMERA) for e in (0.0, 400.0))
+    assert bright[0] > 1.3 * dark[0]
+    assert bright[1] > 1.3 * dark[1]
+
+
+def test_without_light_there_is_no_limit_and_the_summary_leaves_it_out() -> None:
+    assert all(math.isnan(limit) for limit in source_limits(truth(direct_e=0.0), CAMERA))
+    lit, unlit = truth(), truth(u_px=200.0, direct_e=0.0)
+    summary = evaluate([("r1.front", 0)], [lit, unlit], {"r1.front": CAMERA}, {}).summary
+    assert summary["bearing_limit_rms_deg"] == pytest.approx(source_limits(lit, CAMERA)[1])
