@@ -95,7 +95,6 @@ def calibrate_rail(
     RecordingError
         If there are fewer than 6 different ranges, or the source is found at fewer than two of them.
     """
-
     fitted, held_out = _split(ranges_m, calibration.camera)
     # One number for each place: the regression pools what stands at the same range.
     place_m = {index: ranges_m[place[0]] for place in (*fitted, *held_out) for index in place}
