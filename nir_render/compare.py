@@ -63,9 +63,9 @@ def compare_batches(one: Array, other: Array, tile_px: int = 16, significance: f
     # Where neither varies there is no light, or no Monte Carlo: they must agree to float32 rounding.
     floor = (1e-6 * np.maximum(np.abs(means[0]), np.abs(means[1]))) ** 2
     t = (means[0] - means[1]) / np.sqrt(np.maximum(error2, floor) + 1e-300)
-    spread = sum(e**2 / (len(tile) - 1) for e, tile in zip(errors2, tiles, strict=True))
+    spread = errors2[0] ** 2 / (len(tiles[0]) - 1) + errors2[1] ** 2 / (len(tiles[1]) - 1)
     freedom = np.where(spread > 0.0, error2**2 / np.maximum(spread, 1e-300), np.inf)
-    p = 2.0 * stats.t.sf(np.abs(t), np.maximum(freedom, 1.0))
+    p = np.asarray(2.0 * stats.t.sf(np.abs(t), np.maximum(freedom, 1.0)))
     smallest = float(np.min(_holm(p)))
     relative = np.sqrt(error2) / np.maximum(np.abs(means[1]), 1e-300)
     lit = np.abs(means[1][:-1]) > 0.0

@@ -37,6 +37,7 @@ from perception import (
     read_frames,
 )
 
+FRAMES_FILE = "frames.jsonl"
 Item = TypeVar("Item")
 Progress = Callable[[int, int], None]
 """Called with the number of frames done, and of all."""
@@ -156,7 +157,7 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress:
     found: dict[str, list[Detection]] = {name: [] for name in estimators}
     try:
         calibrations = read_calibrations(folder)
-        total = len(run_folder.read_lines(folder / "frames.jsonl"))
+        total = len(_frame_keys(folder))
         for done, frame in enumerate(read_frames(folder)):
             if frame.camera not in calibrations:
                 raise InputError(f"{folder / 'calibration.json'}: knows no camera {frame.camera!r}")
@@ -167,8 +168,6 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress:
         raise InputError(f"--estimator {error}") from None
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
-    if not any(folder.joinpath("frames.jsonl").read_text(encoding="utf-8").split()):
-        raise InputError(f"{folder / 'frames.jsonl'}: names no frame")
     for name, detections in found.items():
         run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, detections))
     note_seconds(folder, "perceive", started)
@@ -194,9 +193,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         raise InputError(f"{folder}: there are no detections; run 'nir-render perceive {folder}' first")
     try:
         calibrations = read_calibrations(folder)
-        keys = [(record.camera, record.index) for record in read_frame_records(folder)]
-        if not keys:
-            raise InputError(f"{folder / 'frames.jsonl'}: names no frame")
+        keys = _frame_keys(folder)
         truth = _parse_lines(truth_path, parse_truth)
         detections = {
             path.name.removeprefix("detections.").removesuffix(".jsonl"): _parse_lines(path, parse_detection)
@@ -247,6 +244,14 @@ def report_run(folder: Path, result: Evaluation) -> Path:
     run_folder.write_file(folder / "report.html", page.encode())
     note_seconds(folder, "report", started)
     return folder / "report.html"
+
+
+def _frame_keys(folder: Path) -> list[FrameKey]:
+    """Return camera and index of all frames of a recording; raise InputError where it has none."""
+    keys = [(record.camera, record.index) for record in read_frame_records(folder)]
+    if not keys:
+        raise InputError(f"{folder / FRAMES_FILE}: names no frame")
+    return keys
 
 
 def _parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:

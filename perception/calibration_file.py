@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perception.json_fields import Place, as_number, check_format, get, integer, number, number_or_nan, numbers
+from perception.json_fields import (
+    Place,
+    as_number,
+    check_format,
+    get,
+    integer,
+    number,
+    number_or_nan,
+    numbers,
+)
 from perception.types import Calibration
 
 _WHOLE = ("width_px", "height_px", "saturation_dn", "bit_depth")

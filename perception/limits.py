@@ -11,7 +11,6 @@ from perception.ranging import angular_radius_rad
 from perception.sensor import clip_level_e, noise_floor_e2
 from perception.types import Calibration
 
-
 WIDE_PX = 64.0
 """Images larger than this, sources within arm's length, have their limit in closed form."""
 

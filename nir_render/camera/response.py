@@ -103,9 +103,7 @@ def _response(camera: Camera, emitter: Emitter) -> Response:
     return Response(angle_rad, np.asarray(at_nodes(cosines)) @ weights)
 
 
-def _electrons_per_j(
-    camera: Camera, emitter: Emitter, cosines: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _electrons_per_j(camera: Camera, emitter: Emitter, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return electrons per joule of parallel light that meets the filter at given cosines, shape (n,)."""
     spectrum = emission_spectrum(emitter)
     wavelength_m = _merged_grid(spectrum, camera)

@@ -1,8 +1,8 @@
-"""Indirect light as spectral OpenEXR, after A. Fichet, R. Pacanowski, A. Wilkie, "An OpenEXR Layout for Spectral
-Images", JCGT 10(3), 2021: float32 channels named by Stokes component and wavelength, such as S0.940,000000nm.
+"""Indirect light as spectral OpenEXR: float32 channels named by Stokes component and wavelength.
 
-One part per light group, and one more, `GROUP.variance`, with the variance of each mean. The direct part has no
-pixels; it goes beside the image as a table.
+The layout is that of A. Fichet, R. Pacanowski, A. Wilkie, "An OpenEXR Layout for Spectral Images", JCGT 10(3),
+2021; a channel is called S0.940,000000nm. One part per light group, and one more, `GROUP.variance`, with the
+variance of each mean. The direct part has no pixels; it goes beside the image as a table.
 """
 
 from pathlib import Path
@@ -21,10 +21,16 @@ def write_light(path: Path, light: Light) -> None:
     """
     if light.indirect is None:
         return
-    channels = [f"S0.{wavelength_m * 1e9:.6f}nm".replace(".", ",").replace("S0,", "S0.") for wavelength_m in light.wavelengths_m]
+    channels = [
+        f"S0.{wavelength_m * 1e9:.6f}nm".replace(".", ",").replace("S0,", "S0.")
+        for wavelength_m in light.wavelengths_m
+    ]
     parts = []
     for group, name in enumerate(light.groups):
-        for part, arrays in ((name, light.indirect.radiance_per_w), (f"{name}.variance", light.indirect.variance)):
+        for part, arrays in (
+            (name, light.indirect.radiance_per_w),
+            (f"{name}.variance", light.indirect.variance),
+        ):
             header: dict[str, Any] = {
                 "compression": OpenEXR.ZIP_COMPRESSION,
                 "type": OpenEXR.scanlineimage,
@@ -33,7 +39,9 @@ def write_light(path: Path, light: Light) -> None:
                 "perWattOf": name,
                 "scale": light.indirect.scale,
             }
-            layers = {channel: np.ascontiguousarray(arrays[group, node]) for node, channel in enumerate(channels)}
+            layers = {
+                channel: np.ascontiguousarray(arrays[group, node]) for node, channel in enumerate(channels)
+            }
             parts.append(OpenEXR.Part(header, layers, part))
     OpenEXR.File(parts).write(str(path))
 

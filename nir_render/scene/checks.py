@@ -41,7 +41,10 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
         for camera_name, camera in robot.rig.cameras.items():
             efficiency = efficiency_of(camera)
             for place, spectrum in spectra.items():
-                if efficiency.low_m > spectrum.low_m + _SLACK_M or efficiency.high_m < spectrum.high_m - _SLACK_M:
+                if (
+                    efficiency.low_m > spectrum.low_m + _SLACK_M
+                    or efficiency.high_m < spectrum.high_m - _SLACK_M
+                ):
                     problems.append(
                         f"robots.{name}.rig.cameras.{camera_name}.sensor.quantum_efficiency: covers "
                         f"{efficiency.range_nm()}, but {place} shines from "
@@ -68,7 +71,7 @@ def _cameras_inside_solids(document: SceneDocument) -> list[str]:
 
 
 def solid_around(document: SceneDocument, point_m: NDArray[np.float64]) -> str | None:
-    """Return the name of a closed shape that holds a point, or None. Meshes are tested where they are built."""
+    """Return the name of a closed shape that holds a point, or None. Meshes are tested when built."""
     return next((name for name, body in document.shapes.items() if _contains(body, point_m)), None)
 
 

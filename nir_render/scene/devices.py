@@ -198,8 +198,8 @@ class Sensor(PresetDocument):
             )
         if self.full_well_e < 10.0 * self.read_noise_e:
             raise ValueError(
-                f"read_noise {self.read_noise_e:g} e leaves less than ten steps of noise below the full well of "
-                f"{self.full_well_e:g} e"
+                f"read_noise {self.read_noise_e:g} e leaves less than ten steps of noise below the "
+                f"full well of {self.full_well_e:g} e"
             )
         reached_dn = self.black_level_dn + self.system_gain_dn_per_e * self.full_well_e
         if reached_dn < 0.5 * self.full_scale_dn:
@@ -223,7 +223,7 @@ class PointSpread(Document):
 
 
 class AutoExposure(Document):
-    """Exposure that follows the brightest pixel of the last frame, to `target` of the range up to clipping."""
+    """Exposure that brings the brightest pixel of the last frame to `target` of the range up to clipping."""
 
     target: Annotated[Fraction, Field(gt=0, lt=1)] = 0.7
     shortest_s: Annotated[Time, Positive]

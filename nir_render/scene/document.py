@@ -11,6 +11,7 @@ from nir_render.scene.devices import Name, NotNegative, Orientation, Positive, R
 from nir_render.scene.units import Frequency, Position, Time
 from nir_render.scene.world import Lamp, MaterialDocument, ShapeDocument
 
+
 class Waypoint(Document):
     """Where a robot is from one time on, for as long as `hold`; then it moves evenly to the next."""
 
@@ -35,8 +36,8 @@ class Robot(Document):
         for earlier, later in itertools.pairwise(self.motion):
             if later.time_s <= earlier.time_s + earlier.hold_s:
                 raise ValueError(
-                    f"the times of 'motion' must increase: {later.time_s:g} s is not after {earlier.time_s:g} s "
-                    f"and its hold of {earlier.hold_s:g} s"
+                    f"the times of 'motion' must increase: {later.time_s:g} s is not after "
+                    f"{earlier.time_s:g} s and its hold of {earlier.hold_s:g} s"
                 )
         return self
 
@@ -60,7 +61,9 @@ class IndirectSettings(Document):
     @classmethod
     def _power_of_two(cls, samples: int) -> int:
         if samples & (samples - 1):
-            raise ValueError(f"{samples} is no power of two: only these render to the same bits on any machine")
+            raise ValueError(
+                f"{samples} is no power of two: only these render to the same bits on any machine"
+            )
         return samples
 
 

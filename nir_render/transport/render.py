@@ -21,7 +21,9 @@ def render(scene: Scene, camera: str, time_s: float, seed: int) -> Light:
     pose = camera_pose(robot, device, time_s)
     inside = solid_around(scene.document, pose.position_m)
     if inside is not None:
-        raise InputError(f"{scene.path}: the camera {camera} is inside shapes.{inside} at {time_s:g} s; move one")
+        raise InputError(
+            f"{scene.path}: the camera {camera} is inside shapes.{inside} at {time_s:g} s; move one"
+        )
     world.check_meshes(scene, pose.position_m, f"the camera {camera} at {time_s:g} s")
     direct = direct_table(scene, pose, time_s)
     indirect = stock.indirect(scene, camera, device, pose, time_s, seed, direct)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.errors import InputError
 from nir_render.camera.lens import intrinsics_of
+from nir_render.errors import InputError
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import Pose
@@ -53,7 +53,9 @@ def indirect(
         )
     groups = world.groups(scene)
     sensor = _sensor(camera, pose, settings.scale)
-    seen = {int(group) for group, share in zip(direct.group, direct.visible_fraction, strict=True) if share > 0}
+    seen = {
+        int(group) for group, share in zip(direct.group, direct.visible_fraction, strict=True) if share > 0
+    }
     means, variances = [], []
     for group, emitter in enumerate(groups):
         bodies = world.build(scene, time_s, emitting=emitter)
@@ -85,7 +87,9 @@ def _batch(
     """Return one estimate of the radiance without straight emission, shape (rows, columns)."""
     mi = backend().mi
     whole = mi.load_dict({"type": "path", "max_depth": max_depth})
-    image = np.array(mi.render(bodies, sensor=sensor, integrator=whole, spp=samples, seed=seed), dtype=np.float64)
+    image = np.array(
+        mi.render(bodies, sensor=sensor, integrator=whole, spp=samples, seed=seed), dtype=np.float64
+    )
     if straight:
         emission = mi.load_dict({"type": "path", "max_depth": 1})
         shown = mi.render(bodies, sensor=sensor, integrator=emission, spp=samples, seed=seed)

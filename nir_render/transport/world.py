@@ -33,7 +33,7 @@ def groups(scene: Scene) -> tuple[str, ...]:
 
 
 def has_indirect_light(scene: Scene) -> bool:
-    """Tell whether any light comes other than straight from sources: a lamp shines or a body does not absorb."""
+    """Tell whether light comes other than straight from sources: a lamp shines or a body does not absorb."""
     materials = {scene.document.materials[shape.material] for shape in scene.document.shapes.values()}
     absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in materials)
     return bool(scene.document.lamps) or not absorbing

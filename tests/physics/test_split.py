@@ -123,7 +123,9 @@ def stock_e(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> np.ndarra
     sigma_nm = 42.0 / np.sqrt(8.0 * np.log(2.0))
     led_per_nm = np.exp(-0.5 * ((NM - 940.0) / sigma_nm) ** 2) / (sigma_nm * np.sqrt(2.0 * np.pi))
     all_nm = np.linspace(300.0, 1100.0, 8001)
-    planck_per_nm = planck_shape(NM * 1e-9, 2856.0) / np.trapezoid(planck_shape(all_nm * 1e-9, 2856.0), all_nm)
+    planck_per_nm = planck_shape(NM * 1e-9, 2856.0) / np.trapezoid(
+        planck_shape(all_nm * 1e-9, 2856.0), all_nm
+    )
     out = tmp_path_factory.mktemp("stock") / "stock.npy"
     scale = 1e-17
     case = {
@@ -135,7 +137,9 @@ def stock_e(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> np.ndarra
         "width": WIDTH, "height": HEIGHT, "samples": SAMPLES, "batches": BATCHES, "out": str(out),
         "fov_deg": float(np.degrees(2.0 * np.arctan(0.5 * WIDTH / FOCAL_PX))),
     }  # fmt: skip
-    subprocess.run([sys.executable, "-c", STOCK], input=json.dumps(case), text=True, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-c", STOCK], input=json.dumps(case), text=True, check=True, capture_output=True
+    )
     radiance = np.load(out) / scale
     lens = intrinsics_of(scene.camera("r1.c")[1])
     x = (np.arange(WIDTH) - lens.cx_px) / lens.fx_px
@@ -193,5 +197,3 @@ def test_groups_add_up_and_scale(scene: Scene) -> None:
     off = whole - expected_electrons(light, dim)
     only = scene.with_({"robots.r3.rig.sources.s.flux": "1e-30 W", "lamps.one.luminous_flux": "1e-30 lm"})
     np.testing.assert_allclose(2.0 * off, expected_electrons(light, only), rtol=1e-6, atol=1e-6 * whole.max())
-
-

@@ -17,7 +17,9 @@ def _render(seed: int, gain: float = 1.0, batches: int = 16) -> np.ndarray:
 
 def test_equal_renders_are_rarely_called_different() -> None:
     """400 pairs at a significance of 5 %: Holm keeps false alarms at or below 5 %, here at most 35 (3 σ)."""
-    verdicts = [compare_batches(_render(2 * i), _render(2 * i + 1), significance=0.05).same for i in range(400)]
+    verdicts = [
+        compare_batches(_render(2 * i), _render(2 * i + 1), significance=0.05).same for i in range(400)
+    ]
     alarms = len(verdicts) - sum(verdicts)
     assert alarms <= 35
     assert alarms >= 4  # and it is no test that never fires: an uncorrected frame alone would give about 20

@@ -33,7 +33,7 @@ def _offenders(folder: str, *banned: str, but: str = "") -> list[str]:
 
 
 def test_the_walk_sees_imports() -> None:
-    assert "nir_render.transport.direct" in _imports(ROOT / "nir_render" / "simulate.py")
+    assert "nir_render.transport.render" in _imports(ROOT / "nir_render" / "simulate.py")
     assert _offenders("nir_render/transport", "mitsuba")
 
 

@@ -74,7 +74,12 @@ def test_photometry(shot: tuple[RawFrame, SourceTruth]) -> None:
     cos_angle = 3.0 / math.sqrt(range2_m2)
     flux_e = 0.2 / (4.0 * math.pi * range2_m2) * APERTURE_M2 * cos_angle * _electrons_per_j() * EXPOSURE_S
     assert truth.direct_e == pytest.approx(flux_e, rel=1e-4)
-    assert (truth.visible_fraction, truth.on_fraction, truth.scattered_e, truth.background_e) == (1.0, 1.0, 0.0, 0.0)
+    assert (truth.visible_fraction, truth.on_fraction, truth.scattered_e, truth.background_e) == (
+        1.0,
+        1.0,
+        0.0,
+        0.0,
+    )
     peak_e = (float(frame.data_dn.max()) - 64.0) / GAIN_DN_PER_E
     if truth.saturated_px == 0:
         assert truth.peak_snr == pytest.approx(math.sqrt(peak_e**2 / (peak_e + 100.0)), rel=0.05)
@@ -90,12 +95,18 @@ def test_calibration(scene: Scene) -> None:
     assert calibration.sigma == {}
     assert calibration.position_body_m == pytest.approx([0.0, 0.06, 0.2])
     # Columns: the camera's right, down and ahead in body axes.
-    np.testing.assert_allclose(calibration.rotation_body_camera, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-15)
+    np.testing.assert_allclose(
+        calibration.rotation_body_camera, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-15
+    )
     np.testing.assert_allclose(calibration.response_relative, 1.0, rtol=1e-12)
     assert (calibration.fx_px, calibration.fy_px) == pytest.approx((480.0, 480.0))
     assert (calibration.cx_px, calibration.cy_px) == (639.5, 479.5)
     assert (calibration.width_px, calibration.height_px, calibration.bit_depth) == (1280, 960, 12)
-    assert (calibration.system_gain_dn_per_e, calibration.read_noise_e, calibration.black_level_dn) == (0.74, 10, 64)
+    assert (calibration.system_gain_dn_per_e, calibration.read_noise_e, calibration.black_level_dn) == (
+        0.74,
+        10,
+        64,
+    )
     assert (calibration.psf_sigma_px, calibration.source_radius_m) == (0.7, 0.01)
     assert calibration.wavelength_m == 940e-9
     # floor(64 + 0.74 · (5500 − 4 · 10)) is below full scale: read noise may show a full well up to there.
@@ -110,7 +121,9 @@ def test_the_papers_constant_is_the_slope_of_its_regression(scene: Scene) -> Non
     from nir_render import expose, render
     from perception import detect
 
-    near = scene.with_({"robots.r2.position": "[-0.06, 2.0, -0.08] m", "robots.r1.rig.cameras.left.exposure": "0.05 ms"})
+    near = scene.with_(
+        {"robots.r2.position": "[-0.06, 2.0, -0.08] m", "robots.r1.rig.cameras.left.exposure": "0.05 ms"}
+    )
     (found,) = detect(expose(render(near, "r1.left"), near), near.calibration("r1.left"), "paper")
     assert found.range_m == pytest.approx(1.0, rel=0.15)
 

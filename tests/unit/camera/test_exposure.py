@@ -23,6 +23,8 @@ def test_a_sphere_gives_the_same_flux_as_a_point(
     angle = np.radians(angle_deg)
     irradiance = 0.2 / (4.0 * np.pi * distance_m**2)
     direction = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    beam = Beam(direction, float(np.arcsin(source.radius_m / distance_m)), irradiance, response(camera, source))
+    beam = Beam(
+        direction, float(np.arcsin(source.radius_m / distance_m)), irradiance, response(camera, source)
+    )
     expected_e = irradiance * aperture_area_m2(camera) * np.cos(angle) * float(beam.response(0.0)) * 1e-3
     assert beam_window(camera, beam, 1e-3).total == pytest.approx(expected_e, rel=1e-6)

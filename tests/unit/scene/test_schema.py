@@ -43,7 +43,10 @@ def _scene(camera: Any) -> dict[str, Any]:
         ({"preset": "infra_swarm", "exposure": "1 ms"}, True),
         ({"preset": "infra_swarm", "exposure": 1}, False),
         ({"preset": "infra_swarm", "exposur": "1 ms"}, False),
-        ({"exposure": "1 ms"}, True),  # a preset of the rig may hold the rest; the loader tells where none does
+        (
+            {"exposure": "1 ms"},
+            True,
+        ),  # a preset of the rig may hold the rest; the loader tells where none does
         ({"preset": "infra_swarm", "sensor": {"preset": "mt9m031", "quantum_efficiency": 0.2}}, True),
     ],
 )
