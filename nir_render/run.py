@@ -73,7 +73,7 @@ def render_run(
             if keep_light:
                 _write_light(aside / "light" / shot.frame.camera / f"{shot.frame.index:06d}", shot.light)
             progress(done + 1, total)
-        run_folder.write_lines(aside / "frames.jsonl", records)
+        run_folder.write_lines(aside / FRAMES_FILE, records)
         run_folder.write_lines(aside / "truth.jsonl", truth)
         run_folder.write_json(aside / "calibration.json", calibration_document(calibrations.values()))
         run_folder.write_file(aside / "scene.yaml", scene.resolved_yaml().encode())

@@ -1,8 +1,8 @@
 """Indirect light as spectral OpenEXR: float32 channels named by Stokes component and wavelength.
 
-The layout is that of A. Fichet, R. Pacanowski, A. Wilkie, "An OpenEXR Layout for Spectral Images", JCGT 10(3),
-2021; a channel is called S0.940,000000nm. One part per light group, and one more, `GROUP.variance`, with the
-variance of each mean. The direct part has no pixels; it goes beside the image as a table.
+The layout is that of A. Fichet, R. Pacanowski, A. Wilkie, "An OpenEXR Layout for Spectral Images", JCGT
+10(3), 2021; a channel is called S0.940,000000nm. One part per light group, and one more, `GROUP.variance`,
+with the variance of each mean. The direct part has no pixels; it goes beside the image as a table.
 """
 
 from pathlib import Path

@@ -43,7 +43,7 @@ def robot_pose(robot: Robot, time_s: float) -> Pose:
     """Return the robot's pose in the world; before its first and after its last waypoint it stands still."""
     if not robot.motion:
         return Pose(rotation_of(robot.orientation), np.array(robot.position_m))
-    # Each waypoint is two knots, its arrival and the end of its hold; np.interp and Slerp want them to increase.
+    # A waypoint is two knots, its arrival and the end of its hold; np.interp and Slerp want them to increase.
     stops = [(way.time_s, way) for way in robot.motion]
     stops += [(way.time_s + way.hold_s, way) for way in robot.motion if way.hold_s > 0.0]
     stops.sort(key=lambda stop: stop[0])
