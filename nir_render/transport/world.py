@@ -48,11 +48,26 @@ def source_positions_m(scene: Scene, time_s: float) -> dict[str, NDArray[np.floa
     return positions
 
 
-def build(scene: Scene, time_s: float, emitting: str | None = None) -> Any:
+def extent_m(scene: Scene, time_s: float) -> float:
+    """Return the diagonal of the box that holds all bodies."""
+    box = build(scene, time_s).bbox()
+    return float(np.linalg.norm(np.array(box.max).ravel() - np.array(box.min).ravel()))
+
+
+def has_smooth_surface(scene: Scene) -> bool:
+    """Tell whether any body shows sharp images: a mirror, glass, a smooth clear coat."""
+    materials = [scene.document.materials[shape.material] for shape in scene.document.shapes.values()]
+    return any(
+        isinstance(material, Mirror | Dielectric) or (isinstance(material, Plastic) and material.roughness == 0.0)
+        for material in materials
+    )
+
+
+def build(scene: Scene, time_s: float, emitting: str | None = None, as_point: bool = False) -> Any:
     """Return the Mitsuba scene of all bodies at one time, lamps and the spheres of the sources included.
 
     The light group `emitting` sends one watt; nothing else shines. Sources and lamps absorb what falls on
-    them.
+    them. With `as_point` the emitting source is a point without a body.
     """
     bodies: dict[str, Any] = {"type": "scene"}
     for name, shape in scene.document.shapes.items():
@@ -62,6 +77,10 @@ def build(scene: Scene, time_s: float, emitting: str | None = None) -> Any:
     sources = scene.sources()
     for index, (name, centre_m) in enumerate(source_positions_m(scene, time_s).items()):
         radius_m = sources[name][1].radius_m
+        if name == emitting and as_point:
+            intensity = _uniform(1.0 / (4.0 * np.pi))  # one watt in all directions
+            bodies["point"] = {"type": "point", "position": centre_m.tolist(), "intensity": intensity}
+            continue
         sphere = {"type": "sphere", "center": centre_m.tolist(), "radius": radius_m, "bsdf": _BLACK}
         # One watt from the whole sphere: L = 1 / (4π² r²).
         shine = {"emitter": _area_light(1.0 / (4.0 * np.pi**2 * radius_m**2))} if name == emitting else {}

@@ -1,0 +1,48 @@
+"""Spectral EXR: what is written is what a reader of the layout finds."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from nir_render.export.spectral_exr import direct_document, write_light
+from nir_render.transport.light import DirectTable, Indirect, Light
+
+# The channel names of the layout (Fichet et al. 2021): Stokes component, wavelength with a comma, unit.
+_CHANNEL = re.compile(r"^S0\.(\d+,\d+)nm$")
+
+
+def _light() -> Light:
+    table = DirectTable(
+        group=np.array([0]), direction=np.array([[0.0, 0.0, 1.0]]), distance_m=np.array([2.0]),
+        angular_radius_rad=np.array([0.005]), visible_fraction=np.array([0.5]),
+        irradiance_per_w=np.array([[0.00995]]), visibility_rays=1024,
+    )  # fmt: skip
+    radiance = np.arange(2 * 6 * 8, dtype=np.float32).reshape(2, 1, 6, 8) / 7.0
+    return Light("r1.front", 0.0, 1, ("r2.top", "lamps.one"), (940e-9,), table, Indirect(radiance, radiance**2, 2, 16))
+
+
+def test_every_group_is_a_part_and_reads_back_to_the_bit(tmp_path: Path) -> None:
+    light = _light()
+    write_light(tmp_path / "light.exr", light)
+    parts = {part.name(): part for part in OpenEXR.File(str(tmp_path / "light.exr")).parts}
+    assert set(parts) == {"r2.top", "r2.top.variance", "lamps.one", "lamps.one.variance"}
+    assert light.indirect is not None
+    for group, name in enumerate(light.groups):
+        ((channel, values),) = parts[name].channels.items()
+        found = _CHANNEL.match(channel)
+        assert found is not None
+        assert float(found[1].replace(",", ".")) == 940.0
+        assert values.pixels.dtype == np.float32
+        np.testing.assert_array_equal(values.pixels, light.indirect.radiance_per_w[group, 0])
+        ((_, variance),) = parts[f"{name}.variance"].channels.items()
+        np.testing.assert_array_equal(variance.pixels, light.indirect.variance[group, 0])
+    assert parts["r2.top"].header["emissiveUnits"] == "W.m^-2.sr^-1"
+
+
+def test_the_direct_table_as_json() -> None:
+    light = _light()
+    (row,) = direct_document(light.direct, light.groups)["rows"]
+    assert (row["group"], row["distance_m"], row["visible_fraction"]) == ("r2.top", 2.0, 0.5)
+    assert row["irradiance_per_w"] == [0.00995]
