@@ -14,7 +14,7 @@ endif
 
 help:
 	@echo "make setup   make .venv, install the pinned packages, find a usable LLVM"
-	@echo "make demo    render and evaluate scenes/one_source.yaml into outputs/one_source"
+	@echo "make demo    render and evaluate scenes/arena.yaml into outputs/arena"
 	@echo "make test    the tests, without the long statistical checks"
 	@echo "make verify  the long statistical checks"
 	@echo "make lint    ruff and mypy"
@@ -26,7 +26,7 @@ setup:
 	@"$(PYTHON)" tools/bootstrap.py
 
 demo: setup
-	$(BIN)/nir-render run scenes/one_source.yaml -o outputs/one_source --overwrite
+	$(BIN)/nir-render run scenes/arena.yaml -o outputs/arena --overwrite
 
 test: setup
 	$(BIN)/python -m pytest -m "not verify" $(ARGS)

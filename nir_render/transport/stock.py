@@ -80,7 +80,9 @@ def indirect(
             body_radiance=_radiance_of(sources[emitter][1]) if as_point else None,
         )
         keys = [_seed(seed, name, time_s, emitter, batch) for batch in range(batches)]
-        renders = np.stack([_batch(view, sensor, samples // batches, settings.max_depth, key) for key in keys])
+        renders = np.stack(
+            [_batch(view, sensor, samples // batches, settings.max_depth, key) for key in keys]
+        )
         means.append(renders.mean(axis=0))
         variances.append(renders.var(axis=0, ddof=1) / batches)
     return Indirect(

@@ -58,7 +58,8 @@ def has_smooth_surface(scene: Scene) -> bool:
     """Tell whether any body shows sharp images: a mirror, glass, a smooth clear coat."""
     materials = [scene.document.materials[shape.material] for shape in scene.document.shapes.values()]
     return any(
-        isinstance(material, Mirror | Dielectric) or (isinstance(material, Plastic) and material.roughness == 0.0)
+        isinstance(material, Mirror | Dielectric)
+        or (isinstance(material, Plastic) and material.roughness == 0.0)
         for material in materials
     )
 

@@ -75,7 +75,9 @@ def tally(scene: Scene, calibrations: dict[str, Calibration]) -> Tally:
                     row, hit = shot.truth[i], found[j]
                     total.found += countable(row, calibrations[name])
                     total.angles_deg[name].append(angle_deg(hit.bearing_body, row.bearing_body))
-                    total.pulls.append((hit.range_m - row.range_m) / source_limits(row, calibrations[name])[0])
+                    total.pulls.append(
+                        (hit.range_m - row.range_m) / source_limits(row, calibrations[name])[0]
+                    )
                     total.seen_twice[seed, row.robot].append((hit, row))
     return total
 

@@ -1,5 +1,6 @@
 """What the README shows runs as it stands there."""
 
+import json
 import os
 import re
 import shlex
@@ -27,16 +28,55 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_python_snippets_run_in_order(checkout: Path) -> None:
-    code = "\n".join(_blocks("python"))
-    assert "nr.render(scene" in code
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=checkout, capture_output=True, text=True, check=False
-    )
+def _python(code: str, folder: Path) -> str:
+    run = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(run, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    found = re.match(r"([\d.]+) ± ([\d.]+) m at", done.stdout)
-    assert found is not None, done.stdout
-    assert float(found[1]) == pytest.approx(1.0229, abs=5 * 0.0012)
+    return done.stdout
+
+
+def test_the_python_snippets_run_in_order(checkout: Path) -> None:
+    """The front camera sees r2 and r5; their ranges are those of the arena, within five of their σ."""
+    said = _python("\n".join(_blocks("python")), checkout)
+    found = [(float(m[1]), float(m[2])) for m in re.finditer(r"([\d.]+) ± ([\d.]+) m at", said)]
+    true_m = [2.128, 2.398]
+    assert len(found) == len(true_m)
+    for (range_m, sigma_m), truth_m in zip(sorted(found), true_m, strict=True):
+        assert range_m == pytest.approx(truth_m, abs=5 * sigma_m)
+        assert sigma_m < 0.02
+
+
+def test_the_example_of_the_design_runs_as_it_stands(checkout: Path) -> None:
+    _python(
+        """
+import nir_render as nr, perception
+scene = nr.load_scene("scenes/arena.yaml")
+light = nr.render(scene, camera="r1.front", time_s=0.0, seed=1)
+frame = nr.expose(light, scene, exposure_s=2e-3, seed=1)
+hits = perception.detect(frame, scene.calibration("r1.front"), estimator="robust")
+assert len(hits) >= 2 and any(hit.saturated for hit in hits)
+assert frame._repr_png_().startswith(b"\\x89PNG") and "r2.top" in light._repr_html_()
+""",
+        checkout,
+    )
+
+
+def test_dimming_the_source_does_not_fool_the_calibration(checkout: Path) -> None:
+    """What the README's `--set …flux="0.05 W"` makes: the run is calibrated for the source it has."""
+    settings = ["--set", "robots.r2.rig.sources.top.flux=0.05 W", "--set", "clock.frames=3", "--json"]
+    run = [
+        sys.executable,
+        "-c",
+        "from nir_render.cli import main; main()",
+        "run",
+        "scenes/one_source.yaml",
+        "-o",
+        "dim",
+    ]
+    done = subprocess.run([*run, *settings], cwd=checkout, capture_output=True, text=True, check=True)
+    robust = json.loads(done.stdout)["estimators"]["robust"]
+    assert robust["recall"] == 1.0
+    assert robust["range_rmse_m"] < 3.0 * robust["range_limit_rmse_m"]
 
 
 def test_the_commands_run_in_order(checkout: Path) -> None:

@@ -20,7 +20,9 @@ def _light() -> Light:
         irradiance_per_w=np.array([[0.00995]]), visibility_rays=1024,
     )  # fmt: skip
     radiance = np.arange(2 * 6 * 8, dtype=np.float32).reshape(2, 1, 6, 8) / 7.0
-    return Light("r1.front", 0.0, 1, ("r2.top", "lamps.one"), (940e-9,), table, Indirect(radiance, radiance**2, 2, 16))
+    return Light(
+        "r1.front", 0.0, 1, ("r2.top", "lamps.one"), (940e-9,), table, Indirect(radiance, radiance**2, 2, 16)
+    )
 
 
 def test_every_group_is_a_part_and_reads_back_to_the_bit(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """Indirect light against closed forms, its variance against its scatter, and what it must not hold."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -76,7 +75,12 @@ def test_a_wall_lit_by_a_lamp(scene: Scene) -> None:
 
     It hangs 4 m up, 2 m before the wall, and shines down: to the wall's point ahead, cos θ' = 4/d, cos θ = 2/d.
     """
-    lamp = {"center": "[1, 0, 4] m", "size": "[0.1, 0.1] m", "luminous_flux": "1000 lm", "temperature": "2856 K"}
+    lamp = {
+        "center": "[1, 0, 4] m",
+        "size": "[0.1, 0.1] m",
+        "luminous_flux": "1000 lm",
+        "temperature": "2856 K",
+    }
     lit = _indirect(scene.with_({"lamps.one": lamp})).radiance_per_w[1, 0].astype(float)
     d2 = 4.0 + 16.0
     expected = 0.6 / math.pi * (2.0 / math.sqrt(d2)) * (4.0 / math.sqrt(d2)) / (math.pi * d2)
@@ -118,7 +122,9 @@ def test_same_seed_same_bits(scene: Scene) -> None:
 
 
 def test_a_scale_that_does_not_divide_the_sensor_is_refused(scene: Scene) -> None:
-    with pytest.raises(InputError, match=r"render\.indirect\.scale: 5 does not divide the sensor of r1\.c, 32 × 24"):
+    with pytest.raises(
+        InputError, match=r"render\.indirect\.scale: 5 does not divide the sensor of r1\.c, 32 × 24"
+    ):
         render(scene.with_({"render.indirect.scale": 5}), "r1.c")
 
 
