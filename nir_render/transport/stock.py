@@ -6,9 +6,10 @@ and once at depth 1, where a camera sees nothing but emission, and the differenc
 sources hide what is behind them in both.
 
 Mitsuba samples a sphere by the cone that it fills, of solid angle 2π (1 − cos α) in float32. That difference
-loses its digits where the sphere is small and far: the light of a source of 10 mm is wrong by 1 % at 5 m and by
-7 % at 10 m. So sources that are small in their scene light it as points, which for a uniform sphere in full view
-is exact at any distance. Where smooth surfaces show images of sources, they stay spheres, and keep that error.
+loses its digits where the sphere is small and far: the light of a source of 10 mm is wrong by 1 % at 5 m and
+by 7 % at 10 m. So sources that are small in their scene light it as points, which for a uniform sphere in
+full view is exact at any distance. Where smooth surfaces show images of sources, they stay spheres, and keep
+that error.
 """
 
 import hashlib
