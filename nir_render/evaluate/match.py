@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from nir_render.evaluate.truth import SourceTruth
-from perception.flare_model import image_radius_px
+from perception import flare_model
 from perception.types import Calibration, Detection
 
 GATE_PX = 3.0
@@ -43,7 +43,7 @@ def match(
     As many pairs as possible within max(3 px, radius of the source's image), and among these the nearest.
     """
     distance_px = np.empty((len(truth), len(detections)))
-    gates_px = np.array([max(GATE_PX, radius_px(row, calibration)) for row in truth])
+    gates_px = np.array([max(GATE_PX, image_radius_px(row, calibration)) for row in truth])
     for i, row in enumerate(truth):
         for j, detection in enumerate(detections):
             distance_px[i, j] = np.hypot(detection.u_px - row.u_px, detection.v_px - row.v_px)
@@ -56,9 +56,9 @@ def match(
     return FrameMatch(pairs, tuple(j for j in range(len(detections)) if j not in taken))
 
 
-def radius_px(truth: SourceTruth, calibration: Calibration) -> float:
+def image_radius_px(truth: SourceTruth, calibration: Calibration) -> float:
     """Return the radius of a source's image along its longer axis; 0 where it is too near to have one."""
     if truth.range_m <= 2.0 * calibration.source_radius_m:
         return 0.0
     angle_rad = math.asin(calibration.source_radius_m / truth.range_m)
-    return float(image_radius_px(truth.u_px, truth.v_px, angle_rad, calibration))
+    return float(flare_model.image_radius_px(truth.u_px, truth.v_px, angle_rad, calibration))

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.evaluate.metrics import FrameKey, Score
-from nir_render.evaluate.truth import SourceTruth
 from perception.picture import tone_map
 from perception.types import Calibration, RawFrame
 
@@ -57,8 +56,3 @@ def whole_picture(frame: RawFrame, calibration: Calibration, block_px: int) -> N
         float(calibration.saturation_dn),
         _FAINT_SOFTENING,
     )
-
-
-def image_radius_px(truth: SourceTruth, calibration: Calibration) -> float:
-    """Return the radius of a source's image, bounded where the camera touches the source."""
-    return calibration.fx_px * calibration.source_radius_m / max(truth.depth_z_m, calibration.source_radius_m)

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.evaluate.match import image_radius_px
 from nir_render.evaluate.metrics import Evaluation, FrameKey, Score
-from nir_render.report.frames import cameras_of, image_radius_px, key_of, spread, whole_picture
+from nir_render.report.frames import cameras_of, key_of, spread, whole_picture
 from nir_render.report.style import BAD, TRUTH, look
 from nir_render.report.wording import counted, metres
 from perception.picture import tone_map
