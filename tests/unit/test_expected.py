@@ -1,0 +1,85 @@
+"""Light to electrons with lights made by hand: what a known radiance, and a known variance of it, become."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nir_render import InputError, Scene, load_scene
+from nir_render.camera.lens import aperture_area_m2
+from nir_render.expected import expected, expected_electrons, group_electrons
+from nir_render.transport.light import DirectTable, Indirect, Light
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Without a filter and with a flat efficiency, C is 0.9 · 0.15 photons per joule of 940 nm."""
+    base = load_scene(Path(__file__).parents[2] / "scenes" / "one_source.yaml")
+    return base.with_({"robots.r1.rig.cameras.front.filter": None})
+
+
+def _light(radiance: float, variance: float, scale: int = 2) -> Light:
+    shape = (2, 1, 960 // scale, 1280 // scale)
+    none = DirectTable(
+        group=np.empty(0, dtype=np.int64), direction=np.empty((0, 3)), distance_m=np.empty(0),
+        angular_radius_rad=np.empty(0), visible_fraction=np.empty(0), irradiance_per_w=np.empty((0, 1)),
+        visibility_rays=1024,
+    )  # fmt: skip
+    arrays = [np.full(shape, value, dtype=np.float32) for value in (radiance, variance)]
+    return Light(
+        "r1.front", 0.0, 1, ("r1.top", "r2.top"), (940e-9,), none, Indirect(arrays[0], arrays[1], scale, 16)
+    )
+
+
+def _electrons_on_axis(radiance_w: float, exposure_s: float) -> float:
+    """L · A_ap · (pitch/f)² · C · t."""
+    electrons_per_j = 0.9 * 0.15 * 940e-9 / (6.62607015e-34 * 299_792_458.0)
+    aperture_m2 = np.pi * 0.9e-3**2 / 4.0
+    return float(radiance_w * aperture_m2 * (3.75e-6 / 1.8e-3) ** 2 * electrons_per_j * exposure_s)
+
+
+@pytest.mark.parametrize("scale", [1, 2, 4])
+def test_an_even_radiance_falls_with_the_fourth_power_of_the_cosine(scene: Scene, scale: int) -> None:
+    """Two groups of 0.2 W at 1e-2 per watt: on axis the closed form, 45° off (480 px) a quarter of it."""
+    image_e = expected_electrons(_light(1e-2, 0.0, scale), scene, 1e-3)
+    on_axis_e = _electrons_on_axis(2 * 0.2 * 1e-2, 1e-3)
+    assert image_e[479:481, 639:641].mean() == pytest.approx(on_axis_e, rel=2e-4)
+    assert image_e[479:481, 1119:1121].mean() == pytest.approx(on_axis_e / 4.0, rel=1e-3)
+    assert aperture_area_m2(scene.camera("r1.front")[1]) == pytest.approx(np.pi * 0.9e-3**2 / 4.0)
+
+
+def test_each_group_has_its_own_flux(scene: Scene) -> None:
+    dim = scene.with_({"robots.r2.rig.sources.top.flux": "0.05 W"})
+    mean = expected(_light(1e-2, 0.0), dim, 1e-3)
+    parts = [group_electrons(mean, dim, group)[480, 640] for group in (0, 1)]
+    assert parts[0] / parts[1] == pytest.approx(4.0, rel=1e-6)
+    assert sum(parts) == pytest.approx(mean.electrons[480, 640], rel=1e-9)
+
+
+def test_the_share_of_render_noise_in_the_frame(scene: Scene) -> None:
+    """Two groups whose radiances have σ = 1e-3 per watt: variance 2 (0.2 k σ)², over signal + read noise.
+
+    The median pixel is where cos⁴ θ has its median; there both signal and σ are that much smaller.
+    """
+    share = expected(_light(1e-2, 1e-6), scene, 1e-3).render_noise_share
+    columns, rows = (np.arange(1280) - 639.5) / 480.0, (np.arange(960) - 479.5) / 480.0
+    cos4 = (1.0 + columns**2 + rows[:, None] ** 2) ** -2
+    signal_e = _electrons_on_axis(0.4 * 1e-2, 1e-3) * cos4
+    noise_e2 = 2.0 * (_electrons_on_axis(0.2 * 1e-3, 1e-3) * cos4) ** 2
+    assert share == pytest.approx(float(np.median(noise_e2 / (signal_e + 100.0))), rel=0.005)
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_impossible_exposures_are_refused(scene: Scene, exposure_s: float) -> None:
+    with pytest.raises(InputError, match="wanted seconds greater than 0"):
+        expected_electrons(_light(1e-2, 0.0), scene, exposure_s)
+
+
+def test_exposing_changes_nothing_of_the_light(scene: Scene) -> None:
+    light = _light(1e-2, 1e-6)
+    assert light.indirect is not None
+    before = light.indirect.radiance_per_w.copy()
+    expected_electrons(light, scene, 1e-3)
+    expected_electrons(dataclasses.replace(light, time_s=3.0), scene, 2e-3)
+    np.testing.assert_array_equal(light.indirect.radiance_per_w, before)
