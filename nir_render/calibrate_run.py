@@ -11,11 +11,10 @@ from nir_render import run_folder
 from nir_render.calibration import range_constant
 from nir_render.errors import InputError
 from nir_render.evaluate.truth import SourceTruth, parse_truth
-from nir_render.run import Progress, note_seconds
+from nir_render.run import Progress, note_seconds, parse_lines
 from nir_render.scene.load import load_scene
 from perception import (
     RailCalibration,
-    RecordingError,
     calibrate_rail,
     calibration_document,
     encode_ranges,
@@ -97,6 +96,7 @@ def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibrati
         The folder is no recording, no ranges are known, or they are too few.
     """
     started = time.perf_counter()
+    (folder / FITTED_FILE).unlink(missing_ok=True)
     truth = _truth(folder)
     try:
         calibrations = read_calibrations(folder)
@@ -124,11 +124,12 @@ def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibrati
             done[camera] = CameraCalibration(
                 result, tuple(faults(result)), _true_constant(folder, camera, truth)
             )
-    except RecordingError as error:
+    except InputError:
+        raise
+    except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
     if not done:
         raise InputError(f"{folder / RANGES_FILE}: holds no ranges")
-    (folder / FITTED_FILE).unlink(missing_ok=True)
     if not any(camera.faults for camera in done.values()):
         fitted = {**calibrations, **{name: camera.result.calibration for name, camera in done.items()}}
         run_folder.write_json(folder / FITTED_FILE, calibration_document(fitted.values()))
@@ -140,10 +141,7 @@ def _truth(folder: Path) -> list[SourceTruth]:
     path = folder / "truth.jsonl"
     if not path.is_file():
         return []
-    try:
-        return [parse_truth(record) for record in run_folder.read_lines(path)]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: a line is broken ({error})") from None
+    return parse_lines(path, parse_truth)
 
 
 def _true_ranges(folder: Path, truth: list[SourceTruth]) -> dict[tuple[str, int], float]:
@@ -154,6 +152,8 @@ def _true_ranges(folder: Path, truth: list[SourceTruth]) -> dict[tuple[str, int]
                 f"{folder}: frame {row.index} of {row.camera!r} has more than one source in view; "
                 f"calibrate on a rail with one source, or write the range that counts into {RANGES_FILE}"
             )
+        if not (isinstance(row.range_m, float) and row.range_m > 0.0):
+            raise InputError(f"{folder / 'truth.jsonl'}: range_m of frame {row.index} is {row.range_m!r}")
         ranges_m[row.camera, row.index] = row.range_m
     return ranges_m
 
@@ -164,7 +164,12 @@ def _true_constant(folder: Path, camera: str, truth: list[SourceTruth]) -> float
     if len(seen) != 1 or not (folder / "scene.yaml").is_file():
         return None
     scene = load_scene(folder / "scene.yaml")
-    _, source = scene.sources()[seen.pop()]
+    name = seen.pop()
+    if name not in scene.sources():
+        raise InputError(
+            f"{folder / 'truth.jsonl'}: speaks of a source {name!r} that scene.yaml does not have"
+        )
+    _, source = scene.sources()[name]
     return range_constant(scene.camera(camera)[1], source)
 
 

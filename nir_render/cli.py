@@ -264,6 +264,21 @@ def _load(path: Path, settings: list[str] | None, seed: int | None) -> "Scene":
     return load_scene(path, overrides if seed is None else {**overrides, "seed": seed})
 
 
+def _say_what_is_lowered(scene: "Scene") -> None:
+    """Tell, on standard error, where this machine renders with fewer samples than the scene asks for."""
+    if not scene.document.has_indirect_light():
+        return
+    from nir_render.transport.stock import samples_of
+
+    asked, used = scene.document.render.indirect.samples, samples_of(scene)
+    if used < asked:
+        _errors.print(
+            f"no usable LLVM: indirect light with {used} samples per pixel instead of {asked}; "
+            "'nir-render doctor' says more",
+            soft_wrap=True,
+        )
+
+
 def _show_estimate(scene: "Scene", as_json: bool) -> None:
     from nir_render.estimate import estimate
 
@@ -291,6 +306,7 @@ def _render(
     from nir_render.transport.backend import set_threads
 
     scene = _load(path, settings, seed)
+    _say_what_is_lowered(scene)
     folder = output if output is not None else Path("outputs") / scene.document.name
     check_free(folder, overwrite)
     if threads is not None:

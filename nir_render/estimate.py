@@ -27,17 +27,21 @@ class Estimate:
 
 
 def estimate(scene: Scene) -> Estimate:
-    """Return how long `render` will take, by the light of each camera once at few samples, and one frame.
+    """Return how long `render` will take, by trials with the first camera: its light, and one frame.
 
-    The time of a render is a fixed part and one that grows with the samples: two trials tell both.
+    The time of a light is a fixed part and one that grows with the samples: two trials tell both. Other
+    cameras are taken to be like the first; writing files is not counted.
     """
+    from nir_render.transport.stock import samples_of
+
     cameras = scene.cameras()
     start_s = scene.document.clock.start_s
-    wanted = scene.document.render.indirect.samples
+    wanted = samples_of(scene)
     few, more = scene.with_({"render.indirect.samples": 4}), scene.with_({"render.indirect.samples": 8})
     render(few, cameras[0], start_s)  # compiles
     spent_few, spent_more = _spent(few, cameras[0], start_s), _spent(more, cameras[0], start_s)
-    per_sample = max(spent_more - spent_few, 0.0) / 4.0
+    more_samples = samples_of(more) - samples_of(few)
+    per_sample = max(spent_more - spent_few, 0.0) / more_samples if more_samples else 0.0
     light = render(few, cameras[0], start_s)
     expose(light, few)  # fills the tables
     started = time.perf_counter()

@@ -1,4 +1,6 @@
-"""Directions in cones, for whoever looks at a small sphere from outside."""
+"""Directions in cones, for whoever looks at a small sphere from outside; frames of rectangles."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,3 +32,19 @@ def cone_directions(direction: Array, versine: Array, azimuth_rad: Array) -> Arr
 def cone_versine(angular_radius_rad: float) -> float:
     """Return 1 − cos of a cone's half angle, exact for small ones."""
     return 2.0 * float(np.sin(0.5 * angular_radius_rad)) ** 2
+
+
+def rectangle_frame(normal: Sequence[float], size_m: tuple[float, float], rotation_rad: float) -> Array:
+    """Return half width, half height and unit normal of a rectangle as the columns of a matrix, shape (3, 3).
+
+    Width runs horizontally, along world x where the normal is vertical, before it is turned about the normal.
+    """
+    facing = np.array(normal) / np.linalg.norm(normal)
+    across = np.cross([0.0, 0.0, 1.0], facing)
+    if np.linalg.norm(across) < 1e-9:
+        across = np.array([1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    up = np.cross(facing, across)
+    c, s = np.cos(rotation_rad), np.sin(rotation_rad)
+    width, height = 0.5 * size_m[0], 0.5 * size_m[1]
+    return np.stack([width * (c * across + s * up), height * (c * up - s * across), facing], axis=1)

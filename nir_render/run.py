@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nir_render import run_folder
 from nir_render.errors import InputError
+from nir_render.evaluate.lamps import lamp_outlines_px
 from nir_render.evaluate.metrics import Evaluation, FrameKey, evaluate
 from nir_render.evaluate.truth import SourceTruth, parse_truth
 from nir_render.report.preview import preview_png
-from nir_render.scene.load import Scene
+from nir_render.scene.load import Scene, load_scene
 from nir_render.simulate import simulate
 from nir_render.transport.light import Light
 from perception import (
@@ -64,6 +66,7 @@ def render_run(
     calibrations = {name: scene.calibration(name) for name in cameras}
     with run_folder.new_run_folder(folder, overwrite) as aside:
         records, truth, noise_shares = [], [], []
+        kept: dict[str, tuple[str, Light]] = {}
         for done, shot in enumerate(simulate(scene)):
             file = f"frames/{shot.frame.camera}/{shot.frame.index:06d}.png"
             run_folder.write_file(aside / file, encode_png16(shot.frame.data_dn))
@@ -71,7 +74,10 @@ def render_run(
             truth += [row.record() for row in shot.truth]
             noise_shares.append(shot.render_noise_share)
             if keep_light:
-                _write_light(aside / "light" / shot.frame.camera / f"{shot.frame.index:06d}", shot.light)
+                folder_of_light = aside / "light" / shot.frame.camera
+                kept[shot.frame.camera] = _write_light(
+                    folder_of_light / f"{shot.frame.index:06d}", shot.light, kept.get(shot.frame.camera)
+                )
             progress(done + 1, total)
         run_folder.write_lines(aside / FRAMES_FILE, records)
         run_folder.write_lines(aside / "truth.jsonl", truth)
@@ -96,24 +102,31 @@ def render_run(
         run_folder.write_manifest(aside, facts)
 
 
-def _write_light(stem: Path, light: Light) -> None:
+def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tuple[str, Light]:
+    """Write a light; its arrays only where they are not those of the last one. Returns their file, and it."""
     from nir_render.export.spectral_exr import direct_document, write_light
 
-    table = direct_document(light.direct, light.groups)
-    run_folder.write_json(stem.with_suffix(".direct.json"), table)
+    same = last is not None and last[1].indirect is light.indirect
+    file = last[0] if last is not None and same else f"{stem.name}.exr"
+    held = {"indirect": file if light.indirect is not None else None}
+    run_folder.write_json(
+        stem.with_suffix(".direct.json"), direct_document(light.direct, light.groups) | held
+    )
     try:
-        write_light(stem.with_suffix(".exr"), light)
+        if not same:
+            write_light(stem.with_suffix(".exr"), light)
     except RuntimeError as error:  # how OpenEXR says that the disk is full
         raise InputError(f"{stem}.exr: cannot be written ({error})") from None
+    return file, light
 
 
 def _indirect_facts(scene: Scene) -> dict[str, Any]:
-    from nir_render.transport import stock, world
+    from nir_render.transport import stock
 
     settings = scene.document.render.indirect
     samples = stock.samples_of(scene)
     note = "" if samples == settings.samples else f"{settings.samples} asked for; no usable LLVM"
-    rendered = world.has_indirect_light(scene)
+    rendered = scene.document.has_indirect_light()
     return {"rendered": rendered, "scale": settings.scale, "samples": samples, "note": note}
 
 
@@ -194,13 +207,13 @@ def evaluate_run(folder: Path) -> Evaluation:
     try:
         calibrations = read_calibrations(folder)
         keys = _frame_keys(folder)
-        truth = _parse_lines(truth_path, parse_truth)
+        truth = parse_lines(truth_path, parse_truth)
         detections = {
-            path.name.removeprefix("detections.").removesuffix(".jsonl"): _parse_lines(path, parse_detection)
+            path.name.removeprefix("detections.").removesuffix(".jsonl"): parse_lines(path, parse_detection)
             for path in paths
         }
         _check_frames_known(keys, truth, detections, calibrations, folder)
-        result = evaluate(keys, truth, calibrations, detections)
+        result = evaluate(keys, truth, calibrations, detections, _lamps(folder))
         preview = _preview(folder, keys, result)
     except InputError:
         raise
@@ -246,6 +259,19 @@ def report_run(folder: Path, result: Evaluation) -> Path:
     return folder / "report.html"
 
 
+def _lamps(folder: Path) -> dict[FrameKey, list[NDArray[np.float32]]]:
+    """Return the outlines of the lamps in each frame of a rendered run, from the scene that it holds."""
+    if not (folder / "scene.yaml").is_file():
+        return {}
+    scene = load_scene(folder / "scene.yaml")
+    if not scene.document.lamps:
+        return {}
+    return {
+        (record.camera, record.index): lamp_outlines_px(scene, record.camera, record.time_s)
+        for record in read_frame_records(folder)
+    }
+
+
 def _frame_keys(folder: Path) -> list[FrameKey]:
     """Return camera and index of all frames of a recording; raise InputError where it has none."""
     keys = [(record.camera, record.index) for record in read_frame_records(folder)]
@@ -254,7 +280,7 @@ def _frame_keys(folder: Path) -> list[FrameKey]:
     return keys
 
 
-def _parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
+def parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
     """Parse a file of JSON lines; raise InputError with file and line where one is broken."""
     items = []
     for number, record in enumerate(run_folder.read_lines(path), 1):

@@ -14,6 +14,7 @@ from nir_render.errors import InputError
 from nir_render.evaluate.truth import SourceTruth, truth_of
 from nir_render.expected import Expected, expected
 from nir_render.randomness import generator
+from nir_render.scene.devices import AutoExposure, Camera
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import robot_pose
 from nir_render.transport.light import Light
@@ -72,19 +73,18 @@ def simulate(scene: Scene, seed: int | None = None) -> Iterator[Shot]:
     for index, time_s in enumerate(scene.document.frame_times_s()):
         for name in scene.cameras():
             _, camera = scene.camera(name)
-            if name not in exposures_s:
+            control = camera.auto_exposure
+            if name not in exposures_s and control is not None:
                 lights[name] = _light(scene, name, time_s, run_seed, lights.get(name))
-                exposures_s[name] = _settled_exposure(scene, lights[name][1], run_seed)
-            exposure_s = exposures_s[name]
+                exposures_s[name] = _settled_exposure(scene, lights[name][1], camera, control, run_seed)
+            exposure_s = exposures_s.setdefault(name, camera.exposure_s)
             lights[name] = _light(scene, name, time_s + 0.5 * exposure_s, run_seed, lights.get(name))
             mean = expected(lights[name][1], scene, exposure_s)
             frame = _frame(mean, scene, run_seed, index)
             truth = tuple(truth_of(scene, mean, frame))
             yield Shot(frame, mean.light, truth, mean.render_noise_share)
-            if camera.auto_exposure is not None:
-                exposures_s[name] = next_exposure_s(
-                    camera.auto_exposure, camera.sensor, frame.data_dn, exposure_s
-                )
+            if control is not None:
+                exposures_s[name] = next_exposure_s(control, camera.sensor, frame.data_dn, exposure_s)
 
 
 def _light(
@@ -103,14 +103,12 @@ def geometry_key(scene: Scene, time_s: float) -> bytes:
     return b"".join(pose.rotation.tobytes() + pose.position_m.tobytes() for pose in poses)
 
 
-def _settled_exposure(scene: Scene, light: Light, seed: int) -> float:
+def _settled_exposure(scene: Scene, light: Light, camera: Camera, control: AutoExposure, seed: int) -> float:
     """Return the exposure that a camera has found before its first frame, by frames that are not kept."""
-    _, camera = scene.camera(light.camera)
     exposure_s = camera.exposure_s
-    if camera.auto_exposure is not None:
-        for frame in range(_SETTLING_FRAMES):
-            data_dn = expose(light, scene, exposure_s, seed, index=-1 - frame).data_dn
-            exposure_s = next_exposure_s(camera.auto_exposure, camera.sensor, data_dn, exposure_s)
+    for frame in range(_SETTLING_FRAMES):
+        data_dn = expose(light, scene, exposure_s, seed, index=-1 - frame).data_dn
+        exposure_s = next_exposure_s(control, camera.sensor, data_dn, exposure_s)
     return exposure_s
 
 

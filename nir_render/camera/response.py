@@ -75,9 +75,16 @@ def _optics(camera: Camera) -> Camera:
 
 
 def _kind(emitter: Emitter) -> Emitter:
-    """Return the emitter without its place, likewise."""
-    where = "center_m" if isinstance(emitter, Lamp) else "position_m"
-    return emitter.model_copy(update={where: (0.0, 0.0, 0.0)})
+    """Return the emitter without its place, size and flux, likewise."""
+    if isinstance(emitter, Lamp):
+        update = {
+            "center_m": (0.0, 0.0, 0.0),
+            "size_m": (1.0, 1.0),
+            "normal": (0.0, 0.0, 1.0),
+            "luminous_flux_lm": 1.0,
+        }
+        return emitter.model_copy(update=update)
+    return emitter.model_copy(update={"position_m": (0.0, 0.0, 0.0), "radius_m": 1.0, "flux_w": 1.0})
 
 
 @lru_cache(maxsize=16)

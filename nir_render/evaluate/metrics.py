@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from nir_render.evaluate.lamps import on_a_lamp
 from nir_render.evaluate.match import countable, match
 from nir_render.evaluate.truth import SourceTruth
 from perception.bearing import direction_camera
@@ -43,6 +45,7 @@ def evaluate(
     truth: Iterable[SourceTruth],
     calibrations: Mapping[str, Calibration],
     detections: Mapping[str, Iterable[Detection]],
+    lamps: Mapping[FrameKey, Sequence[NDArray[np.float32]]] | None = None,
 ) -> Evaluation:
     """Score the detections of each estimator.
 
@@ -56,12 +59,15 @@ def evaluate(
         By camera.
     detections
         By estimator: all its detections.
+    lamps
+        Outlines of lamps by frame, in pixels: what is found there is counted apart.
     """
     truth_in = _by_frame(truth)
     found_in = {name: _by_frame(found) for name, found in detections.items()}
     scores: list[Score] = []
     false_alarms: dict[str, list[Detection]] = {name: [] for name in detections}
     ghosts = dict.fromkeys(detections, 0)
+    lamps_reported = dict.fromkeys(detections, 0)
     for key in frames:
         calibration = calibrations[key[0]]
         rows = truth_in.get(key, [])
@@ -70,7 +76,12 @@ def evaluate(
             real = [detection for detection in found_in[name].get(key, []) if not detection.ghost]
             ghosts[name] += len(found_in[name].get(key, [])) - len(real)
             pairing = match(rows, real, calibration)
-            false_alarms[name] += [real[j] for j in pairing.unmatched]
+            outlines = (lamps or {}).get(key, ())
+            on_lamps = [on_a_lamp(real[j], outlines) for j in pairing.unmatched]
+            lamps_reported[name] += sum(on_lamps)
+            false_alarms[name] += [
+                real[j] for j, lamp in zip(pairing.unmatched, on_lamps, strict=True) if not lamp
+            ]
             for i, j in pairing.pairs:
                 matched[i][name] = real[j]
         scores += [
@@ -89,6 +100,7 @@ def evaluate(
                 **_estimator_numbers(counted, name),
                 "false_alarms_per_frame": len(false_alarms[name]) / len(frames) if frames else None,
                 "ghosts_reported": ghosts[name],
+                "lamps_reported": lamps_reported[name],
             }
             for name in detections
         },

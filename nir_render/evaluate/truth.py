@@ -27,8 +27,8 @@ class SourceTruth:
     `position_body_m` counts from the observing robot's origin. `direct_e` are the expected electrons that
     came straight, those beyond the sensor's edge included; `scattered_e` those of the source's own light that
     came by way of bodies into the pixels of the flare, mirrored light included (`mirrored_e` is 0 until
-    ghosts are told apart). `background_e` is the mean of all other light per pixel there, `peak_snr` the
-    source's brightest pixel over the noise there.
+    ghosts are told apart). `background_e` is all light but the direct, the source's own scattered light
+    included, as a mean per pixel there; `peak_snr` the source's brightest pixel over the noise there.
     """
 
     camera: str

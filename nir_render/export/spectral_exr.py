@@ -2,7 +2,8 @@
 
 The layout is that of A. Fichet, R. Pacanowski, A. Wilkie, "An OpenEXR Layout for Spectral Images", JCGT
 10(3), 2021; a channel is called S0.940,000000nm. One part per light group, and one more, `GROUP.variance`,
-with the variance of each mean. The direct part has no pixels; it goes beside the image as a table.
+with the variance of each mean. Values are per watt of the group (`perWattOf`): times its flux they have the
+declared unit. The direct part has no pixels; it goes beside the image as a table.
 """
 
 from pathlib import Path

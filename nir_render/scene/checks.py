@@ -15,7 +15,29 @@ _SLACK_M = 1e-15  # what float64 rounds away
 
 def check(document: SceneDocument) -> list[str]:
     """Return one line per problem of a document whose fields are right one by one."""
-    return [*_flat_cylinders(document), *_uncovered_curves(document), *_cameras_inside_solids(document)]
+    return [
+        *_flat_cylinders(document),
+        *_indivisible_sensors(document),
+        *_uncovered_curves(document),
+        *_cameras_inside_solids(document),
+    ]
+
+
+def _indivisible_sensors(document: SceneDocument) -> list[str]:
+    scale = document.render.indirect.scale
+    if not document.has_indirect_light():
+        return []
+    sensors = {
+        name: document.robots[name.split(".")[0]].rig.cameras[name.split(".")[1]].sensor
+        for selector in document.observe
+        for name in document.cameras_of(selector)
+    }
+    return [
+        f"render.indirect.scale: {scale} does not divide the sensor of {name}, {sensor.columns} × "
+        f"{sensor.rows} pixels; take a divisor of both"
+        for name, sensor in sensors.items()
+        if sensor.columns % scale or sensor.rows % scale
+    ]
 
 
 def _flat_cylinders(document: SceneDocument) -> list[str]:

@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from nir_render.scene.base import Document, expand_preset, preset_names
 from nir_render.scene.devices import Name, NotNegative, Orientation, Positive, Rig
 from nir_render.scene.units import Frequency, Position, Time
-from nir_render.scene.world import Lamp, MaterialDocument, ShapeDocument
+from nir_render.scene.world import Diffuse, Lamp, MaterialDocument, ShapeDocument
 
 
 class Waypoint(Document):
@@ -128,6 +128,15 @@ class SceneDocument(Document):
         if camera:
             return [selector] if camera in cameras else []
         return [f"{robot}.{name}" for name in cameras]
+
+    def has_indirect_light(self) -> bool:
+        """Tell whether light comes other than straight from sources: from a lamp, or off a body."""
+        used = {shape.material for shape in self.shapes.values()}
+        absorbing = all(
+            isinstance(self.materials[name], Diffuse) and self.materials[name].reflectance == 0.0  # type: ignore[union-attr]
+            for name in used
+        )
+        return bool(self.lamps) or not absorbing
 
     def frame_times_s(self) -> list[float]:
         """Return the start of each frame's exposure."""

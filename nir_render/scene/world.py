@@ -27,6 +27,20 @@ def _refuse_rgb(value: Any) -> Any:
     return value
 
 
+def _rough_enough(roughness: float) -> float:
+    if roughness < _LEAST_ROUGHNESS:
+        raise ValueError(
+            f"{roughness:g} is nearly smooth: its sharp glints cannot be sampled; use at least "
+            f"{_LEAST_ROUGHNESS}, or the type 'mirror'"
+        )
+    return roughness
+
+
+def _smooth_or_rough_enough(roughness: float) -> float:
+    return roughness if roughness == 0.0 else _rough_enough(roughness)
+
+
+_LEAST_ROUGHNESS = 0.02
 Reflectance = Annotated[Fraction, BeforeValidator(_refuse_rgb), Field(ge=0, le=1)]
 Direction = tuple[float, float, float]
 
@@ -44,7 +58,7 @@ class RoughConductor(Document):
     type: Literal["rough_conductor"]
     index: Annotated[float, Positive]
     extinction_index: Annotated[float, NotNegative]
-    roughness: Annotated[float, Field(gt=0, le=1)]
+    roughness: Annotated[float, Field(le=1), AfterValidator(_rough_enough)]
 
 
 class Mirror(Document):
@@ -67,7 +81,7 @@ class Plastic(Document):
     type: Literal["plastic"]
     index: Annotated[float, Field(ge=1)]
     reflectance: Reflectance
-    roughness: Annotated[float, Field(ge=0, le=1)]
+    roughness: Annotated[float, Field(ge=0, le=1), AfterValidator(_smooth_or_rough_enough)]
 
 
 MaterialDocument = Annotated[
@@ -164,6 +178,6 @@ class Lamp(PresetDocument):
     size_m: Annotated[Size2, AfterValidator(_positive)]
     normal: Direction = (0.0, 0.0, -1.0)
     luminous_flux_lm: Annotated[LuminousFlux, Positive]
-    temperature_k: Annotated[Temperature, Positive]
+    temperature_k: Annotated[Temperature, Field(ge=500, le=20000)]
 
     _direction = field_validator("normal")(_not_zero)

@@ -83,7 +83,8 @@ def blocked(scene: Any, own: Any, origins_m: Array, directions: Array, reach_m: 
         )
         ray.maxt = mi.Float(reach_m.astype(np.float32))
         hit = scene.ray_intersect_preliminary(ray)
-        return np.array(hit.is_valid() & (hit.shape != mi.ShapePtr(own)), dtype=bool)
+        others = hit.is_valid() if own is None else hit.is_valid() & (hit.shape != mi.ShapePtr(own))
+        return np.array(others, dtype=bool)
     hits = np.zeros(len(reach_m), dtype=bool)
     for index, (origin, direction, reach) in enumerate(zip(origins_m, directions, reach_m, strict=True)):
         ray = mi.Ray3f(mi.Point3f(*map(float, origin)), mi.Vector3f(*map(float, direction)))

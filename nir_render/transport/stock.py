@@ -8,8 +8,8 @@ sources hide what is behind them in both.
 Mitsuba samples a sphere by the cone that it fills, of solid angle 2π (1 − cos α) in float32. That difference
 loses its digits where the sphere is small and far: the light of a source of 10 mm is wrong by 1 % at 5 m and
 by 7 % at 10 m. So sources that are small in their scene light it as points, which for a uniform sphere in
-full view is exact at any distance. Where smooth surfaces show images of sources, they stay spheres, and keep
-that error.
+full view is exact at any distance. Sources that a body comes close to stay spheres, and so do all where
+smooth surfaces show images of them; these keep that error.
 """
 
 import hashlib
@@ -25,12 +25,13 @@ from nir_render.scene.devices import Camera, Source
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import Pose
 from nir_render.transport import world
-from nir_render.transport.backend import backend
+from nir_render.transport.backend import backend, blocked
 from nir_render.transport.light import DirectTable, Indirect
 
 _BATCHES = 8
 # Radius over the scene's diagonal from which on a sphere's solid angle keeps three digits in float32.
 _SMALLEST_SPHERE = 0.01
+_CLEARANCE_RAYS = 256
 # The scalar variants are 4 to 6 times slower; they get by with fewer samples, and the noise says so.
 _SCALAR_SAMPLES = 4
 # Mitsuba's camera looks along z with x to the left and y up; ours has x right and y down.
@@ -49,7 +50,7 @@ def indirect(
     direct
         The direct light of the same camera: it tells which sources the camera sees.
     """
-    if not world.has_indirect_light(scene):
+    if not scene.document.has_indirect_light():
         return None
     settings = scene.document.render.indirect
     samples = samples_of(scene)
@@ -67,6 +68,7 @@ def indirect(
     }
     small_m = _SMALLEST_SPHERE * world.extent_m(scene, time_s)
     sources = scene.sources()
+    positions_m = world.source_positions_m(scene, time_s)
     means, variances = [], []
     for group, emitter in enumerate(groups):
         spherical = world.build(scene, time_s, emitting=emitter)
@@ -75,8 +77,12 @@ def indirect(
             and sources[emitter][1].radius_m < small_m
             and not world.has_smooth_surface(scene)
         )
+        lone = world.build(scene, time_s, emitting=emitter, as_point=True) if as_point else None
+        as_point = lone is not None and _stands_clear(
+            lone, positions_m[emitter], sources[emitter][1].radius_m
+        )
         view = _View(
-            bodies=world.build(scene, time_s, emitting=emitter, as_point=True) if as_point else spherical,
+            bodies=lone if as_point else spherical,
             body=spherical if group in seen else None,
             body_radiance=_radiance_of(sources[emitter][1]) if as_point else None,
         )
@@ -126,6 +132,16 @@ def _batch(view: _View, sensor: Any, samples: int, max_depth: int, seed: int) ->
     if view.body_radiance is None:
         return image - straight
     return image * (1.0 - straight / view.body_radiance)
+
+
+def _stands_clear(bodies: Any, centre_m: NDArray[np.float64], radius_m: float) -> bool:
+    """Tell whether no body comes within three radii of a source; only then a point lights as it does."""
+    turn = np.arange(_CLEARANCE_RAYS)
+    height = 1.0 - 2.0 * (turn + 0.5) / _CLEARANCE_RAYS
+    flat = np.sqrt(1.0 - height**2)
+    directions = np.stack([flat * np.cos(2.399963 * turn), flat * np.sin(2.399963 * turn), height], axis=1)
+    origins_m = np.broadcast_to(centre_m, directions.shape)
+    return not blocked(bodies, None, origins_m, directions, np.full(_CLEARANCE_RAYS, 3.0 * radius_m)).any()
 
 
 def _render(bodies: Any, sensor: Any, max_depth: int, samples: int, seed: int) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.errors import InputError
-from nir_render.geometry import perpendiculars
+from nir_render.geometry import perpendiculars, rectangle_frame
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import robot_pose, rotation_of
 from nir_render.scene.units import LENGTH, format_vector
@@ -30,13 +30,6 @@ from nir_render.transport.backend import backend
 def groups(scene: Scene) -> tuple[str, ...]:
     """Return the light groups: each source, `robot.source`, then each lamp, `lamps.name`."""
     return (*scene.sources(), *(f"lamps.{name}" for name in scene.document.lamps))
-
-
-def has_indirect_light(scene: Scene) -> bool:
-    """Tell whether light comes other than straight from sources: a lamp shines or a body does not absorb."""
-    materials = {scene.document.materials[shape.material] for shape in scene.document.shapes.values()}
-    absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in materials)
-    return bool(scene.document.lamps) or not absorbing
 
 
 def source_positions_m(scene: Scene, time_s: float) -> dict[str, NDArray[np.float64]]:
@@ -99,7 +92,7 @@ def build(scene: Scene, time_s: float, emitting: str | None = None, as_point: bo
     try:
         return backend().mi.load_dict(bodies, optimize=False)
     except RuntimeError as error:
-        raise InputError(f"{scene.path}: a mesh cannot be read: {' '.join(str(error).split())}") from None
+        raise InputError(f"{scene.path}: Mitsuba refuses the scene: {' '.join(str(error).split())}") from None
 
 
 def source_spheres(bodies: Any) -> list[Any]:
@@ -136,7 +129,8 @@ def _crossings(shape: Mesh, point_m: NDArray[np.float64]) -> int:
 def _bodies(shape: ShapeDocument) -> list[dict[str, Any]]:
     match shape:
         case Rectangle():
-            return [{"type": "rectangle", "to_world": _matrix(*_rectangle_frame(shape))}]
+            frame = rectangle_frame(shape.normal, shape.size_m, shape.rotation_rad)
+            return [{"type": "rectangle", "to_world": _matrix(frame, shape.center_m)}]
         case Box():
             rotation = rotation_of(shape.orientation)
             return [
@@ -190,26 +184,12 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
             surface = {
                 **(rough if material.roughness > 0.0 else {"type": "plastic"}),
                 "int_ior": material.index,
+                "ext_ior": 1.0,
                 "diffuse_reflectance": _uniform(material.reflectance),
             }
         case Dielectric():
             return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
     return {"type": "twosided", "nested": surface}
-
-
-def _rectangle_frame(shape: Rectangle) -> tuple[NDArray[np.float64], tuple[float, float, float]]:
-    """Return half width, half height and normal as columns, and the centre."""
-    normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
-    across = np.cross([0.0, 0.0, 1.0], normal)
-    if np.linalg.norm(across) < 1e-9:
-        across = np.array([1.0, 0.0, 0.0])
-    across /= np.linalg.norm(across)
-    up = np.cross(normal, across)
-    c, s = np.cos(shape.rotation_rad), np.sin(shape.rotation_rad)
-    width, height = 0.5 * shape.size_m[0], 0.5 * shape.size_m[1]
-    return np.stack(
-        [width * (c * across + s * up), height * (c * up - s * across), normal], axis=1
-    ), shape.center_m
 
 
 def _closed_cylinder(shape: Cylinder) -> list[dict[str, Any]]:

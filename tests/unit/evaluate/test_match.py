@@ -115,6 +115,7 @@ def test_the_summary_of_a_run_worked_out_by_hand() -> None:
         "bearing_rms_deg": pytest.approx(1.0),
         "false_alarms_per_frame": pytest.approx(1.0 / 3.0),
         "ghosts_reported": 1,
+        "lamps_reported": 0,
     }
     assert summary["estimators"]["paper"]["recall"] == 0.0
     assert summary["estimators"]["paper"]["range_mae_m"] is None
@@ -122,3 +123,18 @@ def test_the_summary_of_a_run_worked_out_by_hand() -> None:
 
 def test_truth_reads_back_as_it_was_written() -> None:
     assert parse_truth(_truth(100.0).record()) == _truth(100.0)
+
+
+def test_what_is_found_on_a_lamp_is_counted_apart() -> None:
+    """A lamp's outline from 390 to 410 px: the detection at 400 is on it, one 7 px beside it is not."""
+    lamp = np.array([[390, 90], [410, 90], [410, 110], [390, 110]], dtype=np.float32)
+    found = [_detection(100.0), _detection(400.0), _detection(417.0)]
+    result = evaluate(
+        [("r1.front", 0)],
+        [_truth(100.0)],
+        {"r1.front": CALIBRATION},
+        {"robust": found},
+        {("r1.front", 0): [lamp]},
+    )
+    robust = result.summary["estimators"]["robust"]
+    assert (robust["lamps_reported"], robust["false_alarms_per_frame"], robust["recall"]) == (1, 1.0, 1.0)

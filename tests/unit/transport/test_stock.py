@@ -110,6 +110,51 @@ def test_straight_light_is_not_in_it_but_bodies_hide(scene: Scene) -> None:
     assert radiance[11, 24] > 0.005
 
 
+def test_straight_light_cancels_where_the_source_is_a_sphere(scene: Scene) -> None:
+    """A mirror behind the camera makes the source a sphere in the render: its radiance, 10 per watt, must go.
+
+    What stays is float32 rounding of the difference; the pixel on the wall beside it keeps its light.
+    """
+    mirror = {
+        "type": "rectangle",
+        "center": "[-2, 0, 0] m",
+        "size": "[1, 1] m",
+        "normal": [1, 0, 0],
+        "material": "silver",
+    }
+    near = scene.with_(
+        {
+            "materials.silver": {"type": "mirror", "reflectance": 0.5},
+            "shapes.mirror": mirror,
+            "robots.r2.position": "[2, 0, 0] m",
+            "robots.r2.rig.sources.s.radius": "5 cm",
+        }
+    )
+    radiance = _indirect(near).radiance_per_w[0, 0]
+    assert np.abs(radiance[11:13, 15:17]).max() < 1e-4
+    assert radiance[11, 24] > 0.005
+
+
+@pytest.mark.parametrize("gap_mm", [-5.0, 0.0, 12.0, 40.0])
+def test_a_source_near_a_wall_lights_it(scene: Scene, gap_mm: float) -> None:
+    """A ball of 10 mm whose centre stands before, on or behind the wall's plane still lights the room.
+
+    Half sunk it sends half its light; 12 mm before the wall nearly half of it falls on the wall, whose mean
+    radiance over all directions is ρ/π times the irradiance. Nothing may vanish.
+    """
+    place = f"[{3.0 - 1e-3 * gap_mm}, 0, 0] m"
+    room = scene.with_({"robots.r2.position": place, "render.indirect.samples": 256})
+    opposite = {
+        "type": "rectangle",
+        "center": "[-1, 0, 0] m",
+        "size": "[4, 4] m",
+        "normal": [1, 0, 0],
+        "material": "paint",
+    }
+    radiance = _indirect(room.with_({"shapes.opposite": opposite})).radiance_per_w[0, 0]
+    assert radiance.mean() > 1e-4
+
+
 def test_a_room_that_reflects_nothing_has_no_indirect_light(scene: Scene) -> None:
     assert render(scene.with_({"materials.paint.reflectance": 0}), "r1.c").indirect is None
     assert render(scene.with_({"materials.paint.reflectance": 0.01}), "r1.c").indirect is not None
