@@ -24,7 +24,7 @@ V_LAMBDA = (
 @pytest.mark.parametrize("temperature_k", [2000.0, 2856.0, 3200.0])
 def test_lumens_become_watts(temperature_k: float) -> None:
     """Φ_v = 683 lm/W ∫ V(λ) Φ_λ dλ, here with the table in steps of 10 nm: within 0.2 %."""
-    seen_m = np.arange(380, 771, 10) * 1e-9
+    seen_m = np.linspace(380e-9, 770e-9, 40)
     part_m = np.linspace(300e-9, 1100e-9, 20_001)
     lumens = 683.0 * float(np.sum(np.array(V_LAMBDA) * planck_shape(seen_m, temperature_k)) * 10e-9)
     watts = float(np.trapezoid(planck_shape(part_m, temperature_k), part_m))
