@@ -102,15 +102,8 @@ def _diffuse(
 ) -> NDArray[np.float64]:
     """Return the electrons of indirect light before the blur; groups of one spectrum are summed first."""
     _, camera = scene.camera(light.camera)
-    summed: dict[Hashable, tuple[Emitter, NDArray[np.float64]]] = {}
-    for group, emitter in enumerate(emitters(light, scene)):
-        if flux_w[group] == 0.0:
-            continue
-        key = _spectrum_key(emitter)
-        part = flux_w[group] * per_w[group, 0].astype(np.float64)
-        summed[key] = (emitter, summed[key][1] + part if key in summed else part)
     image = np.zeros((camera.sensor.rows, camera.sensor.columns))
-    for emitter, radiance in summed.values():
+    for emitter, radiance in _by_spectrum(light, scene, per_w, flux_w):
         image += diffuse_electrons(camera, radiance, emitter, exposure_s)
     return image
 
@@ -120,17 +113,28 @@ def _render_variance(
 ) -> NDArray[np.float64]:
     """Return the variance per pixel that rendering adds, in e², the blur's averaging left out.
 
-    Groups are rendered apart, so their variances add up. Each group's electrons are linear in its radiance;
-    its standard deviation goes the way of the radiance.
+    Groups are rendered apart, so their variances add up. Electrons are linear in the radiance; the standard
+    deviation of each spectrum's light goes the way of its radiance.
     """
     _, camera = scene.camera(light.camera)
     total = np.zeros((camera.sensor.rows, camera.sensor.columns))
-    deviation = np.sqrt(indirect.variance)
-    for group in range(len(light.groups)):
-        only = np.zeros(len(light.groups))
-        only[group] = flux_w[group]
-        total += _diffuse(light, scene, deviation, only, exposure_s) ** 2
+    for emitter, variance in _by_spectrum(light, scene, indirect.variance, flux_w**2):
+        total += diffuse_electrons(camera, np.sqrt(variance), emitter, exposure_s) ** 2
     return total
+
+
+def _by_spectrum(
+    light: Light, scene: Scene, per_group: NDArray[np.float32], weights: NDArray[np.float64]
+) -> list[tuple[Emitter, NDArray[np.float64]]]:
+    """Return weighted sums of arrays, shape (group, node, row, column), over the groups of each spectrum."""
+    sums: dict[Hashable, tuple[Emitter, NDArray[np.float64]]] = {}
+    for group, emitter in enumerate(emitters(light, scene)):
+        if weights[group] == 0.0:
+            continue
+        key = _spectrum_key(emitter)
+        part = weights[group] * per_group[group, 0].astype(np.float64)
+        sums[key] = (emitter, sums[key][1] + part if key in sums else part)
+    return list(sums.values())
 
 
 def _windows(light: Light, scene: Scene, camera: Camera, exposure_s: float) -> list[Window]:

@@ -106,9 +106,13 @@ def geometry_key(scene: Scene, time_s: float) -> bytes:
 def _settled_exposure(scene: Scene, light: Light, camera: Camera, control: AutoExposure, seed: int) -> float:
     """Return the exposure that a camera has found before its first frame, by frames that are not kept."""
     exposure_s = camera.exposure_s
+    mean = expected(light, scene, exposure_s)
     for frame in range(_SETTLING_FRAMES):
-        data_dn = expose(light, scene, exposure_s, seed, index=-1 - frame).data_dn
-        exposure_s = next_exposure_s(control, camera.sensor, data_dn, exposure_s)
+        electrons = mean.electrons * (exposure_s / mean.exposure_s)  # light is linear in the exposure
+        random = generator(seed, "settling", light.camera, frame)
+        exposure_s = next_exposure_s(
+            control, camera.sensor, read_out(electrons, camera.sensor, random), exposure_s
+        )
     return exposure_s
 
 

@@ -68,24 +68,11 @@ def indirect(
     }
     small_m = _SMALLEST_SPHERE * world.extent_m(scene, time_s)
     sources = scene.sources()
-    positions_m = world.source_positions_m(scene, time_s)
+    smooth = world.has_smooth_surface(scene)
     means, variances = [], []
     for group, emitter in enumerate(groups):
-        spherical = world.build(scene, time_s, emitting=emitter)
-        as_point = (
-            emitter in sources
-            and sources[emitter][1].radius_m < small_m
-            and not world.has_smooth_surface(scene)
-        )
-        lone = world.build(scene, time_s, emitting=emitter, as_point=True) if as_point else None
-        as_point = lone is not None and _stands_clear(
-            lone, positions_m[emitter], sources[emitter][1].radius_m
-        )
-        view = _View(
-            bodies=lone if as_point else spherical,
-            body=spherical if group in seen else None,
-            body_radiance=_radiance_of(sources[emitter][1]) if as_point else None,
-        )
+        small = emitter in sources and sources[emitter][1].radius_m < small_m
+        view = _view(scene, time_s, emitter, small=small and not smooth, seen=group in seen)
         keys = [_seed(seed, name, time_s, emitter, batch) for batch in range(batches)]
         renders = np.stack(
             [_batch(view, sensor, samples // batches, settings.max_depth, key) for key in keys]
@@ -117,6 +104,22 @@ class _View:
     bodies: Any
     body: Any | None
     body_radiance: float | None
+
+
+def _view(scene: Scene, time_s: float, emitter: str, *, small: bool, seen: bool) -> _View:
+    """Return what to render of a group: a point if it is small and stands clear, its body if it is seen."""
+    point = None
+    if small:
+        source = scene.sources()[emitter][1]
+        point = world.build(scene, time_s, emitting=emitter, as_point=True)
+        if not _stands_clear(point, world.source_positions_m(scene, time_s)[emitter], source.radius_m):
+            point = None
+    whole = world.build(scene, time_s, emitting=emitter) if seen or point is None else None
+    return _View(
+        bodies=whole if point is None else point,
+        body=whole if seen else None,
+        body_radiance=None if point is None else _radiance_of(source),
+    )
 
 
 def _batch(view: _View, sensor: Any, samples: int, max_depth: int, seed: int) -> NDArray[np.float64]:
