@@ -108,12 +108,13 @@ def _draw_whole(
     extent = (-0.5, columns - 0.5, rows - 0.5, -0.5)
     axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="bilinear", extent=extent)
     _bare(axes)
-    for score in scores:
+    for place, score in enumerate(sorted(scores, key=lambda score: score.truth.u_px)):
         truth = score.truth
         axes.add_patch(Circle((truth.u_px, truth.v_px), 22, fill=False, color=TRUTH, linewidth=1.0))
+        # Above the flare, at one of three heights in turn, so that neighbours' names do not cover each other.
         axes.annotate(
-            f"{truth.robot}  {truth.range_m:.2f} m", (truth.u_px, truth.v_px), (26, 0), color=TRUTH,
-            textcoords="offset points", va="center",
+            f"{truth.robot}  {truth.range_m:.2f} m", (truth.u_px, truth.v_px), (0, 13 + 11 * (place % 3)),
+            color=TRUTH, textcoords="offset points", ha="center",
         )  # fmt: skip
         for name, detection in score.detections.items():
             marker, colour = look(name, estimators)
