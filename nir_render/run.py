@@ -214,7 +214,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         }
         _check_frames_known(keys, truth, detections, calibrations, folder)
         result = evaluate(keys, truth, calibrations, detections, _lamps(folder))
-        preview = _preview(folder, keys, result)
+        preview = _preview(folder, keys, calibrations, result)
     except InputError:
         raise
     except ValueError as error:
@@ -314,10 +314,10 @@ def _check_frames_known(
                 )
 
 
-def _preview(folder: Path, keys: Sequence[FrameKey], result: Evaluation) -> bytes:
-    records = read_frame_records(folder)
-    at = {(record.camera, record.index): record for record in records}
-    calibrations = read_calibrations(folder)
+def _preview(
+    folder: Path, keys: Sequence[FrameKey], calibrations: Mapping[str, Calibration], result: Evaluation
+) -> bytes:
+    at = {(record.camera, record.index): record for record in read_frame_records(folder)}
     estimators = list(result.summary["estimators"])
     return preview_png(
         keys=keys,

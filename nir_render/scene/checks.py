@@ -24,20 +24,22 @@ def check(document: SceneDocument) -> list[str]:
 
 
 def _indivisible_sensors(document: SceneDocument) -> list[str]:
+    names = dict.fromkeys(name for selector in document.observe for name in document.cameras_of(selector))
+    problems = [indivisible_sensor(document, name) for name in names]
+    return [problem for problem in problems if problem is not None]
+
+
+def indivisible_sensor(document: SceneDocument, name: str) -> str | None:
+    """Return what is wrong where the pixels of the indirect light do not fit the sensor of `robot.camera`."""
+    robot, camera = name.split(".")
+    sensor = document.robots[robot].rig.cameras[camera].sensor
     scale = document.render.indirect.scale
-    if not document.has_indirect_light():
-        return []
-    sensors = {
-        name: document.robots[name.split(".")[0]].rig.cameras[name.split(".")[1]].sensor
-        for selector in document.observe
-        for name in document.cameras_of(selector)
-    }
-    return [
+    if not document.has_indirect_light() or not (sensor.columns % scale or sensor.rows % scale):
+        return None
+    return (
         f"render.indirect.scale: {scale} does not divide the sensor of {name}, {sensor.columns} × "
         f"{sensor.rows} pixels; take a divisor of both"
-        for name, sensor in sensors.items()
-        if sensor.columns % scale or sensor.rows % scale
-    ]
+    )
 
 
 def _flat_cylinders(document: SceneDocument) -> list[str]:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_serializer, field_validator, model_validator
 
 from nir_render.scene.base import CURVE_FORMS, Document, PresetDocument, read_curve_csv, resolve_file
 from nir_render.scene.units import (
@@ -90,17 +90,18 @@ class CurveDocument(Document):
             raise ValueError("values must be finite and not negative")
         return tuple(pairs)
 
+    @field_serializer("points")
+    def _write_points(self, points: tuple[tuple[float, float], ...] | None) -> list[list[Any]] | None:
+        """Write what `_parse_points` reads: a resolved document loads again."""
+        if points is None:
+            return None
+        return [[format_quantity(wavelength_m, LENGTH), value] for wavelength_m, value in points]
+
     @model_validator(mode="after")
     def _one_form(self) -> Self:
         if self.constant is None and self.gaussian is None and self.points is None:
             raise ValueError("wanted a number, or 'points', 'file' or 'gaussian'")
         return self
-
-    def dump(self) -> dict[str, Any]:
-        """Return the curve as it stands in a resolved document."""
-        if self.points is not None:
-            return {"points": [[format_quantity(m, LENGTH), value] for m, value in self.points]}
-        return self.model_dump(by_alias=True, exclude_none=True)
 
 
 class Source(PresetDocument):

@@ -131,11 +131,8 @@ class SceneDocument(Document):
 
     def has_indirect_light(self) -> bool:
         """Tell whether light comes other than straight from sources: from a lamp, or off a body."""
-        used = {shape.material for shape in self.shapes.values()}
-        absorbing = all(
-            isinstance(self.materials[name], Diffuse) and self.materials[name].reflectance == 0.0  # type: ignore[union-attr]
-            for name in used
-        )
+        used = [self.materials[name] for name in {shape.material for shape in self.shapes.values()}]
+        absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in used)
         return bool(self.lamps) or not absorbing
 
     def frame_times_s(self) -> list[float]:

@@ -1,7 +1,7 @@
 """From a scene to the light that reaches one camera."""
 
 from nir_render.errors import InputError
-from nir_render.scene.checks import solid_around
+from nir_render.scene.checks import indivisible_sensor, solid_around
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import camera_pose
 from nir_render.transport import stock, world
@@ -24,6 +24,9 @@ def render(scene: Scene, camera: str, time_s: float, seed: int) -> Light:
         raise InputError(
             f"{scene.path}: the camera {camera} is inside shapes.{inside} at {time_s:g} s; move one"
         )
+    indivisible = indivisible_sensor(scene.document, camera)
+    if indivisible is not None:
+        raise InputError(f"{scene.path}: {indivisible}")
     world.check_meshes(scene, pose.position_m, f"the camera {camera} at {time_s:g} s")
     direct = direct_table(scene, pose, time_s)
     indirect = stock.indirect(scene, camera, device, pose, time_s, seed, direct)

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.lens import intrinsics_of
-from nir_render.errors import InputError
 from nir_render.scene.devices import Camera, Source
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import Pose
@@ -55,12 +54,6 @@ def indirect(
     settings = scene.document.render.indirect
     samples = samples_of(scene)
     batches = min(_BATCHES, samples)
-    columns, rows = camera.sensor.columns, camera.sensor.rows
-    if columns % settings.scale or rows % settings.scale:
-        raise InputError(
-            f"{scene.path}: render.indirect.scale: {settings.scale} does not divide the sensor of {name}, "
-            f"{columns} × {rows} pixels; take a divisor of both"
-        )
     groups = world.groups(scene)
     sensor = _sensor(camera, pose, settings.scale)
     seen = {

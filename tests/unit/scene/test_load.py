@@ -177,6 +177,14 @@ def test_the_resolved_document_loads_to_the_same_scene(scene: Scene, tmp_path: P
     assert again.resolved_yaml() == changed.resolved_yaml()
 
 
+def test_a_resolved_curve_loads_to_the_same_curve(scene: Scene, tmp_path: Path) -> None:
+    """Points of a curve carry their unit in the resolved document too."""
+    points = {"points": [["800 nm", 0.3], ["940 nm", 0.15], ["1100 nm", 0.02]]}
+    changed = scene.with_({f"{FRONT}.sensor.quantum_efficiency": points})
+    again = load_scene(_write(tmp_path, changed.resolved_yaml()))
+    assert again.document == changed.document
+
+
 def test_the_world_of_the_models(scene: Scene) -> None:
     """All bodies, materials and lamps of a scene file load, and keep their figures in SI units."""
     changed = scene.with_(
