@@ -138,10 +138,11 @@ def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibrati
 
 
 def _truth(folder: Path) -> list[SourceTruth]:
+    """Return the truth about the sources themselves; a ghost is not what one ranges to."""
     path = folder / "truth.jsonl"
     if not path.is_file():
         return []
-    return parse_lines(path, parse_truth)
+    return [row for row in parse_lines(path, parse_truth) if row.ghost_of is None]
 
 
 def _true_ranges(folder: Path, truth: list[SourceTruth]) -> dict[tuple[str, int], float]:

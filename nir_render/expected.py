@@ -6,14 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.emission import Emitter, radiant_flux_w
+from nir_render.camera.emission import Emitter, emission_units
 from nir_render.camera.exposure import Beam, beam_window, blur, diffuse_electrons
 from nir_render.camera.psf import Window
 from nir_render.camera.response import response
 from nir_render.errors import InputError
+from nir_render.geometry import sunflower
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
-from nir_render.scene.world import Lamp
+from nir_render.scene.world import Lamp, Sun
 from nir_render.transport.light import Indirect, Light
 
 _TINY_E2 = 1e-12  # a noiseless sensor in the dark has no noise to compare with
@@ -82,18 +83,20 @@ def group_electrons(mean: Expected, scene: Scene, group: int) -> NDArray[np.floa
 
 def emitters(light: Light, scene: Scene) -> list[Emitter]:
     """Return what each group of a light is."""
-    sources = scene.sources()
-    return [
-        sources[name][1] if name in sources else scene.document.lamps[name.removeprefix("lamps.")]
-        for name in light.groups
-    ]
+    known: dict[str, Emitter] = {name: source for name, (_, source) in scene.sources().items()}
+    known |= {f"lamps.{name}": lamp for name, lamp in scene.document.lamps.items()}
+    if scene.document.sun is not None:
+        known["sun"] = scene.document.sun
+    return [known[name] for name in light.groups]
 
 
 def _fluxes(light: Light, scene: Scene) -> NDArray[np.float64]:
-    return np.array([radiant_flux_w(emitter) for emitter in emitters(light, scene)])
+    return np.array([emission_units(emitter) for emitter in emitters(light, scene)])
 
 
 def _spectrum_key(emitter: Emitter) -> Hashable:
+    if isinstance(emitter, Sun):
+        return "sun"
     return emitter.temperature_k if isinstance(emitter, Lamp) else emitter.spectrum
 
 
@@ -144,11 +147,16 @@ def _windows(light: Light, scene: Scene, camera: Camera, exposure_s: float) -> l
     windows = []
     for row, group in enumerate(table.group):
         emitter = known[group]
+        direction, angular_radius_rad = table.direction[row], float(table.angular_radius_rad[row])
+        seen = None
+        if 0.0 < table.visible_fraction[row] < 1.0:
+            seen = sunflower(direction, angular_radius_rad, table.visibility_rays)[table.seen[row]]
         beam = Beam(
-            direction=table.direction[row],
-            angular_radius_rad=float(table.angular_radius_rad[row]),
-            irradiance_w_per_m2=float(table.irradiance_per_w[row, 0]) * radiant_flux_w(emitter),
+            direction=direction,
+            angular_radius_rad=angular_radius_rad,
+            irradiance_w_per_m2=float(table.irradiance_per_w[row, 0]) * emission_units(emitter),
             response=response(camera, emitter),
+            seen=seen,
         )
         windows.append(beam_window(camera, beam, exposure_s))
     return windows

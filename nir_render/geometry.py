@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
+
 
 def perpendiculars(direction: Array) -> tuple[Array, Array]:
     """Return two unit vectors that make a right-handed frame with a unit vector, shape (3,) each."""
@@ -27,6 +29,13 @@ def cone_directions(direction: Array, versine: Array, azimuth_rad: Array) -> Arr
     sine = np.sqrt(versine * (2.0 - versine))[..., None]
     around = np.cos(azimuth_rad)[..., None] * x_axis + np.sin(azimuth_rad)[..., None] * y_axis
     return (1.0 - versine)[..., None] * direction + sine * around
+
+
+def sunflower(direction: Array, angular_radius_rad: float, count: int) -> Array:
+    """Return unit directions that cover a cone evenly, each for an equal solid angle, shape (count, 3)."""
+    turn = np.arange(count)
+    versine = (turn + 0.5) / count * cone_versine(angular_radius_rad)
+    return cone_directions(direction, versine, _GOLDEN_ANGLE_RAD * turn)
 
 
 def cone_versine(angular_radius_rad: float) -> float:

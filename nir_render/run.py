@@ -109,9 +109,7 @@ def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tu
     same = last is not None and last[1].indirect is light.indirect
     file = last[0] if last is not None and same else f"{stem.name}.exr"
     held = {"indirect": file if light.indirect is not None else None}
-    run_folder.write_json(
-        stem.with_suffix(".direct.json"), direct_document(light.direct, light.groups) | held
-    )
+    run_folder.write_json(stem.with_suffix(".direct.json"), direct_document(light) | held)
     try:
         if not same:
             write_light(stem.with_suffix(".exr"), light)
@@ -260,11 +258,11 @@ def report_run(folder: Path, result: Evaluation) -> Path:
 
 
 def _lamps(folder: Path) -> dict[FrameKey, list[NDArray[np.float32]]]:
-    """Return the outlines of the lamps in each frame of a rendered run, from the scene that it holds."""
+    """Return the outlines of lamps and sun in each frame of a rendered run, from the scene that it holds."""
     if not (folder / "scene.yaml").is_file():
         return {}
     scene = load_scene(folder / "scene.yaml")
-    if not scene.document.lamps:
+    if not scene.document.lamps and scene.document.sun is None:
         return {}
     return {
         (record.camera, record.index): lamp_outlines_px(scene, record.camera, record.time_s)
@@ -322,6 +320,7 @@ def _preview(
     return preview_png(
         keys=keys,
         scores=result.scores,
+        ghosts=result.ghosts,
         estimators=estimators,
         load=lambda key: read_frame(folder, at[key]),
         calibrations=calibrations,

@@ -17,16 +17,18 @@ from nir_render.scene.devices import Camera
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """The light of one small source that comes straight to the lens.
+    """The light of one small source that comes to the lens in straight lines.
 
     `direction` is the unit vector to its centre in camera axes, shape (3,); `angular_radius_rad` half the
-    angle that it fills; `irradiance_w_per_m2` what falls on a plane across its direction at the lens.
+    angle that it fills; `irradiance_w_per_m2` what falls on a plane across its direction at the lens. Of a
+    partly hidden source, `seen` holds unit directions that cover the visible part evenly, shape (n, 3).
     """
 
     direction: NDArray[np.float64]
     angular_radius_rad: float
     irradiance_w_per_m2: float
     response: Response
+    seen: NDArray[np.float64] | None = None
 
 
 def beam_window(camera: Camera, beam: Beam, exposure_s: float) -> Window:
@@ -45,8 +47,14 @@ def beam_window(camera: Camera, beam: Beam, exposure_s: float) -> Window:
         angle_rad = np.arccos(np.clip(cos_angle, -1.0, 1.0))
         return np.asarray(collected_j * cos_angle * beam.response(angle_rad))
 
-    sigma_px = camera.point_spread.sigma_px
-    return source_window(intrinsics_of(camera), sigma_px, beam.direction, beam.angular_radius_rad, electrons)
+    return source_window(
+        intrinsics_of(camera),
+        camera.point_spread.sigma_px,
+        beam.direction,
+        beam.angular_radius_rad,
+        electrons,
+        beam.seen,
+    )
 
 
 def diffuse_electrons(

@@ -63,3 +63,14 @@ def intrinsics_of(camera: Camera) -> Intrinsics:
 def aperture_area_m2(camera: Camera) -> float:
     """Return the area of the entrance pupil, π f² / (4 N²)."""
     return math.pi * (camera.lens.focal_length_m / camera.lens.f_number) ** 2 / 4.0
+
+
+def corner_directions(camera: Camera) -> NDArray[np.float64]:
+    """Return directions at the corners of all pixels in camera axes, shape (rows + 1, columns + 1, 3).
+
+    Their depth is 1, so that between corners of a rectilinear lens they are linear, and interpolation is exact.
+    """
+    lens = intrinsics_of(camera)
+    x = (np.arange(lens.width_px + 1) - 0.5 - lens.cx_px) / lens.fx_px
+    y = (np.arange(lens.height_px + 1) - 0.5 - lens.cy_px) / lens.fy_px
+    return np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)

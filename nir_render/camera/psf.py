@@ -61,6 +61,7 @@ def source_window(
     direction: NDArray[np.float64],
     angular_radius_rad: float,
     power_at: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    seen: NDArray[np.float64] | None = None,
 ) -> Window:
     """Return the image of a source, in the unit of `power_at`, as far as it falls on the sensor.
 
@@ -73,9 +74,15 @@ def source_window(
     power_at
         What the whole source would give were it all at field angle θ, as a function of cos θ, shape (n,).
         Directions behind the aperture plane give nothing.
+    seen
+        Unit directions of equal power, shape (n, 3), of which the image of a partly hidden source is made;
+        None where it is in full view. They are points: they show as a grain where they lie more than 1.8
+        sigma apart, in images of a radius above 1.8 sigma √(n/π).
     """
     directions, shares = direction[None, :], np.ones(1)
-    if angular_radius_rad > 0.0:
+    if seen is not None:
+        directions, shares = seen, np.full(len(seen), 1.0 / len(seen))
+    elif angular_radius_rad > 0.0:
         rings = _rings(intrinsics, sigma_px, direction, angular_radius_rad)
         directions, shares = cone_nodes(direction, angular_radius_rad, rings)
     in_front = directions[:, 2] > 1e-6

@@ -17,7 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from nir_render.camera.emission import Emitter, curve_of, emission_spectrum
 from nir_render.camera.lens import intrinsics_of
 from nir_render.scene.devices import Camera, Orientation
-from nir_render.scene.world import Lamp
+from nir_render.scene.world import Lamp, Sun
 from nir_render.spectra.bandpass import transmission
 from nir_render.spectra.curve import Curve
 
@@ -47,7 +47,7 @@ class Response:
 
 
 def response(camera: Camera, emitter: Emitter) -> Response:
-    """Return how a camera responds to the light of a source or lamp.
+    """Return how a camera responds to the light of a source, a lamp or the sun.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def _optics(camera: Camera) -> Camera:
 
 
 def _kind(emitter: Emitter) -> Emitter:
-    """Return the emitter without its place, size and flux, likewise."""
+    """Return the emitter without its place, size, directions and flux, likewise."""
     if isinstance(emitter, Lamp):
         update = {
             "center_m": (0.0, 0.0, 0.0),
@@ -84,7 +84,12 @@ def _kind(emitter: Emitter) -> Emitter:
             "luminous_flux_lm": 1.0,
         }
         return emitter.model_copy(update=update)
-    return emitter.model_copy(update={"position_m": (0.0, 0.0, 0.0), "radius_m": 1.0, "flux_w": 1.0})
+    if isinstance(emitter, Sun):
+        return emitter.model_copy(
+            update={"azimuth_rad": 0.0, "elevation_rad": 1.0, "irradiance_w_per_m3": 1.0}
+        )
+    update = {"position_m": (0.0, 0.0, 0.0), "radius_m": 1.0, "flux_w": 1.0}
+    return emitter.model_copy(update={**update, "orientation": Orientation(), "pattern": None})
 
 
 @lru_cache(maxsize=16)

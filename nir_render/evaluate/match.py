@@ -25,20 +25,28 @@ class FrameMatch:
 
 
 def countable(truth: SourceTruth, calibration: Calibration) -> bool:
-    """Tell whether a source counts for recall: in the image, at least half visible, lit, and peak SNR ≥ 5."""
+    """Tell whether a row counts for recall.
+
+    It must be a source, not a ghost, in the image, at least half visible, lit, and of peak SNR 5 or more.
+    """
     in_image = (
         -0.5 <= truth.u_px <= calibration.width_px - 0.5 and -0.5 <= truth.v_px <= calibration.height_px - 0.5
     )
     lit = truth.on_fraction > 0.0
+    real = truth.ghost_of is None
     return (
-        in_image and lit and truth.visible_fraction >= MIN_VISIBLE_FRACTION and truth.peak_snr >= MIN_PEAK_SNR
+        real
+        and in_image
+        and lit
+        and truth.visible_fraction >= MIN_VISIBLE_FRACTION
+        and truth.peak_snr >= MIN_PEAK_SNR
     )
 
 
 def match(
     truth: Sequence[SourceTruth], detections: Sequence[Detection], calibration: Calibration
 ) -> FrameMatch:
-    """Match sources and detections of one frame, one to one.
+    """Match sources, ghosts among them, and detections of one frame, one to one.
 
     As many pairs as possible within max(3 px, radius of the source's image), and among these the nearest.
     """

@@ -33,11 +33,15 @@ class Score:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All scores, each estimator's detections that belong to no source, and the numbers of `summary.json`."""
+    """All scores, each estimator's false alarms, and the numbers of `summary.json`.
+
+    `ghosts` are the scores of the sources' mirror images, none of which counts.
+    """
 
     scores: tuple[Score, ...]
     false_alarms: Mapping[str, tuple[Detection, ...]]
     summary: Mapping[str, Any]
+    ghosts: tuple[Score, ...] = ()
 
 
 def evaluate(
@@ -48,6 +52,9 @@ def evaluate(
     lamps: Mapping[FrameKey, Sequence[NDArray[np.float32]]] | None = None,
 ) -> Evaluation:
     """Score the detections of each estimator.
+
+    A detection that belongs to a ghost, or that its estimator calls one, is counted apart: it is neither a
+    hit nor a false alarm.
 
     Parameters
     ----------
@@ -60,7 +67,7 @@ def evaluate(
     detections
         By estimator: all its detections.
     lamps
-        Outlines of lamps by frame, in pixels: what is found there is counted apart.
+        Outlines of lamps and the sun by frame, in pixels: what is found there is counted apart.
     """
     truth_in = _by_frame(truth)
     found_in = {name: _by_frame(found) for name, found in detections.items()}
@@ -84,10 +91,13 @@ def evaluate(
             ]
             for i, j in pairing.pairs:
                 matched[i][name] = real[j]
+                ghosts[name] += rows[i].ghost_of is not None
         scores += [
             Score(row, countable(row, calibration), *source_limits(row, calibration), said)
             for row, said in zip(rows, matched, strict=True)
         ]
+    mirrored = tuple(score for score in scores if score.truth.ghost_of is not None)
+    scores = [score for score in scores if score.truth.ghost_of is None]
     counted = [score for score in scores if score.countable]
     summary = {
         "format": 1,
@@ -105,7 +115,8 @@ def evaluate(
             for name in detections
         },
     }
-    return Evaluation(tuple(scores), {name: tuple(found) for name, found in false_alarms.items()}, summary)
+    alarms = {name: tuple(found) for name, found in false_alarms.items()}
+    return Evaluation(tuple(scores), alarms, summary, mirrored)
 
 
 def source_limits(truth: SourceTruth, calibration: Calibration) -> tuple[float, float]:

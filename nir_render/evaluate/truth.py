@@ -1,4 +1,4 @@
-"""What is true about each source in a frame."""
+"""What is true about each source in a frame, and about each of its mirror images."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -20,15 +20,19 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SourceTruth:
-    """The truth about one source in one frame, at mid-exposure.
+    """The truth about one source, or one ghost of it, in one frame, at mid-exposure.
 
     `u_px, v_px` is the projection of the source's centre; `range_m` the straight distance from the lens to
     it, `depth_z_m` its part along the optical axis; bearings are unit vectors from the camera's centre;
     `position_body_m` counts from the observing robot's origin. `direct_e` are the expected electrons that
     came straight, those beyond the sensor's edge included; `scattered_e` those of the source's own light that
-    came by way of bodies into the pixels of the flare, mirrored light included (`mirrored_e` is 0 until
-    ghosts are told apart). `background_e` is all light but the direct, the source's own scattered light
-    included, as a mean per pixel there; `peak_snr` the source's brightest pixel over the noise there.
+    came by way of bodies or fog into the pixels of the flare. `background_e` is all light but the flare's,
+    the source's own scattered light included, as a mean per pixel there; `peak_snr` the flare's brightest
+    pixel over the noise there.
+
+    A ghost, the image of a source in one flat smooth surface, has a row of its own: `ghost_of` is the name
+    `robot.source` of whom it shows (None for a source itself), place and range are those of the image behind
+    the surface, its electrons are `mirrored_e`, and `direct_e` is 0; a source's own `mirrored_e` is 0.
     """
 
     camera: str
@@ -51,6 +55,7 @@ class SourceTruth:
     peak_snr: float
     saturated_px: int
     on_fraction: float
+    ghost_of: str | None = None
 
     def record(self) -> dict[str, Any]:
         """Return the line of `truth.jsonl`."""
@@ -66,7 +71,10 @@ def parse_truth(record: Mapping[str, Any]) -> SourceTruth:
 
 
 def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTruth]:
-    """Yield the truth about each source whose centre is in the image, or of whose light some falls on it."""
+    """Yield the truth about each source and ghost that is in the image.
+
+    It is there if its centre is, or some of its light. The sun is no source that anyone looks for.
+    """
     light = mean.light
     _, camera = scene.camera(light.camera)
     intrinsics = intrinsics_of(camera)
@@ -78,7 +86,9 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
         lit = float(window.values.sum()) >= 1.0
         if not intrinsics.contains(u_px, v_px) and not (lit and np.isfinite([u_px, v_px]).all()):
             continue
-        group = int(table.group[row])
+        group, is_ghost = int(table.group[row]), bool(table.facet[row] >= 0)
+        if light.groups[group] == "sun":
+            continue
         robot, _, source = light.groups[group].partition(".")
         direction, distance_m = table.direction[row], float(table.distance_m[row])
         flare = _flare(scene, mean, frame, window, group)
@@ -96,13 +106,14 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
             bearing_body=_vector(mount.rotation @ direction),
             position_body_m=_vector(mount.rotation @ (distance_m * direction) + mount.position_m),
             visible_fraction=float(table.visible_fraction[row]),
-            direct_e=window.total,
-            mirrored_e=0.0,
+            direct_e=0.0 if is_ghost else window.total,
+            mirrored_e=window.total if is_ghost else 0.0,
             scattered_e=flare.scattered_e,
             background_e=flare.background_e,
             peak_snr=flare.peak_snr,
             saturated_px=flare.saturated_px,
             on_fraction=1.0,
+            ghost_of=light.groups[group] if is_ghost else None,
         )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-from nir_render.transport.light import DirectTable, Light
+from nir_render.transport.light import Light
 
 
 def write_light(path: Path, light: Light) -> None:
@@ -47,15 +47,25 @@ def write_light(path: Path, light: Light) -> None:
     OpenEXR.File(parts).write(str(path))
 
 
-def direct_document(table: DirectTable, groups: tuple[str, ...]) -> dict[str, Any]:
-    """Return a direct table as a JSON document: one row per source and way."""
+def direct_document(light: Light) -> dict[str, Any]:
+    """Return the direct table of a light as a JSON document: one row per source and way.
+
+    `mirror` is the surface that shows a ghost, null where the source itself is seen. `distance_m` is null for
+    the sun. `seen` tells which rays of the disc arrive, as bits, the first the highest, in hexadecimal; null
+    where all of them do, or none.
+    """
+    table = light.direct
     rows = [
         {
-            "group": groups[table.group[row]],
+            "group": light.groups[table.group[row]],
+            "mirror": light.mirrors[table.facet[row]] if table.facet[row] >= 0 else None,
             "direction_camera": table.direction[row].tolist(),
-            "distance_m": float(table.distance_m[row]),
+            "distance_m": float(table.distance_m[row]) if np.isfinite(table.distance_m[row]) else None,
             "angular_radius_rad": float(table.angular_radius_rad[row]),
             "visible_fraction": float(table.visible_fraction[row]),
+            "seen": np.packbits(table.seen[row]).tobytes().hex()
+            if 0.0 < table.visible_fraction[row] < 1.0
+            else None,
             "irradiance_per_w": table.irradiance_per_w[row].tolist(),
         }
         for row in range(len(table.group))

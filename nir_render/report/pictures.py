@@ -39,7 +39,7 @@ def whole_figures(
     figures = []
     for key in chosen[:MOST_CAMERAS]:
         frame, calibration = load(key), calibrations[key[0]]
-        scores = [score for score in result.scores if key_of(score) == key]
+        scores = [score for score in (*result.scores, *result.ghosts) if key_of(score) == key]
         false_alarms = {
             name: [found for found in alarms if (found.camera, found.index) == key]
             for name, alarms in result.false_alarms.items()
@@ -94,8 +94,7 @@ def _whole(
         u, v = truth.u_px, truth.v_px
         radius = max(1.6 * unit, 1.2 * image_radius_px(truth, calibration))
         faint = "" if score.countable else ' stroke-dasharray="3 3"'
-        hint = f"{truth.robot}.{truth.source}, true range {truth.range_m:.3f} m"
-        hint += "" if score.countable else " (too faint or hidden to count)"
+        hint, label = _named(score)
         to_the_left = u > 0.82 * columns
         x = u - 1.4 * radius if to_the_left else u + 1.4 * radius
         parts.append(
@@ -103,7 +102,7 @@ def _whole(
             f'stroke="{TRUTH}" class="mark"{faint}/>'
             f'<text x="{x:.2f}" y="{v - 0.8 * unit:.2f}" font-size="{2.3 * unit:.2f}" fill="{TRUTH}" '
             f'text-anchor="{"end" if to_the_left else "start"}">'
-            f"{escape(truth.robot)} {metres(truth.range_m)}</text></g>"
+            f"{escape(label)}</text></g>"
         )
         for name, said in score.detections.items():
             parts.append(_said_mark(name, names, said, 1.8 * unit))
@@ -123,6 +122,16 @@ def _whole(
         f"<figcaption><b>{escape(frame.camera)}</b> frame {frame.index} · {frame.time_s:.2f} s · exposed "
         f"{frame.exposure_s * 1e3:.3g} ms{said_of_alarms}</figcaption></figure>"
     )
+
+
+def _named(score: Score) -> tuple[str, str]:
+    """Return what is told of a source or ghost when pointed at, and what stands beside it."""
+    truth = score.truth
+    if truth.ghost_of is not None:
+        return f"mirror image of {truth.ghost_of}, {truth.range_m:.3f} m away", f"ghost of {truth.robot}"
+    hint = f"{truth.robot}.{truth.source}, true range {truth.range_m:.3f} m"
+    faint = "" if score.countable else " (too faint or hidden to count)"
+    return hint + faint, f"{truth.robot} {metres(truth.range_m)}"
 
 
 def _close_up(frame: RawFrame, calibration: Calibration, score: Score, names: Sequence[str]) -> str:

@@ -27,6 +27,7 @@ _CLOSE_UP_HALF_PX = 14
 def preview_png(
     keys: Sequence[FrameKey],
     scores: Sequence[Score],
+    ghosts: Sequence[Score],
     estimators: Sequence[str],
     load: Callable[[FrameKey], RawFrame],
     calibrations: Mapping[str, Calibration],
@@ -40,6 +41,8 @@ def preview_png(
         Camera and index of all frames, at least one, in the order they were taken.
     scores
         All scores of the run.
+    ghosts
+        Those of the sources' mirror images.
     estimators
         Names of those that were scored.
     load
@@ -73,7 +76,7 @@ def preview_png(
         for axes in whole_axes[len(wholes) :]:
             axes.axis("off")
         for axes, key in zip(whole_axes, wholes, strict=False):
-            own = [score for score in scores if key_of(score) == key]
+            own = [score for score in (*scores, *ghosts) if key_of(score) == key]
             _draw_whole(axes, frames[key], own, estimators, calibrations[key[0]])
         if closes:
             grid = parts[1].subplots(rows, columns, squeeze=False).ravel()
@@ -110,11 +113,14 @@ def _draw_whole(
     _bare(axes)
     for place, score in enumerate(sorted(scores, key=lambda score: score.truth.u_px)):
         truth = score.truth
-        axes.add_patch(Circle((truth.u_px, truth.v_px), 22, fill=False, color=TRUTH, linewidth=1.0))
+        line, prefix = ("-", "") if truth.ghost_of is None else (":", "ghost of ")
+        axes.add_patch(
+            Circle((truth.u_px, truth.v_px), 22, fill=False, color=TRUTH, linewidth=1.0, linestyle=line)
+        )
         # Above the flare, at one of three heights in turn, so that neighbours' names do not cover each other.
         axes.annotate(
-            f"{truth.robot}  {truth.range_m:.2f} m", (truth.u_px, truth.v_px), (0, 13 + 11 * (place % 3)),
-            color=TRUTH, textcoords="offset points", ha="center",
+            f"{prefix}{truth.robot}  {truth.range_m:.2f} m", (truth.u_px, truth.v_px),
+            (0, 13 + 11 * (place % 3)), color=TRUTH, textcoords="offset points", ha="center",
         )  # fmt: skip
         for name, detection in score.detections.items():
             marker, colour = look(name, estimators)

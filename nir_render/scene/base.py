@@ -1,6 +1,5 @@
 """What all models of a scene file share: closed fields, aliases without unit suffix, presets."""
 
-import csv
 import difflib
 from collections.abc import Mapping
 from importlib import resources
@@ -12,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, ValidationInfo, model_validator
 
 _UNIT_SUFFIXES = (
     "_dn_per_e",
+    "_w_per_m3",
+    "_per_m",
     "_px",
     "_dn",
     "_hz",
@@ -25,7 +26,8 @@ _UNIT_SUFFIXES = (
     "_k",
     "_bit",
 )
-CURVE_FORMS = {"constant", "gaussian", "points", "file"}
+# Keys of which a document has one: a change that writes another replaces the first.
+_ALTERNATIVES = ({"constant", "gaussian", "points", "grid", "file"}, {"extinction", "visibility"})
 _COLOUR_KEYS = {"rgb", "color", "colour", "srgb"}
 RGB_REFUSED = "RGB colours have no meaning at 940 nm; give the value in the band, a number from 0 to 1"
 
@@ -140,9 +142,17 @@ def merge(base: Any, change: Any) -> Any:
         return change if "preset" in change else {"preset": base, **change}
     if not isinstance(base, Mapping) or change.get("type", base.get("type")) != base.get("type"):
         return dict(change)
-    if CURVE_FORMS & change.keys():  # a curve that is written in another form replaces the first
-        base = {key: value for key, value in base.items() if key not in CURVE_FORMS}
+    base = without_alternatives(base, change)
     return {**base, **{key: merge(base.get(key), value) for key, value in change.items()}}
+
+
+def without_alternatives(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` without the keys that stand for the same thing as those which `change` sets."""
+    kept = dict(base)
+    for forms in _ALTERNATIVES:
+        if any(change[key] is not None for key in forms & change.keys()):
+            kept = {key: value for key, value in kept.items() if key not in forms}
+    return kept
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
@@ -181,15 +191,3 @@ def read_yaml(path: Path) -> Any:
         return parse_yaml(path.read_text(encoding="utf-8"), str(path))
     except UnicodeDecodeError:
         raise ValueError(f"{path} is not UTF-8 text") from None
-
-
-def read_curve_csv(path: Path) -> list[tuple[float, float]]:
-    """Read a curve from CSV with the header `wavelength_nm,value`; returns (wavelength_nm, value) pairs."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
-    if not rows or [cell.strip() for cell in rows[0]] != ["wavelength_nm", "value"]:
-        raise ValueError(f"{path}: the first line must be the header 'wavelength_nm,value'")
-    try:
-        return [(float(wavelength), float(value)) for wavelength, value in rows[1:]]
-    except ValueError as error:
-        raise ValueError(f"{path}: each line must hold two numbers ({error})") from None

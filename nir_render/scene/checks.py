@@ -7,7 +7,7 @@ from nir_render.camera.emission import emission_spectrum
 from nir_render.camera.response import efficiency_of
 from nir_render.scene.document import SceneDocument
 from nir_render.scene.motion import camera_pose, rotation_of
-from nir_render.scene.world import Box, Cylinder, ShapeDocument, Sphere
+from nir_render.scene.world import Box, Cylinder, Dielectric, Pane, Rectangle, ShapeDocument, Sphere
 
 _BAND_M = 940e-9
 _SLACK_M = 1e-15  # what float64 rounds away
@@ -17,6 +17,8 @@ def check(document: SceneDocument) -> list[str]:
     """Return one line per problem of a document whose fields are right one by one."""
     return [
         *_flat_cylinders(document),
+        *_sheets_and_solids(document),
+        *_fog_up_to_the_sun(document),
         *_indivisible_sensors(document),
         *_uncovered_curves(document),
         *_cameras_inside_solids(document),
@@ -50,6 +52,33 @@ def _flat_cylinders(document: SceneDocument) -> list[str]:
     ]
 
 
+def _sheets_and_solids(document: SceneDocument) -> list[str]:
+    problems = []
+    for name, shape in document.shapes.items():
+        material = document.materials[shape.material]
+        if isinstance(material, Pane) and not isinstance(shape, Rectangle):
+            problems.append(
+                f"shapes.{name}.material: {shape.material!r} is a pane, a thin sheet: only a rectangle can "
+                f"be of it, not a {shape.type}; solid glass is of the type 'dielectric'"
+            )
+        if isinstance(material, Dielectric) and isinstance(shape, Rectangle):
+            problems.append(
+                f"shapes.{name}.material: {shape.material!r} is a solid dielectric, and a rectangle has no "
+                "inside; use the type 'pane' for a sheet of glass, or a box"
+            )
+    return problems
+
+
+def _fog_up_to_the_sun(document: SceneDocument) -> list[str]:
+    fog = document.fog
+    endless = fog is not None and fog.extinction_per_m > 0.0 and fog.top_m is None and fog.size_m is None
+    problem = (
+        "fog: has no end on the way to the sun, so that the sun is black; give it a 'top', such as '4 m', "
+        "or make it a bank with 'center' and 'size'"
+    )
+    return [problem] if endless and document.sun is not None else []
+
+
 def _uncovered_curves(document: SceneDocument) -> list[str]:
     problems = []
     spectra = {
@@ -58,6 +87,8 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
         for source_name, source in robot.rig.sources.items()
     }
     spectra |= {f"lamps.{name}": emission_spectrum(lamp) for name, lamp in document.lamps.items()}
+    if document.sun is not None:
+        spectra["sun"] = emission_spectrum(document.sun)
     for place, spectrum in spectra.items():
         if not spectrum.low_m - _SLACK_M <= _BAND_M <= spectrum.high_m + _SLACK_M:
             problems.append(f"{place}: covers {spectrum.range_nm()}, not 940 nm")

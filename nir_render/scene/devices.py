@@ -1,13 +1,14 @@
 """Models of what a robot carries: sources and cameras with lens, filter and sensor."""
 
-import itertools
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_serializer, field_validator, model_validator
 
-from nir_render.scene.base import CURVE_FORMS, Document, PresetDocument, read_curve_csv, resolve_file
+from nir_render.scene.base import Document, PresetDocument, resolve_file
+from nir_render.scene.pattern import PatternDocument
+from nir_render.scene.points import Points, parse_points, read_csv, write_points
 from nir_render.scene.units import (
     LENGTH,
     Angle,
@@ -21,10 +22,9 @@ from nir_render.scene.units import (
     Power,
     SystemGain,
     Time,
-    format_quantity,
-    parse_quantity,
 )
 
+_CURVE_FORMS = ("constant", "gaussian", "points", "file")
 Positive = Field(gt=0)
 NotNegative = Field(ge=0)
 # Names become parts of dotted paths and of file names.
@@ -54,7 +54,7 @@ class CurveDocument(Document):
 
     constant: Annotated[Fraction, NotNegative] | None = None
     gaussian: Gaussian | None = None
-    points: tuple[tuple[float, float], ...] | None = None
+    points: Points | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -63,11 +63,11 @@ class CurveDocument(Document):
             return {"constant": data}
         if not isinstance(data, Mapping):
             raise ValueError("wanted a number, or 'points', 'file' or 'gaussian'")
-        forms = sorted(form for form in CURVE_FORMS if data.get(form) is not None)
+        forms = sorted(form for form in _CURVE_FORMS if data.get(form) is not None)
         if len(forms) > 1:
             raise ValueError(f"wanted one of 'constant', 'gaussian', 'points' and 'file', not {forms}")
         if "file" in data:
-            points = read_curve_csv(resolve_file(str(data["file"]), info))
+            points = read_csv(resolve_file(str(data["file"]), info), "wavelength_nm,value")
             others = {key: value for key, value in data.items() if key != "file"}
             return {**others, "points": [(f"{nm!r} nm", value) for nm, value in points]}
         return data
@@ -75,27 +75,11 @@ class CurveDocument(Document):
     @field_validator("points", mode="before")
     @classmethod
     def _parse_points(cls, points: Any) -> Any:
-        if points is None:
-            return None
-        try:
-            pairs = [(parse_quantity(wavelength, LENGTH), float(value)) for wavelength, value in points]
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"wanted a list of [wavelength, value], such as ['940 nm', 0.15]: {error}"
-            ) from None
-        wavelengths = [wavelength for wavelength, _ in pairs]
-        if len(pairs) < 2 or any(b <= a for a, b in itertools.pairwise(wavelengths)):
-            raise ValueError("wanted at least two points of increasing wavelength")
-        if any(not math.isfinite(value) or value < 0 for _, value in pairs):
-            raise ValueError("values must be finite and not negative")
-        return tuple(pairs)
+        return None if points is None else parse_points(points, LENGTH, "wavelength", "['940 nm', 0.15]")
 
     @field_serializer("points")
-    def _write_points(self, points: tuple[tuple[float, float], ...] | None) -> list[list[Any]] | None:
-        """Write what `_parse_points` reads: a resolved document loads again."""
-        if points is None:
-            return None
-        return [[format_quantity(wavelength_m, LENGTH), value] for wavelength_m, value in points]
+    def _write_points(self, points: Points | None) -> list[list[Any]] | None:
+        return write_points(points, LENGTH)
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
@@ -105,10 +89,11 @@ class CurveDocument(Document):
 
 
 class Source(PresetDocument):
-    """A 940 nm light source: a sphere of uniform radiance, the same in all directions.
+    """A 940 nm light source: a sphere, evenly bright over its disc.
 
-    `flux` is the radiant flux over the whole spectrum, `spectrum` its shape (any scale), `position` the
-    sphere's centre on the robot.
+    `flux` is the radiant flux over the whole spectrum and all directions, `spectrum` its shape (any scale),
+    `position` the sphere's centre on the robot. Without `pattern` it shines the same in all directions;
+    `orientation` turns the pattern's axes on the robot.
     """
 
     preset_folder: ClassVar[str] = "sources"
@@ -117,6 +102,8 @@ class Source(PresetDocument):
     radius_m: Annotated[Length, Positive]
     spectrum: CurveDocument
     position_m: Position = (0.0, 0.0, 0.0)
+    orientation: Orientation = Orientation()
+    pattern: PatternDocument | None = None
 
     @field_validator("spectrum")
     @classmethod

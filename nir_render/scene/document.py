@@ -8,8 +8,9 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from nir_render.scene.base import Document, expand_preset, preset_names
 from nir_render.scene.devices import Name, NotNegative, Orientation, Positive, Rig
+from nir_render.scene.fog import Fog
 from nir_render.scene.units import Frequency, Position, Time
-from nir_render.scene.world import Diffuse, Lamp, MaterialDocument, ShapeDocument
+from nir_render.scene.world import Diffuse, Lamp, MaterialDocument, ShapeDocument, Sun
 
 
 class Waypoint(Document):
@@ -87,6 +88,8 @@ class SceneDocument(Document):
     materials: dict[Name, MaterialDocument] = {}
     shapes: dict[Name, ShapeDocument] = {}
     lamps: dict[Name, Lamp] = {}
+    sun: Sun | None = None
+    fog: Fog | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -130,10 +133,11 @@ class SceneDocument(Document):
         return [f"{robot}.{name}" for name in cameras]
 
     def has_indirect_light(self) -> bool:
-        """Tell whether light comes other than straight from sources: from a lamp, or off a body."""
+        """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""
         used = [self.materials[name] for name in {shape.material for shape in self.shapes.values()}]
         absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in used)
-        return bool(self.lamps) or not absorbing
+        scattering = self.fog is not None and self.fog.albedo * self.fog.extinction_per_m > 0.0
+        return bool(self.lamps) or not absorbing or scattering
 
     def frame_times_s(self) -> list[float]:
         """Return the start of each frame's exposure."""

@@ -10,7 +10,7 @@ import yaml
 from pydantic import ValidationError
 
 from nir_render.errors import InputError
-from nir_render.scene.base import merge, read_yaml
+from nir_render.scene.base import merge, read_yaml, without_alternatives
 from nir_render.scene.checks import check
 from nir_render.scene.devices import Camera, Source
 from nir_render.scene.document import Robot, SceneDocument
@@ -133,6 +133,8 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
         node = {"preset": node}
     elif not isinstance(node, dict):
         raise InputError(f"--set {path}: {keys[0]!r} lies inside the value {node!r}")
+    if len(keys) == 1:
+        node = without_alternatives(node, {keys[0]: value})
     return {**node, keys[0]: _set(node.get(keys[0]), keys[1:], value, path)}
 
 

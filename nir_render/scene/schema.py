@@ -5,6 +5,7 @@ from typing import Any
 from nir_render.scene import devices, world
 from nir_render.scene.base import PresetDocument, preset_names
 from nir_render.scene.document import SceneDocument
+from nir_render.scene.units import LENGTH
 
 _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     devices.Source,
@@ -24,21 +25,49 @@ def scene_schema() -> dict[str, Any]:
     for model in _PRESET_MODELS:
         if model.__name__ in definitions:
             definitions[model.__name__] = _or_preset(definitions[model.__name__], model.preset_folder)
-    curve = definitions["CurveDocument"]
-    curve["properties"]["file"] = {"type": "string", "description": "CSV with the header wavelength_nm,value"}
-    # Points are pairs of a wavelength with its unit and a value.
+    _describe_curves(definitions)
+    fog = definitions["Fog"]
+    fog["properties"]["visibility"] = {**fog["properties"]["extinction"], "examples": [LENGTH.example]}
+    fog["properties"]["visibility"]["description"] = "3.912 / extinction, in place of it"
+    del fog["required"]
+    fog["oneOf"] = [{"required": ["extinction"]}, {"required": ["visibility"]}]
+    schema["properties"]["include"] = {"type": "array", "items": {"type": "string"}}
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "nir_render scene"
+    return schema
+
+
+def _describe_curves(definitions: dict[str, Any]) -> None:
+    """Describe curves as they are written: points with a unit, or a CSV file that becomes points."""
+    # Points are pairs of a place with its unit and a value.
     pair = {
         "type": "array",
         "prefixItems": [{"type": "string"}, {"type": "number"}],
         "minItems": 2,
         "maxItems": 2,
     }
-    curve["properties"]["points"] = {"type": "array", "items": pair, "minItems": 2}
-    definitions["CurveDocument"] = {"title": "Curve", "anyOf": [{"type": "number"}, curve]}
-    schema["properties"]["include"] = {"type": "array", "items": {"type": "string"}}
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    schema["title"] = "nir_render scene"
-    return schema
+    points = {"type": "array", "items": pair, "minItems": 2}
+    headers = {
+        "CurveDocument": "wavelength_nm,value",
+        "PatternDocument": "polar_deg,azimuth_deg,value",
+        "TabulatedPhase": "angle_deg,value",
+    }
+    for name, header in headers.items():
+        properties = definitions[name]["properties"]
+        properties["file"] = {"type": "string", "description": f"CSV with the header {header}"}
+        properties["points"] = points
+    definitions["TabulatedPhase"]["required"].remove("points")
+    definitions["CurveDocument"] = {
+        "title": "Curve",
+        "anyOf": [{"type": "number"}, definitions["CurveDocument"]],
+    }
+    angles = {"type": "string", "pattern": r"^\s*\[.*\]\s*\S+\s*$", "examples": ["[0, 90, 180] deg"]}
+    row = {"type": "string", "pattern": r"^\s*\[.*\]\s*$", "examples": ["[1, 0.5, 0.2]"]}
+    definitions["PatternGrid"]["properties"] |= {
+        "polar": angles,
+        "azimuth": angles,
+        "values": {"type": "array", "items": row, "minItems": 2},
+    }
 
 
 def _or_preset(definition: dict[str, Any], folder: str) -> dict[str, Any]:

@@ -72,6 +72,8 @@ SYSTEM_GAIN = Quantity("system gain", "DN/e", "0.74 DN/e")
 PIXELS = Quantity("length in the image", "px", "0.7 px")
 BITS = Quantity("number of bits", "bit", "12 bit")
 FRACTION = Quantity("fraction", "", "0.8")
+EXTINCTION = Quantity("extinction coefficient", "1/m", "0.05 /m")
+SPECTRAL_IRRADIANCE = Quantity("spectral irradiance", "W/m**3", "0.305 W/m^2/nm")
 _OTHERS = (
     Quantity("mass", "kg", ""),
     Quantity("illuminance", "lx", ""),
@@ -82,7 +84,7 @@ _OTHERS = (
 )
 _KNOWN = (
     LENGTH, TIME, FREQUENCY, ANGLE, POWER, TEMPERATURE, LUMINOUS_FLUX, ELECTRONS, COUNTS, SYSTEM_GAIN, PIXELS,
-    BITS, FRACTION, *_OTHERS,
+    BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, *_OTHERS,
 )  # fmt: skip
 
 _NUMBER = re.compile(
@@ -101,7 +103,7 @@ def _factor(unit: str, quantity: Quantity) -> float:
     """Return what one `unit` is in the quantity's own unit; raise ValueError where it is no such unit."""
     registry = _registry()
     try:
-        given = registry.Quantity(1.0, registry.parse_units(unit))
+        given = registry.Quantity(1.0, registry.parse_units(f"1{unit}" if unit.startswith("/") else unit))
         return float(given.to(registry.parse_units(quantity.unit)).magnitude)
     except pint.DimensionalityError:
         kind = _kind_of(given)
@@ -113,13 +115,16 @@ def _factor(unit: str, quantity: Quantity) -> float:
 def _kind_of(given: Any) -> str:
     for known in _KNOWN:
         if given.dimensionality == _registry().parse_units(known.unit).dimensionality:
-            return f"a {known.name}"
+            return _with_article(known)
     return f"of dimension {given.dimensionality}"
 
 
 def _wanted(quantity: Quantity) -> str:
-    article = "an" if quantity.name[0] in "aeiou" else "a"
-    return f"{article} {quantity.name} such as {quantity.example!r}"
+    return f"{_with_article(quantity)} such as {quantity.example!r}"
+
+
+def _with_article(quantity: Quantity) -> str:
+    return f"{'an' if quantity.name[0] in 'aeiou' else 'a'} {quantity.name}"
 
 
 def _number(text: str, shown: object) -> float:
@@ -165,18 +170,21 @@ def parse_quantity(text: object, quantity: Quantity) -> float:
         raise ValueError(f"{text!r} {error}") from None
 
 
-def parse_vector(text: object, quantity: Quantity, size: int) -> tuple[float, ...]:
-    """Read "[1, 2, 0.3] m" as `size` numbers in the quantity's unit; errors as `parse_quantity`."""
-    example = f"'[{', '.join('123'[:size])}] {quantity.unit}'"
+def parse_vector(text: object, quantity: Quantity, size: int | None) -> tuple[float, ...]:
+    """Read "[1, 2, 0.3] m" as `size` numbers (None: as many as there are) in the quantity's unit.
+
+    Errors as `parse_quantity`.
+    """
+    example = f"'[{', '.join('123'[:size])}] {quantity.unit}'".replace(" '", "'")
     if isinstance(text, list | tuple):
         raise ValueError(f"{text!r} is a vector without a unit; write it as text, such as {example}")
     match = _VECTOR.fullmatch(text) if isinstance(text, str) else None
     if match is None:
         raise ValueError(f"{text!r} is not a vector with a unit, such as {example}")
     parts = match[1].split(",")
-    if len(parts) != size:
+    if size is not None and len(parts) != size:
         raise ValueError(f"{text!r} has {len(parts)} components; wanted {size}, such as {example}")
-    if not match[2]:
+    if not match[2] and quantity is not FRACTION:
         raise ValueError(f"{text!r} is a vector without a unit; write it with one, such as {example}")
     try:
         factor = _factor(match[2], quantity)
@@ -187,12 +195,12 @@ def parse_vector(text: object, quantity: Quantity, size: int) -> tuple[float, ..
 
 def format_quantity(value: float, quantity: Quantity) -> str:
     """Write a value so that `parse_quantity` reads the same bits."""
-    return f"{value!r} {quantity.unit}"
+    return f"{value!r} {quantity.unit}".rstrip()
 
 
 def format_vector(values: tuple[float, ...], quantity: Quantity) -> str:
     """Write a vector so that `parse_vector` reads the same bits."""
-    return f"[{', '.join(repr(value) for value in values)}] {quantity.unit}"
+    return f"[{', '.join(repr(value) for value in values)}] {quantity.unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -244,6 +252,8 @@ SystemGain = Annotated[float, Unit(SYSTEM_GAIN)]
 Pixels = Annotated[float, Unit(PIXELS)]
 Bits = Annotated[float, Unit(BITS)]
 Fraction = Annotated[float, Unit(FRACTION)]
+Extinction = Annotated[float, Unit(EXTINCTION)]
+SpectralIrradiance = Annotated[float, Unit(SPECTRAL_IRRADIANCE)]
 Position = Annotated[tuple[float, float, float], Unit(LENGTH, 3)]
 Size2 = Annotated[tuple[float, float], Unit(LENGTH, 2)]
 Size3 = Annotated[tuple[float, float, float], Unit(LENGTH, 3)]

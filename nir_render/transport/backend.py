@@ -1,6 +1,7 @@
 """The one place where Mitsuba is imported and its variant chosen, once per process."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 LLVM_VARIANT = "llvm_ad_mono"
 SCALAR_VARIANT = "scalar_rgb"  # Mitsuba's wheels carry no scalar_mono; all spectra here are plain numbers
 _VARIABLE = "NIR_RENDER_VARIANT"
+_FARTHEST_M = 1e9  # well within float32
 
 
 @dataclass(frozen=True)
@@ -74,23 +76,47 @@ def set_threads(count: int) -> None:
     backend().dr.set_thread_count(count)
 
 
-def blocked(scene: Any, own: Any, origins_m: Array, directions: Array, reach_m: Array) -> NDArray[np.bool_]:
-    """Tell which rays hit a shape other than `own` before their reach; (n, 3), (n, 3), (n,) → (n,)."""
-    mi = backend().mi
+def blocked(
+    scene: Any,
+    origins_m: Array,
+    directions: Array,
+    reach_m: Array,
+    shapes: Sequence[Any] = (),
+    own: NDArray[np.int64] | None = None,
+) -> NDArray[np.bool_]:
+    """Tell which rays hit a shape that is not their own before their reach, which may be infinite.
+
+    Parameters
+    ----------
+    origins_m, directions, reach_m
+        Shape (n, 3), (n, 3), (n,).
+    shapes, own
+        Each ray's own shape is `shapes[own]`; −1 where it has none, as all have without `own`. Shape (n,).
+
+    Returns
+    -------
+    Shape (n,).
+    """
+    mi, dr = backend().mi, backend().dr
+    reach_m = np.minimum(reach_m, _FARTHEST_M)
+    own = np.full(len(reach_m), -1) if own is None else own
     if backend().vectorised:
         ray = mi.Ray3f(
             mi.Point3f(origins_m.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32))
         )
         ray.maxt = mi.Float(reach_m.astype(np.float32))
         hit = scene.ray_intersect_preliminary(ray)
-        others = hit.is_valid() if own is None else hit.is_valid() & (hit.shape != mi.ShapePtr(own))
-        return np.array(others, dtype=bool)
+        hits = np.array(hit.is_valid(), dtype=bool)
+        found = np.array(dr.reinterpret_array(mi.UInt32, hit.shape))
+        numbers = [int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s)))[0]) for s in shapes]
+        return np.asarray(hits & ((own < 0) | (found != np.array([*numbers, 0])[own])), dtype=bool)
     hits = np.zeros(len(reach_m), dtype=bool)
     for index, (origin, direction, reach) in enumerate(zip(origins_m, directions, reach_m, strict=True)):
+        mine = shapes[own[index]] if own[index] >= 0 else None
         ray = mi.Ray3f(mi.Point3f(*map(float, origin)), mi.Vector3f(*map(float, direction)))
         ray.maxt = float(reach)
         hit = scene.ray_intersect_preliminary(ray)
-        hits[index] = hit.is_valid() and hit.shape != own
+        hits[index] = hit.is_valid() and hit.shape != mine
     return hits
 
 

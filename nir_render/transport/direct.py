@@ -1,70 +1,95 @@
-"""The light that comes straight from small sources: closed form, only the visibility is traced.
+"""The light of small sources, seen straight or as a ghost: closed form, only the visibility is traced.
 
 A sphere of uniform radiance L = Φ / (4π² r²) gives E = π L (r/d)² = Φ / (4π d²) across its direction, at
-every distance, resolved or not (PHYSICS section 1). Partly hidden, it gives the visible share of that.
+every distance, resolved or not (PHYSICS section 1). A row of the table covers the disc with rays of equal
+solid angle and takes the mean of what each brings: nothing where it is hidden, else the emission pattern in
+the direction of leaving, Beer–Lambert's exp(−σ_t ℓ) over its way through fog up to the source's surface, what
+panes pass, and, for a ghost, what the mirror reflects. Where an edge cuts the disc the share is right to
+about 1.5 / rays^(3/4), 0.8 % for 1024 rays; a fully hidden or free disc is exact.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.errors import InputError
-from nir_render.geometry import cone_directions, cone_versine
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import Pose
 from nir_render.transport import world
-from nir_render.transport.backend import blocked
+from nir_render.transport.facets import facets, no_facets
 from nir_render.transport.light import DirectTable
+from nir_render.transport.rays import Surroundings, trace_ghosts, trace_straight
+from nir_render.transport.ways import Ways, ghosts, small_lights, source_around, straight
 
-_GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_RAYS_AT_ONCE = 2**19
 
 
-def direct_table(scene: Scene, pose: Pose, time_s: float) -> DirectTable:
-    """Return the rows of all sources of which a part is in front of the lens."""
+def direct_table(scene: Scene, pose: Pose, time_s: float, *, specular: bool) -> DirectTable:
+    """Return the rows of all small sources in front of the lens, and of their ghosts.
+
+    Parameters
+    ----------
+    pose
+        The camera's axes in the world.
+    specular
+        Whether ghosts and what is seen through panes belong to the table. Without, they are left to the
+        indirect light, and panes hide what is behind them.
+
+    Raises
+    ------
+    InputError
+        The camera is inside a source.
+    """
     rays = scene.document.render.visibility_rays
-    bodies = world.build(scene, time_s)
-    spheres = world.source_spheres(bodies)
-    rows = []
-    for group, (name, centre_m) in enumerate(world.source_positions_m(scene, time_s).items()):
-        radius_m = scene.sources()[name][1].radius_m
-        offset_m = pose.to_local(centre_m)
-        distance_m = float(np.linalg.norm(offset_m))
-        if distance_m <= radius_m:
-            raise InputError(
-                f"{scene.path}: the camera is inside the source {name} at {time_s:g} s; move one of them"
-            )
-        if offset_m[2] <= -radius_m:
-            continue
-        direction = offset_m / distance_m
-        angular_radius_rad = float(np.arcsin(radius_m / distance_m))
-        seen = _visible_fraction(bodies, spheres[group], pose, offset_m, angular_radius_rad, rays)
-        irradiance = seen / (4.0 * np.pi * distance_m**2)
-        rows.append((group, direction, distance_m, angular_radius_rad, seen, [irradiance]))
-    columns: list[Any] = list(zip(*rows, strict=True)) if rows else [()] * 6
+    bodies = world.build(scene, time_s, panes=not specular)
+    lights, surfaces = small_lights(scene, time_s), facets(scene) if specular else no_facets()
+    around = Surroundings(bodies, world.source_spheres(bodies), lights, surfaces, scene.document.fog)
+    inside = source_around(lights, pose.position_m)
+    if inside is not None:
+        raise InputError(
+            f"{scene.path}: the camera is inside the source {inside} at {time_s:g} s; move one of them"
+        )
+    direct = straight(lights, pose)
+    mirrored = ghosts(lights, surfaces, pose)
+    traced = [_in_parts(trace_straight, direct, around, pose, rays)]
+    traced.append(_in_parts(trace_ghosts, mirrored, around, pose, rays))
+    shown = np.asarray(traced[1][0].any(axis=1), dtype=bool)
+    ways = [direct, mirrored[shown]]
+    seen = np.concatenate([traced[0][0], traced[1][0][shown]])
+    share = np.concatenate([traced[0][1], traced[1][1][shown]])
+    distance_m = np.concatenate([part.distance_m for part in ways])
+    per_unit = np.where(np.isfinite(distance_m), 1.0 / (4.0 * np.pi * distance_m**2), 1.0)
     return DirectTable(
-        group=np.array(columns[0], dtype=np.int64),
-        direction=np.array(columns[1], dtype=np.float64).reshape(-1, 3),
-        distance_m=np.array(columns[2], dtype=np.float64),
-        angular_radius_rad=np.array(columns[3], dtype=np.float64),
-        visible_fraction=np.array(columns[4], dtype=np.float64),
-        irradiance_per_w=np.array(columns[5], dtype=np.float64).reshape(-1, 1),
+        group=lights.group[np.concatenate([part.light for part in ways])],
+        facet=np.concatenate([part.facet for part in ways]),
+        direction=np.concatenate([part.direction for part in ways]),
+        distance_m=distance_m,
+        angular_radius_rad=np.concatenate([part.angular_radius_rad for part in ways]),
+        seen=seen,
+        visible_fraction=seen.mean(axis=1),
+        irradiance_per_w=(per_unit * share.mean(axis=1))[:, None],
         visibility_rays=rays,
     )
 
 
-def _visible_fraction(
-    bodies: Any, sphere: Any, pose: Pose, offset_m: NDArray[np.float64], angular_radius_rad: float, rays: int
-) -> float:
-    """Return the share of a source's solid angle that no other body hides.
-
-    A sunflower of rays covers the disc evenly; where an edge cuts it the share is right to about
-    1.5 / rays^(3/4), 0.8 % for 1024 rays, and a fully hidden or free source is exact. The rays end beside the
-    source's centre, so that what stands behind it hides nothing.
-    """
-    distance_m = float(np.linalg.norm(offset_m))
-    versine = (np.arange(rays) + 0.5) / rays * cone_versine(angular_radius_rad)
-    directions = cone_directions(offset_m / distance_m, versine, _GOLDEN_ANGLE_RAD * np.arange(rays))
-    origins_m = np.broadcast_to(pose.position_m, directions.shape)
-    hidden = blocked(bodies, sphere, origins_m, directions @ pose.rotation.T, np.full(rays, distance_m))
-    return float(1.0 - hidden.mean())
+def _in_parts(
+    trace: Callable[[Ways, Surroundings, Pose, int], tuple[Mask, Array]],
+    ways: Ways,
+    around: Surroundings,
+    pose: Pose,
+    rays: int,
+) -> tuple[Mask, Array]:
+    """Trace so many ways at once as memory holds."""
+    step = max(_RAYS_AT_ONCE // rays, 1)
+    parts = [
+        trace(ways[begin : begin + step], around, pose, rays) for begin in range(0, len(ways.light), step)
+    ]
+    none = np.empty((0, rays))
+    return (
+        np.concatenate([none.astype(bool), *(seen for seen, _ in parts)]),
+        np.concatenate([none, *(share for _, share in parts)]),
+    )

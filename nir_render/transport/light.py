@@ -9,31 +9,43 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class DirectTable:
-    """The light that comes straight from small sources: one row per source in front of the camera.
+    """The light of small sources, the sun among them, that is seen straight or in one flat smooth surface.
+
+    One row per source in front of the camera, hidden or not, then one per ghost of which a part is seen: the
+    image of a source in a mirror, a pane, a smooth coat. A ghost stands at the mirrored place of its source;
+    that is where its row says it is.
 
     Attributes
     ----------
     group
         Index into the light's groups, shape (n,).
+    facet
+        Index into the light's `mirrors` of the surface that shows a ghost, −1 where the source itself is
+        seen, shape (n,).
     direction
-        Unit vectors to the sources' centres in camera axes, shape (n, 3).
+        Unit vectors to the centres in camera axes, shape (n, 3).
     distance_m
-        Lens to the source's centre, shape (n,).
+        Lens to the centre, shape (n,); infinite for the sun.
     angular_radius_rad
-        Half the angle that the source fills, shape (n,).
+        Half the angle that the disc fills, shape (n,).
+    seen
+        Which of the rays that cover the disc (`geometry.sunflower`) arrive, shape (n, `visibility_rays`).
     visible_fraction
-        Share of the source's disc that the lens sees, shape (n,); multiples of 1/`visibility_rays`.
+        Share of the disc that the lens sees, the mean of `seen`, shape (n,).
     irradiance_per_w
-        Irradiance across the direction at the lens for one watt of the group's flux, hidden parts left out,
-        in 1/m², shape (n, nodes).
+        Irradiance across the direction at the lens for one unit of the group's emission (1 W; of the sun
+        1 W/m² across its own direction), in 1/m² (of the sun: 1), shape (n, nodes). Hidden parts are left
+        out; emission pattern, fog, panes and the ghost's reflectance are in it.
     visibility_rays
-        Rays that sampled each source's visibility: the resolution of `visible_fraction`.
+        Rays that sampled each disc: the resolution of `visible_fraction`.
     """
 
     group: NDArray[np.int64]
+    facet: NDArray[np.int64]
     direction: NDArray[np.float64]
     distance_m: NDArray[np.float64]
     angular_radius_rad: NDArray[np.float64]
+    seen: NDArray[np.bool_]
     visible_fraction: NDArray[np.float64]
     irradiance_per_w: NDArray[np.float64]
     visibility_rays: int
@@ -41,7 +53,7 @@ class DirectTable:
 
 @dataclass(frozen=True, eq=False)
 class Indirect:
-    """All other light: off walls and floor, in mirrors, through glass, from lamps, seen or not.
+    """All other light: off walls and floor, mirrored more than once, through glass, from lamps, off fog.
 
     Attributes
     ----------
@@ -66,8 +78,9 @@ class Indirect:
 class Light:
     """The light that reaches one camera with the scene's geometry at one time.
 
-    `groups` are the names of what can be switched apart: `robot.source`, `lamps.name`; `wavelengths_m` the
-    nodes. `indirect` is None where nothing reflects and no lamp shines.
+    `groups` are the names of what can be switched apart: `robot.source`, `lamps.name`, `sun`;
+    `wavelengths_m` the nodes. `indirect` is None where nothing reflects or scatters and no lamp shines.
+    `mirrors` names the flat smooth surfaces that the rows of `direct` speak of, as `shapes.mirror`.
     """
 
     camera: str
@@ -77,15 +90,19 @@ class Light:
     wavelengths_m: tuple[float, ...]
     direct: DirectTable
     indirect: Indirect | None
+    mirrors: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
         """Show the direct table in a notebook."""
-        head = "<tr><th>group</th><th>distance m</th><th>visible</th><th>irradiance per watt 1/m²</th></tr>"
+        titles = ("group", "seen in", "distance m", "visible", "irradiance per watt 1/m²")
+        head = f"<tr>{''.join(f'<th>{title}</th>' for title in titles)}</tr>"
         rows = "".join(
-            f"<tr><td>{html.escape(self.groups[group])}</td><td>{distance_m:.3f}</td>"
+            f"<tr><td>{html.escape(self.groups[group])}</td>"
+            f"<td>{html.escape(self.mirrors[facet]) if facet >= 0 else ''}</td><td>{distance_m:.3f}</td>"
             f"<td>{fraction:.2f}</td><td>{irradiance[0]:.3g}</td></tr>"
-            for group, distance_m, fraction, irradiance in zip(
+            for group, facet, distance_m, fraction, irradiance in zip(
                 self.direct.group,
+                self.direct.facet,
                 self.direct.distance_m,
                 self.direct.visible_fraction,
                 self.direct.irradiance_per_w,

@@ -28,6 +28,6 @@ def render(scene: Scene, camera: str, time_s: float, seed: int) -> Light:
     if indivisible is not None:
         raise InputError(f"{scene.path}: {indivisible}")
     world.check_meshes(scene, pose.position_m, f"the camera {camera} at {time_s:g} s")
-    direct = direct_table(scene, pose, time_s)
+    direct = direct_table(scene, pose, time_s, specular=False)
     indirect = stock.indirect(scene, camera, device, pose, time_s, seed, direct)
     return Light(camera, time_s, seed, world.groups(scene), (940e-9,), direct, indirect)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.lens import intrinsics_of
+from nir_render.errors import InputError
 from nir_render.scene.devices import Camera, Source
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import Pose
@@ -51,6 +52,7 @@ def indirect(
     """
     if not scene.document.has_indirect_light():
         return None
+    _refuse_what_only_groups_render(scene)
     settings = scene.document.render.indirect
     samples = samples_of(scene)
     batches = min(_BATCHES, samples)
@@ -78,6 +80,22 @@ def indirect(
         scale=settings.scale,
         samples=samples,
     )
+
+
+def _refuse_what_only_groups_render(scene: Scene) -> None:
+    """Raise InputError where a scene has what Mitsuba's own path tracer, as it is used here, leaves out."""
+    document = scene.document
+    parts = [
+        ("fog", document.fog is not None),
+        ("the sun", document.sun is not None),
+        ("emission patterns", any(source.pattern is not None for _, source in scene.sources().values())),
+    ]
+    asked = [name for name, is_there in parts if is_there]
+    if asked:
+        raise InputError(
+            f"{scene.path}: {' and '.join(asked)} in a scene whose bodies reflect or scatter needs the "
+            "light-group renderer, which needs LLVM: nir-render doctor"
+        )
 
 
 def samples_of(scene: Scene) -> int:
@@ -137,7 +155,7 @@ def _stands_clear(bodies: Any, centre_m: NDArray[np.float64], radius_m: float) -
     flat = np.sqrt(1.0 - height**2)
     directions = np.stack([flat * np.cos(2.399963 * turn), flat * np.sin(2.399963 * turn), height], axis=1)
     origins_m = np.broadcast_to(centre_m, directions.shape)
-    return not blocked(bodies, None, origins_m, directions, np.full(_CLEARANCE_RAYS, 3.0 * radius_m)).any()
+    return not blocked(bodies, origins_m, directions, np.full(_CLEARANCE_RAYS, 3.0 * radius_m)).any()
 
 
 def _render(bodies: Any, sensor: Any, max_depth: int, samples: int, seed: int) -> NDArray[np.float64]:

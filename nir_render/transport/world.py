@@ -18,18 +18,28 @@ from nir_render.scene.world import (
     MaterialDocument,
     Mesh,
     Mirror,
+    Pane,
     Plastic,
     Rectangle,
     RoughConductor,
     ShapeDocument,
     Sphere,
+    Sun,
 )
 from nir_render.transport.backend import backend
 
+SUN_RADIUS_RAD = Sun.angular_radius_rad
+
 
 def groups(scene: Scene) -> tuple[str, ...]:
-    """Return the light groups: each source, `robot.source`, then each lamp, `lamps.name`."""
-    return (*scene.sources(), *(f"lamps.{name}" for name in scene.document.lamps))
+    """Return the light groups: each source, `robot.source`, each lamp, `lamps.name`, then `sun`."""
+    sun = () if scene.document.sun is None else ("sun",)
+    return (*scene.sources(), *(f"lamps.{name}" for name in scene.document.lamps), *sun)
+
+
+def sun_direction(sun: Sun) -> NDArray[np.float64]:
+    """Return the unit vector towards the sun's centre in the world, shape (3,)."""
+    return np.array(sun.direction)
 
 
 def source_positions_m(scene: Scene, time_s: float) -> dict[str, NDArray[np.float64]]:
@@ -41,6 +51,14 @@ def source_positions_m(scene: Scene, time_s: float) -> dict[str, NDArray[np.floa
     return positions
 
 
+def source_rotations(scene: Scene, time_s: float) -> dict[str, NDArray[np.float64]]:
+    """Return the rotation from each source's own axes to the world's, shape (3, 3), by group name."""
+    return {
+        name: robot_pose(robot, time_s).rotation @ rotation_of(source.orientation)
+        for name, (robot, source) in scene.sources().items()
+    }
+
+
 def extent_m(scene: Scene, time_s: float) -> float:
     """Return the diagonal of the box that holds all bodies."""
     box = build(scene, time_s).bbox()
@@ -48,24 +66,30 @@ def extent_m(scene: Scene, time_s: float) -> float:
 
 
 def has_smooth_surface(scene: Scene) -> bool:
-    """Tell whether any body shows sharp images: a mirror, glass, a smooth clear coat."""
+    """Tell whether any body shows sharp images: a mirror, glass, a pane, a smooth clear coat."""
     materials = [scene.document.materials[shape.material] for shape in scene.document.shapes.values()]
     return any(
-        isinstance(material, Mirror | Dielectric)
+        isinstance(material, Mirror | Dielectric | Pane)
         or (isinstance(material, Plastic) and material.roughness == 0.0)
         for material in materials
     )
 
 
-def build(scene: Scene, time_s: float, emitting: str | None = None, as_point: bool = False) -> Any:
+def build(
+    scene: Scene, time_s: float, emitting: str | None = None, as_point: bool = False, panes: bool = True
+) -> Any:
     """Return the Mitsuba scene of all bodies at one time, lamps and the spheres of the sources included.
 
-    The light group `emitting` sends one watt; nothing else shines. Sources and lamps absorb what falls on
-    them. With `as_point` the emitting source is a point without a body.
+    The light group `emitting`, a source or lamp, sends one watt, evenly; nothing else shines. Sources and
+    lamps absorb what falls on them. With `as_point` the emitting source is a point without a body. Without
+    `panes` these are left out: light passes them straight.
     """
     bodies: dict[str, Any] = {"type": "scene"}
     for name, shape in scene.document.shapes.items():
-        bsdf = _bsdf(scene.document.materials[shape.material])
+        material = scene.document.materials[shape.material]
+        if isinstance(material, Pane) and not panes:
+            continue
+        bsdf = _bsdf(material)
         for part, body in enumerate(_bodies(shape)):
             bodies[f"shape_{name}_{part}"] = {**body, "bsdf": bsdf}
     sources = scene.sources()
@@ -189,6 +213,13 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
             }
         case Dielectric():
             return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
+        case Pane():
+            return {
+                "type": "thindielectric",
+                "int_ior": material.index,
+                "ext_ior": 1.0,
+                "specular_transmittance": _uniform(material.transmission),
+            }
     return {"type": "twosided", "nested": surface}
 
 

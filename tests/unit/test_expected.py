@@ -22,7 +22,7 @@ def scene() -> Scene:
 def _light(radiance: float, variance: float, scale: int = 2) -> Light:
     shape = (2, 1, 960 // scale, 1280 // scale)
     none = DirectTable(
-        group=np.empty(0, dtype=np.int64), direction=np.empty((0, 3)), distance_m=np.empty(0),
+        group=np.empty(0, dtype=np.int64), facet=np.empty(0, dtype=np.int64), seen=np.empty((0, 1024), dtype=bool), direction=np.empty((0, 3)), distance_m=np.empty(0),
         angular_radius_rad=np.empty(0), visible_fraction=np.empty(0), irradiance_per_w=np.empty((0, 1)),
         visibility_rays=1024,
     )  # fmt: skip

@@ -1,6 +1,8 @@
 """Spectral EXR: what is written is what a reader of the layout finds."""
 
+import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ _CHANNEL = re.compile(r"^S0\.(\d+,\d+)nm$")
 
 def _light() -> Light:
     table = DirectTable(
-        group=np.array([0]), direction=np.array([[0.0, 0.0, 1.0]]), distance_m=np.array([2.0]),
+        group=np.array([0]), facet=np.array([-1]), seen=np.arange(1024)[None] < 512, direction=np.array([[0.0, 0.0, 1.0]]), distance_m=np.array([2.0]),
         angular_radius_rad=np.array([0.005]), visible_fraction=np.array([0.5]),
         irradiance_per_w=np.array([[0.00995]]), visibility_rays=1024,
     )  # fmt: skip
@@ -45,6 +47,23 @@ def test_every_group_is_a_part_and_reads_back_to_the_bit(tmp_path: Path) -> None
 
 def test_the_direct_table_as_json() -> None:
     light = _light()
-    (row,) = direct_document(light.direct, light.groups)["rows"]
+    (row,) = direct_document(light)["rows"]
     assert (row["group"], row["distance_m"], row["visible_fraction"]) == ("r2.top", 2.0, 0.5)
     assert row["irradiance_per_w"] == [0.00995]
+    assert row["mirror"] is None
+    bits = np.unpackbits(np.frombuffer(bytes.fromhex(row["seen"]), dtype=np.uint8)).astype(bool)
+    np.testing.assert_array_equal(bits, light.direct.seen[0])
+
+
+def test_a_ghost_and_the_sun_as_json() -> None:
+    """A ghost names its mirror; the sun's infinite distance is null, as is what all rays of a disc see."""
+    light = _light()
+    table = replace(
+        light.direct, facet=np.array([1]), distance_m=np.array([np.inf]), visible_fraction=np.array([1.0])
+    )
+    light = replace(light, direct=table, mirrors=("shapes.one", "shapes.other"))
+    document = direct_document(light)
+    (row,) = document["rows"]
+    assert (row["mirror"], row["distance_m"], row["seen"]) == ("shapes.other", None, None)
+    json.dumps(document, allow_nan=False)
+    assert "shapes.other" in light._repr_html_()

@@ -5,6 +5,7 @@ import pytest
 
 from nir_render.camera.lens import Intrinsics
 from nir_render.camera.psf import Window, source_window
+from nir_render.geometry import sunflower
 from perception.flare_model import Window as FlareWindow
 from perception.flare_model import flare_image
 from perception.types import Calibration
@@ -50,6 +51,33 @@ def test_energy_and_centroid_are_those_of_the_projection(
     expected = 1.0e5 * direction[2] * 0.5 * (1.0 + np.cos(angular_radius_rad))
     assert image.sum() == pytest.approx(expected, rel=1e-6)
     assert _centroid(image) == pytest.approx(place, abs=1e-7 + np.exp(-2.0 * np.pi**2 * sigma_px**2) / np.pi)
+
+
+@pytest.mark.parametrize("place", [(319.87, 239.61), (600.25, 440.75)])
+def test_a_partly_hidden_source_is_where_its_visible_part_is(place: tuple[float, float]) -> None:
+    """Of a disc of 9.6 px radius the right half, 2048 of 4096 rays: by its rays, and by their mean place.
+
+    Each ray has an equal share of the solid angle and the weight cos θ; off the axis by 4r/(3π), within what the
+    rays' own unevenness leaves, 2 · 1.5/4096^(3/4) of it.
+    """
+    direction = _direction(*place)
+    rays = sunflower(direction, 0.02, 4096)
+    pixels = LENS.project(rays)
+    right = pixels[:, 0] > place[0]
+    assert right.mean() == pytest.approx(0.5, abs=0.01)
+    image = _frame(source_window(LENS, 0.7, direction, 0.02, _even, rays[right]))
+    weight = rays[right, 2]
+    assert image.sum() == pytest.approx(1.0e5 * weight.mean(), rel=1e-9)
+    assert _centroid(image) == pytest.approx(
+        tuple(np.average(pixels[right], axis=0, weights=weight)), abs=5e-5
+    )
+    if place[0] < 400.0:
+        radius_px = 480.0 * np.tan(0.02)
+        assert _centroid(image)[0] - place[0] == pytest.approx(4.0 * radius_px / (3.0 * np.pi), rel=0.006)
+    whole = _frame(source_window(LENS, 0.7, direction, 0.02, _even, rays))
+    exact = _frame(source_window(LENS, 0.7, direction, 0.02, _even))
+    # At the rim the rays' grain shows: half a ray's power, of which a pixel takes 0.2756 at most.
+    np.testing.assert_allclose(whole / whole.sum(), exact / exact.sum(), atol=0.5 / 4096 * 0.2756)
 
 
 def test_a_point_is_a_gaussian_integrated_over_pixels() -> None:

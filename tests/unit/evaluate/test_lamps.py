@@ -30,3 +30,33 @@ def test_a_lamp_ahead(scene: Scene) -> None:
 def test_a_lamp_that_faces_away_or_stands_behind_is_not_seen(scene: Scene) -> None:
     assert lamp_outlines_px(scene.with_({"lamps.one.normal": [1, 0, 0]}), "r1.front", 0.0) == []
     assert lamp_outlines_px(scene, "r1.back", 0.0) == []
+
+
+SUN = {"azimuth": "10 deg", "elevation": "20 deg", "irradiance": "0.305 W/m^2/nm"}
+FLOOR = {
+    "type": "rectangle", "center": "[3, 0, 0] m", "size": "[8, 8] m", "normal": [0, 0, 1], "material": "gloss",
+}  # fmt: skip
+GLOSS = {"type": "plastic", "index": 1.5, "reflectance": 0.3, "roughness": 0.0}
+
+
+def test_the_sun_and_its_image_in_the_floor(scene: Scene) -> None:
+    """Seen along x, the sun lies at u = 480 tan 10° to the left and v = 480 tan 20°/cos 10° up; its image in the
+    floor as far below, where the ray meets the floor 0.2/tan 20° = 0.55 m ahead: not on one that begins beyond."""
+    u, v = (
+        639.5 - 480.0 * np.tan(np.radians(10.0)),
+        480.0 * np.tan(np.radians(20.0)) / np.cos(np.radians(10.0)),
+    )
+    sunny = scene.with_({"lamps": {}, "sun": SUN})
+    (disc,) = lamp_outlines_px(sunny, "r1.front", 0.0)
+    # The image of a circle is an ellipse whose middle lies a little farther out: r² / f · … = 0.01 px.
+    np.testing.assert_allclose(0.5 * (disc.min(axis=0) + disc.max(axis=0)), [u, 479.5 - v], atol=0.02)
+    # 480 px · tan 0.2666° = 2.23 px, stretched by 1/cos² of its 22.3° from the axis along the radius alone.
+    assert (disc.max(axis=0) - disc.min(axis=0)).max() / 2.0 == pytest.approx(
+        2.23 / np.cos(np.radians(22.3)) ** 2, rel=0.02
+    )
+    near = sunny.with_({"materials": {"gloss": GLOSS}, "shapes": {"floor": FLOOR}})
+    _, image = lamp_outlines_px(near, "r1.front", 0.0)
+    np.testing.assert_allclose(0.5 * (image.min(axis=0) + image.max(axis=0)), [u, 479.5 + v], atol=0.02)
+    far = near.with_({"shapes.floor.center": "[6, 0, 0] m"})
+    assert len(lamp_outlines_px(far, "r1.front", 0.0)) == 1
+    assert lamp_outlines_px(sunny, "r1.back", 0.0) == []

@@ -80,6 +80,7 @@ def test_as_many_pairs_as_possible_come_before_the_nearest() -> None:
         ({"on_fraction": 0.0}, False),
         ({"u_px": -0.6}, False),
         ({"v_px": 479.6}, False),
+        ({"ghost_of": "r2.top"}, False),
     ],
 )
 def test_what_counts_for_recall(changes: dict[str, object], counts: bool) -> None:
@@ -121,8 +122,42 @@ def test_the_summary_of_a_run_worked_out_by_hand() -> None:
     assert summary["estimators"]["paper"]["range_mae_m"] is None
 
 
+def test_detections_of_ghosts_are_counted_apart() -> None:
+    """A source and its two ghosts: one ghost is found, and called a robot; so is nothing, twice.
+
+    Recall counts the source alone, false alarms what belongs to neither. A second detection on the ghost is one.
+    """
+    ghosts = [
+        _truth(u_px, ghost_of="r2.top", direct_e=0.0, mirrored_e=1e4, range_m=4.0) for u_px in (200.0, 300.0)
+    ]
+    found = [_detection(100.2), _detection(200.3, range_m=4.1), _detection(202.0), _detection(400.0)]
+    result = evaluate(
+        [("r1.front", 0)], [_truth(100.0), *ghosts], {"r1.front": CALIBRATION}, {"robust": found}
+    )
+    assert result.summary["sources_visible"] == 1
+    robust = result.summary["estimators"]["robust"]
+    assert (robust["recall"], robust["ghosts_reported"], robust["false_alarms_per_frame"]) == (1.0, 1, 2.0)
+    assert robust["range_bias_m"] == pytest.approx(0.0, abs=1e-12)
+    assert [score.truth.ghost_of for score in result.scores] == [None]
+    assert [score.truth.u_px for score in result.ghosts] == [200.0, 300.0]
+    assert [len(score.detections) for score in result.ghosts] == [1, 0]
+
+
+def test_a_detection_between_a_source_and_a_ghost_belongs_to_the_nearer() -> None:
+    """Source at 100, ghost at 104 px: what is found at 102.5 is the ghost, and the source is missed."""
+    rows = [_truth(100.0), _truth(104.0, ghost_of="r2.top")]
+    summary = evaluate(
+        [("r1.front", 0)], rows, {"r1.front": CALIBRATION}, {"robust": [_detection(102.5)]}
+    ).summary
+    assert summary["estimators"]["robust"]["ghosts_reported"] == 1
+    assert summary["estimators"]["robust"]["recall"] == 0.0
+
+
 def test_truth_reads_back_as_it_was_written() -> None:
     assert parse_truth(_truth(100.0).record()) == _truth(100.0)
+    ghost = _truth(100.0, ghost_of="r2.top")
+    assert parse_truth(ghost.record()) == ghost
+    assert ghost.record()["ghost_of"] == "r2.top"
 
 
 def test_what_is_found_on_a_lamp_is_counted_apart() -> None:

@@ -60,6 +60,16 @@ def _page(
 ONE = [("r1.front", 0)]
 
 
+def test_a_ghost_is_shown_as_one_and_is_no_source() -> None:
+    """It is drawn and named, and what was found on it is told as a ghost, not as a false alarm."""
+    ghost = truth(u_px=200.0, ghost_of="r2.top", range_m=4.0)
+    page, _ = _page(ONE, [truth(), ghost], {"robust": [detection(), detection(u_px=200.0)]})
+    assert "mirror image of r2.top, 4.000 m away" in page.text
+    assert "ghost of r2" in page.text
+    assert "Found the one source" in page.text
+    assert "1 false alarm" not in page.text
+
+
 @pytest.mark.parametrize(
     ("keys", "rows", "detections", "said"),
     [

@@ -22,6 +22,18 @@ def _wall(**changes: Any) -> dict[str, Any]:
     return {"type": "rectangle", "center": "[3, 0, 0] m", "size": "[1, 1] m", "material": "black", **changes}
 
 
+def _box(material: str) -> dict[str, Any]:
+    return {"type": "box", "center": "[5, 0, 0] m", "size": "[1, 1, 1] m", "material": material}
+
+
+def _table(*points: Any) -> dict[str, Any]:
+    return {"type": "table", "points": list(points)}
+
+
+PATTERN = "robots.r2.rig.sources.top.pattern"
+FOG = {"extinction": "0.05 /m"}
+SUN = {"azimuth": "30 deg", "elevation": "40 deg", "irradiance": "0.305 W/m^2/nm"}
+GRID = {"polar": "[0, 90, 180] deg", "azimuth": "[0, 180] deg", "values": ["[1, 1]", "[0.5, 0.7]", "[0, 0]"]}
 BAD: list[tuple[Mapping[str, Any], str]] = [
     ({f"{FRONT}.exposur": "1 ms"}, f"{FRONT}: unknown key 'exposur'; did you mean 'exposure'?"),
     ({"clok": {}}, "'clok' is no part of a scene"),
@@ -79,6 +91,55 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
         },
         f"{FRONT}: the camera is inside shapes.c",
     ),
+    (
+        {"materials.g": {"type": "pane"}, "shapes.b": _box("g")},
+        "shapes.b.material: 'g' is a pane, a thin sheet: only a rectangle can be of it, not a box",
+    ),
+    (
+        {"materials.g": {"type": "dielectric", "index": 1.5}, "shapes.w": _wall(material="g")},
+        "shapes.w.material: 'g' is a solid dielectric, and a rectangle has no inside; use the type 'pane'",
+    ),
+    ({"materials.g": {"type": "pane", "index": 0.9}}, "materials.g.index: input should be greater than or equal to 1"),
+    ({"materials.g": {"type": "pane", "transmission": 1.1}}, "materials.g.transmission: input should be less than"),
+    ({"fog": {}}, "fog: wanted one of 'extinction' and 'visibility', not none"),
+    ({"fog": {"extinction": "1 /m", "visibility": "9 m"}}, "fog: wanted one of 'extinction' and 'visibility', not ["),
+    ({"fog": {"extinction": 0.05}}, "fog.extinction: 0.05 is a bare number; write it with its unit, such as '0.05 /m'"),
+    ({"fog": {"extinction": "20 m"}}, "is a length; wanted an extinction coefficient such as '0.05 /m'"),
+    ({"fog": {"extinction": "-1 /m"}}, "fog.extinction: input should be greater than or equal to 0"),
+    ({"fog": {"visibility": "50 /m"}}, "fog: visibility: '50 /m' is an extinction coefficient; wanted a length"),
+    ({"fog": {"visibility": "0 m"}}, "fog: visibility: '0 m' is not greater than 0"),
+    ({"fog": {**FOG, "albedo": 1.1}}, "fog.albedo: input should be less than or equal to 1"),
+    ({"fog": {**FOG, "phase": {"type": "henyey_greenstein", "g": 1.0}}}, "fog.phase.g: input should be less than"),
+    ({"fog": {**FOG, "phase": {"type": "mie"}}}, "fog.phase"),
+    ({"fog": {**FOG, "phase": _table(["0 deg", 1], ["90 deg", 1])}}, "wanted angles from 0 to 180 deg, not from 0 to 90"),
+    ({"fog": {**FOG, "phase": _table(["5 deg", 1], ["180 deg", 1])}}, "not from 5 to 180 deg"),
+    ({"fog": {**FOG, "phase": _table(["0 deg", 1], ["0 deg", 2], ["180 deg", 1])}}, "increasing angles"),
+    ({"fog": {**FOG, "phase": _table(["0 deg", -1], ["180 deg", 1])}}, "fog.phase.points: values must be finite and not"),
+    ({"fog": {**FOG, "phase": _table(["0 deg", 0], ["180 deg", 0])}}, "fog.phase.points: the values are 0 everywhere"),
+    ({"fog": {**FOG, "phase": _table([0, 1], [180, 1])}}, "0 is a bare number; write it with its unit"),
+    ({"fog": {**FOG, "phase": {"type": "table"}}}, "fog.phase: wanted one of 'points' and 'file', not none"),
+    ({"fog": {**FOG, "center": "[1, 0, 0] m"}}, "fog: a fog bank needs both 'center' and 'size'"),
+    (
+        {"fog": {**FOG, "top": "2 m", "center": "[1, 0, 0] m", "size": "[1, 1, 1] m"}},
+        "fog: wanted either 'top' (all below it) or 'center' and 'size' (a bank of fog), not both",
+    ),
+    ({"fog": {**FOG, "center": "[1, 0, 0] m", "size": "[1, 0, 1] m"}}, "fog: size: each extent must be greater than 0"),
+    ({"fog": FOG, "sun": SUN}, "fog: has no end on the way to the sun, so that the sun is black; give it a 'top'"),
+    ({"sun": {**SUN, "elevation": "0 deg"}}, "sun.elevation: input should be greater than 0"),
+    ({"sun": {**SUN, "elevation": "91 deg"}}, "sun.elevation: input should be less than or equal to"),
+    ({"sun": {**SUN, "irradiance": "3.05 W/m^2"}}, "sun.irradiance: '3.05 W/m^2' is an irradiance; wanted a spectral irradiance"),
+    ({PATTERN: {}}, f"{PATTERN}: wanted one of 'points', 'grid' and 'file', not none"),
+    ({PATTERN: {"points": [["0 deg", 1], ["90 deg", 1]]}}, "wanted polar angles from 0 to 180 deg, not from 0 to 90 deg"),
+    ({PATTERN: {"points": [["0 deg", 0], ["180 deg", 0]]}}, f"{PATTERN}.points: the values are 0 everywhere"),
+    ({PATTERN: {"points": [["0 deg", "a"], ["180 deg", 0]]}}, "wanted a list of [polar angles, value]"),
+    ({PATTERN: {"file": "no.csv"}}, "there is no file 'no.csv' beside the scene"),
+    ({PATTERN: {"grid": {**GRID, "polar": "[0, 90] deg"}}}, f"{PATTERN}.grid.polar: wanted polar angles from 0 to 180"),
+    ({PATTERN: {"grid": {**GRID, "azimuth": "[0, 360] deg"}}}, "wanted azimuths from 0 up to less than 360 deg: 360 is 0"),
+    ({PATTERN: {"grid": {**GRID, "azimuth": "[180, 0] deg"}}}, f"{PATTERN}.grid.azimuth: wanted increasing angles"),
+    ({PATTERN: {"grid": {**GRID, "values": ["[1, 1]", "[1, 1]"]}}}, "wanted 3 rows of 2 values"),
+    ({PATTERN: {"grid": {**GRID, "values": ["[1]", "[1, 1]", "[1, 1]"]}}}, "wanted 3 rows of 2 values"),
+    ({PATTERN: {"grid": {**GRID, "values": "[1, 1]"}}}, "wanted a list of rows, each written as text"),
+    ({PATTERN: {"grid": {**GRID, "values": ["[-1, 1]", "[1, 1]", "[1, 1]"]}}}, "values must be finite and not negative"),
 ]  # fmt: skip
 
 

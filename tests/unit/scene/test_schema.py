@@ -54,3 +54,41 @@ def test_the_schema_takes_what_editors_should_take(
     camera: Any, holds: bool, validator: Draft202012Validator
 ) -> None:
     assert validator.is_valid(_scene(camera)) is holds
+
+
+FOG = {"extinction": "0.05 /m"}
+
+
+@pytest.mark.parametrize(
+    ("part", "holds"),
+    [
+        ({"fog": FOG}, True),
+        ({"fog": {"visibility": "50 m", "top": "4 m"}}, True),
+        ({"fog": {**FOG, "visibility": "50 m"}}, False),
+        ({"fog": {"albedo": 0.9}}, False),
+        ({"fog": {**FOG, "phase": {"type": "table", "file": "phase.csv"}}}, True),
+        ({"fog": {**FOG, "phase": {"type": "table", "points": [["0 deg", 9], ["180 deg", 1]]}}}, True),
+        ({"fog": {**FOG, "phase": {"type": "henyey_greenstein", "g": 1.5}}}, False),
+        ({"sun": {"azimuth": "30 deg", "elevation": "40 deg", "irradiance": "0.305 W/m^2/nm"}}, True),
+        ({"sun": {"azimuth": "30 deg", "elevation": "40 deg", "irradiance": 0.305}}, False),
+        ({"materials": {"g": {"type": "pane"}}}, True),
+        ({"materials": {"g": {"type": "pane", "reflectance": 0.1}}}, False),
+    ],
+)
+def test_the_schema_takes_fog_sun_and_panes(part: Any, holds: bool, validator: Draft202012Validator) -> None:
+    assert validator.is_valid({**_scene("infra_swarm"), **part}) is holds
+
+
+@pytest.mark.parametrize(
+    ("pattern", "holds"),
+    [
+        ({"points": [["0 deg", 1], ["180 deg", 0]]}, True),
+        ({"file": "led.csv"}, True),
+        ({"grid": {"polar": "[0, 180] deg", "azimuth": "[0] deg", "values": ["[1]", "[0]"]}}, True),
+        ({"grid": {"polar": [0, 180], "azimuth": "[0] deg", "values": ["[1]", "[0]"]}}, False),
+        ({"points": [[0, 1], [180, 0]]}, False),
+    ],
+)
+def test_the_schema_takes_patterns(pattern: Any, holds: bool, validator: Draft202012Validator) -> None:
+    rig = {"sources": {"top": {"preset": "infra_swarm", "pattern": pattern}}}
+    assert validator.is_valid({"format": 1, "observe": ["a"], "robots": {"a": {"rig": rig}}}) is holds

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from nir_render import InputError, Scene, load_scene, render
+from nir_render.scene.motion import camera_pose
+from nir_render.transport import stock
+from nir_render.transport.direct import direct_table
 
 pytestmark = pytest.mark.mitsuba
 
@@ -239,3 +242,29 @@ def test_a_mirror_shows_the_source_behind_it(scene: Scene) -> None:
     assert irradiance == pytest.approx(0.9 / (4.0 * math.pi * (25.0 + 0.25)), rel=0.01)
     u_px = float((columns * radiance).sum() / radiance.sum())
     assert u_px == pytest.approx(15.5 - 120.0 * 0.5 / 5.0, abs=0.05)
+
+
+LED = "robots.r2.rig.sources.s"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"fog": {"extinction": "0.05 /m"}}, "fog in a scene"),
+        (
+            {"sun": {"azimuth": "0 deg", "elevation": "40 deg", "irradiance": "0.3 W/m^2/nm"}},
+            "the sun in a scene",
+        ),
+        ({f"{LED}.pattern": {"points": [["0 deg", 1], ["180 deg", 0]]}}, "emission patterns in a scene"),
+    ],
+)
+def test_what_it_cannot_render_is_refused(scene: Scene, changes: dict[str, Any], said: str) -> None:
+    """Rather than left out: with fog, Mitsuba's path tracer would give the clear scene."""
+    changed = scene.with_({LED: {"preset": "infra_swarm"}, **changes})
+    robot, camera = changed.camera("r1.c")
+    pose = camera_pose(robot, camera, 0.0)
+    table = direct_table(changed, pose, 0.0, specular=False)
+    with pytest.raises(
+        InputError, match=f"{said} whose bodies reflect or scatter needs the light-group renderer"
+    ):
+        stock.indirect(changed, "r1.c", camera, pose, 0.0, 1, table)

@@ -1,0 +1,91 @@
+"""Random numbers that depend on nothing but their key: pixel, seed, sample, and what they are for.
+
+Two rounds of an integer hash make each of them, so samples may be drawn in any order and on any number of
+threads. The numbers of a path's first vertex are stratified over the samples of a batch, each apart (Latin
+hypercube): the choice of a light and the place in the pixel then vary less between batches.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from nir_render.transport.backend import backend
+
+# What a number is for. A vertex has STEP of them; those of the camera come first.
+PIXEL_U, PIXEL_V, CAMERA_DIMENSIONS = 0, 1, 2
+LIGHT, LIGHT_U, LIGHT_V, LOBE, LOBE_U, LOBE_V, SURVIVAL = range(7)
+FOG_LIGHT, FOG_PLACE, FOG_U, FOG_V, FLIGHT, TURN_U, TURN_V = range(7, 14)
+STEP = 14
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Random numbers of the lanes: two keys each, and how many samples make a batch, a power of two
+    (an array of one number, so that another count is no other program)."""
+
+    key: Any
+    key_too: Any
+    samples: Any
+
+    def pixel(self, sample: Any, dimension: int) -> Any:
+        """Return a stratified number in [0, 1) for a sample's place in the pixel."""
+        mi = backend().mi
+        bits = self._bits(sample, mi.UInt32(dimension))
+        return self._even(sample, mi.UInt32(dimension), _unit(bits))
+
+    def vertex(self, sample: Any, depth: Any, use: int) -> Any:
+        """Return a number in [0, 1) for a vertex of a path, stratified for its first one."""
+        mi, dr = backend().mi, backend().dr
+        dimension = CAMERA_DIMENSIONS + depth * STEP + use
+        bits = self._bits(sample, dimension)
+        plain = _unit(bits)
+        if use == SURVIVAL:
+            return plain
+        return dr.select(depth == 0, self._even(sample, dimension, plain), plain)
+
+    def _even(self, sample: Any, dimension: Any, plain: Any) -> Any:
+        """Return a number in the sample's own stratum; which that is a shuffle of each dimension says."""
+        mi, dr = backend().mi, backend().dr
+        stratum = _shuffled(sample, self.samples, self._bits(mi.UInt32(0xFFFFFFFF), dimension))
+        return dr.minimum((mi.Float(stratum) + plain) / mi.Float(self.samples), _BELOW_ONE)
+
+    def _bits(self, sample: Any, dimension: Any) -> Any:
+        mi = backend().mi
+        counter = sample * mi.UInt32(0x9E3779B9) ^ dimension * mi.UInt32(0x85EBCA6B)
+        return _hash(_hash(counter ^ self.key) + self.key_too)
+
+
+def draws(pixel: Any, batch: Any, seed: int, samples: Any) -> Draws:
+    """Return the random numbers of lanes, keyed by pixel, batch and a seed of 64 bits."""
+    mi, dr = backend().mi, backend().dr
+    one, other = mi.sample_tea_32(pixel, batch)
+    low, high = (dr.opaque(mi.UInt32, (seed >> shift) & 0xFFFFFFFF) for shift in (0, 32))
+    key, key_too = mi.sample_tea_32(one ^ low, other ^ high)
+    return Draws(key, key_too, samples)
+
+
+_BELOW_ONE = 1.0 - 2.0**-24
+
+
+def _hash(bits: Any) -> Any:
+    """Mix 32 bits; one to one, every input bit moves every output bit."""
+    mi = backend().mi
+    bits = (bits ^ (bits >> 16)) * mi.UInt32(0x7FEB352D)
+    bits = (bits ^ (bits >> 15)) * mi.UInt32(0x846CA68B)
+    return bits ^ (bits >> 16)
+
+
+def _unit(bits: Any) -> Any:
+    mi = backend().mi
+    return mi.Float(bits >> 8) * mi.Float(2.0**-24)
+
+
+def _shuffled(index: Any, count: Any, key: Any) -> Any:
+    """Return where a shuffle of 0 … count − 1, count a power of two, takes an index; one to one."""
+    mi, dr = backend().mi, backend().dr
+    mask = count - 1
+    half = dr.maximum((32 - dr.lzcnt(mask)) >> 1, 1)
+    for turn in range(3):
+        index = (index ^ (key >> (10 * turn))) & mask
+        index = (index * ((key >> (10 * turn + 4)) | mi.UInt32(1))) & mask
+        index = index ^ (index >> half)
+    return index

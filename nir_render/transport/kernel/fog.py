@@ -1,0 +1,89 @@
+"""Fog on the device: where a ray is in it, how far it gets, and how it turns."""
+
+from typing import Any
+
+from nir_render.transport.backend import backend
+from nir_render.transport.kernel.tables import FogTable
+from nir_render.transport.phase import CELLS
+
+
+def interval(fog: FogTable, origin: Any, direction: Any, reach: Any) -> tuple[Any, Any]:
+    """Return where along a ray, of unit direction, the fog begins and ends; an empty stretch has end ≤ begin."""
+    mi, dr = backend().mi, backend().dr
+    begin, end = mi.Float(0.0), mi.Float(reach)
+    for axis in range(3):
+        slope = direction[axis]
+        slope = dr.select(dr.abs(slope) < 1e-12, 1e-12, slope)
+        one = (fog.low[axis] - origin[axis]) / slope
+        other = (fog.high[axis] - origin[axis]) / slope
+        begin = dr.maximum(begin, dr.minimum(one, other))
+        end = dr.minimum(end, dr.maximum(one, other))
+    return begin, end
+
+
+def transmittance(fog: FogTable, origin: Any, direction: Any, reach: Any) -> Any:
+    """Return what is left of light after a straight way: Beer and Lambert."""
+    dr = backend().dr
+    begin, end = interval(fog, origin, direction, reach)
+    return dr.exp(-fog.extinction * dr.maximum(end - begin, 0.0))
+
+
+def phase(fog: FogTable, versine: Any) -> Any:
+    """Return the phase function, 1/sr, for a turn of which 1 − cos is given."""
+    mi, dr = backend().mi, backend().dr
+    cell = _cell(_angle(versine))
+    low = dr.gather(mi.Float, fog.versine, cell)
+    high = dr.gather(mi.Float, fog.versine, cell + 1)
+    share = dr.clip((versine - low) / (high - low), 0.0, 1.0)
+    return dr.lerp(dr.gather(mi.Float, fog.density, cell), dr.gather(mi.Float, fog.density, cell + 1), share)
+
+
+def turned(fog: FogTable, direction: Any, u: Any, v: Any) -> Any:
+    """Return a direction after a scattering, drawn from the phase function.
+
+    In a cell the density is linear in the versine: of p0, p1 and the share s of the cell's light, the place x
+    in it solves x (p0 + ½ (p1 − p0) x) = ½ s (p0 + p1).
+    """
+    mi, dr = backend().mi, backend().dr
+    cell = dr.binary_search(0, CELLS - 1, lambda k: dr.gather(mi.Float, fog.cumulative, k + 1) <= u)
+    before = dr.gather(mi.Float, fog.cumulative, cell)
+    after = dr.gather(mi.Float, fog.cumulative, cell + 1)
+    share = dr.clip((u - before) / dr.maximum(after - before, 1e-20), 0.0, 1.0)
+    p0, p1 = dr.gather(mi.Float, fog.density, cell), dr.gather(mi.Float, fog.density, cell + 1)
+    root = dr.safe_sqrt(p0 * p0 + share * (p1 * p1 - p0 * p0))
+    place = share * (p0 + p1) / dr.maximum(p0 + root, 1e-30)
+    low, high = dr.gather(mi.Float, fog.versine, cell), dr.gather(mi.Float, fog.versine, cell + 1)
+    versine = dr.lerp(low, high, dr.clip(place, 0.0, 1.0))
+    sine = dr.safe_sqrt(versine * (2.0 - versine))
+    sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * v)
+    return mi.Frame3f(direction).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, 1.0 - versine))
+
+
+def arc(fog: FogTable, angle: Any) -> Any:
+    """Return ∫ of the phase function over the angle itself, from 0 to `angle`."""
+    mi, dr = backend().mi, backend().dr
+    cell = _cell(angle)
+    low, high = dr.gather(mi.Float, fog.angle, cell), dr.gather(mi.Float, fog.angle, cell + 1)
+    share = dr.clip((angle - low) / (high - low), 0.0, 1.0)
+    return dr.lerp(dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1), share)
+
+
+def angle_of_arc(fog: FogTable, value: Any) -> tuple[Any, Any]:
+    """Return the angle up to which `arc` is `value`, and the slope of `arc` there."""
+    mi, dr = backend().mi, backend().dr
+    cell = dr.binary_search(0, CELLS - 1, lambda k: dr.gather(mi.Float, fog.arc, k + 1) <= value)
+    before, after = dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1)
+    low, high = dr.gather(mi.Float, fog.angle, cell), dr.gather(mi.Float, fog.angle, cell + 1)
+    share = dr.clip((value - before) / dr.maximum(after - before, 1e-20), 0.0, 1.0)
+    return dr.lerp(low, high, share), (after - before) / (high - low)
+
+
+def _angle(versine: Any) -> Any:
+    dr = backend().dr
+    return 2.0 * dr.asin(dr.minimum(dr.safe_sqrt(0.5 * versine), 1.0))
+
+
+def _cell(angle: Any) -> Any:
+    """Return the cell of the table that holds an angle: angles are π (i / CELLS)²."""
+    mi, dr = backend().mi, backend().dr
+    return mi.UInt32(dr.clip(CELLS * dr.sqrt(dr.maximum(angle, 0.0) / dr.pi), 0.0, CELLS - 1.0))

@@ -1,0 +1,410 @@
+"""The light-group integrator against closed forms and quadrature: walls, fog, white furnaces, the dark."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from nir_render import Scene, load_scene, render
+from nir_render.transport.backend import backend
+from tests.physics.fog_forms import PhaseFunction, henyey_greenstein, single_scatter_per_w, tabulated
+from tests.physics.stock import stock_radiance
+
+pytestmark = pytest.mark.mitsuba
+
+Array = NDArray[np.float64]
+
+FOCAL_PX = 80.0
+SPECTRUM = {"gaussian": {"centroid": "940 nm", "fwhm": "42 nm"}}
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Any:
+    """Write a document down and load it."""
+
+    def load(document: dict[str, Any]) -> Scene:
+        path = tmp_path / "scene.yaml"
+        path.write_text(yaml.safe_dump(document, sort_keys=False))
+        return load_scene(path)
+
+    return load
+
+
+def _camera(columns: int, rows: int, focal_px: float = FOCAL_PX, **pose: Any) -> dict[str, Any]:
+    return {
+        "lens": {"focal_length": f"{focal_px * 22.5e-3!r} mm", "f_number": 2.0, "transmission": 0.9},
+        "sensor": {
+            "columns": columns, "rows": rows, "pixel_pitch": "22.5 um", "quantum_efficiency": 0.15, "full_well": "1e+7 e",
+            "read_noise": "1 e", "system_gain": "0.0004 DN/e", "black_level": "10 DN", "bit_depth": "12 bit",
+        },
+        "point_spread": {"sigma": "0.7 px"}, "exposure": "1 ms", **pose,
+    }  # fmt: skip
+
+
+def _source(place_m: tuple[float, ...], radius_m: float) -> dict[str, Any]:
+    source = {"flux": "1 W", "radius": f"{radius_m!r} m", "spectrum": SPECTRUM}
+    return {"rig": {"sources": {"s": source}}, "position": f"{list(place_m)!r} m"}
+
+
+def _document(
+    cameras: dict[str, Any], sources: dict[str, Any], *, samples: int, max_depth: int, **more: Any
+) -> dict[str, Any]:
+    return {
+        "format": 1,
+        "observe": ["eye"],
+        "render": {"indirect": {"scale": 1, "samples": samples, "max_depth": max_depth}},
+        "robots": {"eye": {"rig": {"cameras": cameras}}, **sources},
+        **more,
+    }
+
+
+def _rectangle(
+    center_m: tuple[float, ...], size_m: tuple[float, float], normal: tuple[float, ...], material: str
+) -> dict[str, Any]:
+    return {
+        "type": "rectangle", "center": f"{list(center_m)!r} m", "size": f"{list(size_m)!r} m", "normal": list(normal),
+        "material": material,
+    }  # fmt: skip
+
+
+def _rays(columns: int, rows: int, focal_px: float = FOCAL_PX) -> Array:
+    """Return the directions of pixels' centres in world axes, x ahead, shape (rows, columns, 3)."""
+    x = (np.arange(columns) - 0.5 * (columns - 1)) / focal_px
+    y = (np.arange(rows) - 0.5 * (rows - 1)) / focal_px
+    across, down = np.meshgrid(x, y)
+    rays = np.stack([np.ones_like(across), -across, -down], axis=-1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+
+def _radiance(scene: Scene, seed: int = 1, camera: str = "eye.c") -> Array:
+    """Return the indirect radiance per unit of each group, shape (groups, rows, columns)."""
+    light = render(scene, camera, seed=seed)
+    assert light.indirect is not None
+    return light.indirect.radiance_per_w[:, 0].astype(np.float64)
+
+
+def _tiles(image: Array, size_px: int = 16) -> Array:
+    rows, columns = (length // size_px for length in image.shape)
+    return np.asarray(image.reshape(rows, size_px, columns, size_px).mean(axis=(1, 3)))
+
+
+WALL_M, REFLECTANCE = 3.0, 0.6
+WALL = {"wall": _rectangle((WALL_M, 0, 0), (40, 40), (-1, 0, 0), "paint")}
+PAINT = {"paint": {"type": "diffuse", "reflectance": REFLECTANCE}}
+
+
+def _lit_wall(source_m: Array, rays: Array) -> tuple[Array, Array]:
+    """Return L = (ρ/π) cos θ / (4π d²) per watt where rays from the origin meet the wall, and these points."""
+    points_m = rays * (WALL_M / rays[..., :1])
+    offset_m = source_m - points_m
+    distance_m = np.linalg.norm(offset_m, axis=-1)
+    irradiance = -offset_m[..., 0] / distance_m**3 / (4.0 * math.pi)
+    return REFLECTANCE / math.pi * irradiance, points_m
+
+
+def test_a_source_lights_a_wall_by_the_inverse_square_law(make: Any) -> None:
+    """A sphere wholly in view of a wall gives cos θ / (4π d²) per watt, however large it looks.
+
+    A source of 10 mm, 0.2 to 10 m before the wall and 0.3 m aside. Expected: the frame's mean to 0.1 %, every
+    pixel to 0.5 %, and the slope of log L against log d, cos θ taken out, −2.000 ± 0.001.
+    """
+    rays = _rays(32, 24)
+    logs = []
+    for away_m in np.geomspace(0.2, 10.0, 6):
+        source_m = np.array([WALL_M - away_m, 0.3, 0.0])
+        scene = make(
+            _document(
+                {"c": _camera(32, 24)}, {"r": _source(tuple(source_m.tolist()), 0.01)},
+                samples=512, max_depth=2, materials=PAINT, shapes=WALL,
+            )
+        )  # fmt: skip
+        radiance = _radiance(scene)[0]
+        expected, points_m = _lit_wall(source_m, rays)
+        # Where the source stands in the way its body is seen, black.
+        beside = np.linalg.norm(np.cross(rays, source_m), axis=-1) > 0.02 + 1.5 / FOCAL_PX * np.linalg.norm(
+            source_m
+        )
+        beside |= rays @ source_m < 0.0
+        assert radiance[beside].mean() == pytest.approx(expected[beside].mean(), rel=0.001), away_m
+        curvature = 0.005 + 0.5 * (WALL_M / FOCAL_PX / away_m) ** 2  # of the irradiance within a pixel
+        np.testing.assert_allclose(radiance[beside], expected[beside], rtol=curvature)
+        distance_m = np.linalg.norm(source_m - points_m, axis=-1)[beside]
+        logs.append((np.log(distance_m), np.log(radiance[beside] / (away_m / distance_m))))
+    slope, _ = np.polyfit(*(np.concatenate(column) for column in zip(*logs, strict=True)), 1)
+    assert slope == pytest.approx(-2.0, abs=0.001)
+
+
+def test_flux_falls_as_the_square_of_the_range_in_stock_path() -> None:
+    """The same law by Mitsuba's own `path`: seven sources of 3 cm side by side, 1 to 10 m away.
+
+    E = ∫ L cos ψ dΩ over each image, ψ from the source's centre, is 1/(4π d²) per watt: the slope of log E
+    against log d is −2.000 ± 0.005, and E itself holds to 0.5 %.
+    """
+    columns, rows, focal_px = 160, 48, 533.0
+    ranges_m = np.geomspace(1.0, 10.0, 7)
+    widths_px = 2.0 * focal_px * 0.03 / ranges_m
+    gap_px = (columns - widths_px.sum()) / 8.0
+    left_px = np.cumsum(np.concatenate([[0.5 * gap_px], widths_px + gap_px]))  # borders between images
+    centres_px = left_px[:-1] + 0.5 * (gap_px + widths_px)
+    sources = {}
+    directions = []
+    for number, (range_m, centre_px) in enumerate(zip(ranges_m, centres_px, strict=True)):
+        direction = np.array([1.0, -(centre_px - 0.5 * columns) / focal_px, 0.0])
+        directions.append(direction / np.linalg.norm(direction))
+        sources[f"r{number}"] = _source(tuple((range_m * directions[-1]).tolist()), 0.03)
+    document = _document({"c": _camera(columns, rows, focal_px)}, sources, samples=16, max_depth=2)
+    image = stock_radiance(
+        document, [[f"{name}.s" for name in sources]], samples=1024, batches=16, variant=backend().variant, max_depth=1
+    )[0].mean(axis=0)  # fmt: skip
+    rays = _rays(columns, rows, focal_px)
+    solid_angle_sr = rays[..., 0] ** 3 / focal_px**2
+    borders = np.round(left_px).astype(int)
+    irradiance = np.array([
+        (image * solid_angle_sr * (rays @ direction))[:, first:last].sum()
+        for direction, first, last in zip(directions, borders[:-1], borders[1:], strict=True)
+    ])  # fmt: skip
+    np.testing.assert_allclose(irradiance, 1.0 / (4.0 * math.pi * ranges_m**2), rtol=0.005)
+    slope, _ = np.polyfit(np.log(ranges_m), np.log(irradiance), 1)
+    assert slope == pytest.approx(-2.0, abs=0.005)
+
+
+SIDES: dict[str, tuple[float, ...]] = {
+    "ahead": (1, 0, 0), "behind": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0), "above": (0, 0, 1), "below": (0, 0, -1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reflectance", [0.5, pytest.param(0.8, marks=pytest.mark.verify)])
+def test_a_closed_room_keeps_its_energy(make: Any, reflectance: float) -> None:
+    """What the walls of a closed room absorb is what the source sends: Φ = (1 − ρ) ∫ E dA.
+
+    A cube of 2 m with matt walls, one small source off its middle, and six cameras of exactly 90° × 90° in the
+    middle, each of which sees one wall, every pixel the same area of it. So the mean of all pixels is
+    ρ Φ / (π A (1 − ρ)), whatever the light's distribution. Expected to 0.2 %.
+    """
+    turns: dict[str, dict[str, Any]] = {
+        "ahead": {}, "behind": {"yaw": "180 deg"}, "left": {"yaw": "90 deg"}, "right": {"yaw": "-90 deg"},
+        "above": {"pitch": "-90 deg"}, "below": {"pitch": "90 deg"},
+    }  # fmt: skip
+    walls = {
+        side: _rectangle(normal, (2.0, 2.0), tuple(-n for n in normal), "paint")
+        for side, normal in SIDES.items()
+    }
+    scene = make(
+        _document(
+            {side: _camera(32, 32, 16.0, orientation=turn) for side, turn in turns.items()},
+            {"r": _source((0.35, 0.25, -0.15), 0.005)},
+            samples=512, max_depth=64,
+            materials={"paint": {"type": "diffuse", "reflectance": reflectance}}, shapes=walls,
+        )
+    )  # fmt: skip
+    radiance = [_radiance(scene, camera=f"eye.{side}")[0].mean() for side in turns]
+    expected = reflectance / (math.pi * 24.0 * (1.0 - reflectance))
+    assert np.mean(radiance) == pytest.approx(expected, rel=0.002)
+
+
+FURNACES: dict[str, dict[str, Any]] = {
+    "clear": {},
+    "fog": {"fog": {"extinction": "0.5 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.85}}},
+    "even fog": {"fog": {"extinction": "1 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.0}}},
+    "bank of fog": {
+        "fog": {
+            "extinction": "2 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.5},
+            "center": "[0.5, 0.1, 0] m", "size": "[0.7, 0.9, 1.1] m",
+        }
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FURNACES)
+def test_a_white_furnace(make: Any, name: str) -> None:
+    """In a room whose walls all shine alike nothing can be seen but even light, if nothing absorbs.
+
+    A cube of 2 m lined with six lamps of one watt each, of radiance 1/(π A); in it a white ball, a white crate,
+    a perfect mirror, fog that only scatters. Expected: the sum of the groups is that radiance, the frame to
+    0.2 %, tiles within 5 standard errors of eight renders.
+    """
+    lamps = {
+        side: {
+            "center": f"{list(normal)!r} m", "size": "[2.1, 2.1] m", "normal": [-n for n in normal],
+            "luminous_flux": "1000 lm", "temperature": "2856 K",
+        }
+        for side, normal in SIDES.items()
+    }  # fmt: skip
+    shapes = {
+        "ball": {"type": "sphere", "center": "[0.5, 0.3, 0.2] m", "radius": "15 cm", "material": "white"},
+        "crate": {
+            "type": "box", "center": "[0.4, -0.3, -0.2] m", "size": "[0.3, 0.3, 0.3] m", "orientation": {"yaw": "30 deg"},
+            "material": "white",
+        },
+        "mirror": _rectangle((0.7, 0.05, 0.3), (0.3, 0.5), (-1, 0.2, -0.3), "silver"),
+    }  # fmt: skip
+    document = _document(
+        {"c": _camera(64, 48, 32.0)}, {}, samples=64, max_depth=64, lamps=lamps, shapes=shapes,
+        materials={"white": {"type": "diffuse", "reflectance": 1.0}, "silver": {"type": "mirror", "reflectance": 1.0}},
+        **FURNACES[name],
+    )  # fmt: skip
+    document["robots"]["eye"]["position"] = "[-0.6, 0, 0] m"
+    scene = make(document)
+    even = 1.0 / (math.pi * 2.1**2)
+    sums = np.stack([_radiance(scene, seed).sum(axis=0) for seed in range(8)])
+    assert sums.mean() == pytest.approx(even, rel=0.002)
+    tiles = np.stack([_tiles(image, 8) for image in sums])
+    error = tiles.std(axis=0, ddof=1) / math.sqrt(8)
+    # Student's t of 7 degrees of freedom, 48 tiles: 8 standard errors are passed once in 10⁴.
+    assert (np.abs(tiles.mean(axis=0) - even) < 8.0 * error + 1e-5 * even).all()
+
+
+TABLE = [(0.0, 400.0), (0.5, 250.0), (2.0, 60.0), (5.0, 14.0), (12.0, 4.0), (30.0, 0.9), (75.0, 0.12), (120.0, 0.05), (142.0, 0.2), (180.0, 0.08)]  # fmt: skip
+PHASES: dict[str, tuple[dict[str, Any], PhaseFunction]] = {
+    "even": ({"type": "henyey_greenstein", "g": 0.0}, henyey_greenstein(0.0)),
+    "forward": ({"type": "henyey_greenstein", "g": 0.85}, henyey_greenstein(0.85)),
+    "backward": ({"type": "henyey_greenstein", "g": -0.5}, henyey_greenstein(-0.5)),
+    "table": (
+        {"type": "table", "points": [[f"{angle} deg", value] for angle, value in TABLE]},
+        tabulated(*np.array(TABLE).T * np.array([[math.pi / 180.0], [1.0]])),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_single_scattering_is_the_integral_along_the_ray(make: Any, name: str) -> None:
+    """A source alone in fog, all scattering but the first cut off by the depth: L = ∫ σ_s p E exp(−σ s) ds.
+
+    Seen from 2.6 m, 20 mm large, so that the cone it fills matters little but is integrated all the same. Expected:
+    16 × 16 tiles that do not touch the source to 1 %, the frame to 0.3 %.
+    """
+    phase_document, phase = PHASES[name]
+    source_m, radius_m = np.array([2.5, 0.5, 0.3]), 0.02
+    scene = make(
+        _document(
+            {"c": _camera(160, 112)}, {"r": _source(tuple(source_m.tolist()), radius_m)}, samples=256, max_depth=2,
+            fog={"extinction": "0.3 /m", "albedo": 0.9, "phase": phase_document},
+        )
+    )  # fmt: skip
+    radiance = _radiance(scene)[0]
+    rays = _rays(160, 112)
+    # 2 px beyond the source's rim the radiance, which goes with 1/h there, is even enough within a pixel.
+    clear = np.linalg.norm(np.cross(rays, source_m), axis=-1) > radius_m + 3.0 / FOCAL_PX * 2.6
+    expected = np.zeros(radiance.shape)
+    expected[clear] = single_scatter_per_w(rays[clear], source_m, radius_m, 0.3, 0.9, phase)
+    radiance = np.where(clear, radiance, 0.0)
+    assert radiance.mean() == pytest.approx(expected.mean(), rel=0.003)
+    np.testing.assert_allclose(_tiles(radiance), _tiles(expected), rtol=0.01)
+
+
+REGIONS: dict[str, tuple[dict[str, Any], list[float], list[float]]] = {
+    "everywhere": ({}, [-math.inf] * 3, [math.inf] * 3),
+    "below a top": ({"top": "0.2 m"}, [-math.inf] * 3, [math.inf, math.inf, 0.2]),
+    "around the camera": ({"center": "[0, 0, 0] m", "size": "[2, 2, 2] m"}, [-1.0] * 3, [1.0] * 3),
+    "around the source": (
+        {"center": "[2, 0.5, 1] m", "size": "[1, 0.8, 1.2] m"},
+        [1.5, 0.1, 0.4],
+        [2.5, 0.9, 1.6],
+    ),
+}
+
+
+def _length_inside_m(start_m: Array, end_m: Array, low_m: Array, high_m: Array) -> Array:
+    """Return how much of the way between points, shape (..., 3), lies in a box."""
+    way_m = end_m - start_m
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at_low, at_high = (low_m - start_m) / way_m, (high_m - start_m) / way_m
+    enter = np.clip(np.nanmax(np.minimum(at_low, at_high), axis=-1), 0.0, 1.0)
+    leave = np.clip(np.nanmin(np.maximum(at_low, at_high), axis=-1), 0.0, 1.0)
+    return np.maximum(leave - enter, 0.0) * np.linalg.norm(way_m, axis=-1)
+
+
+@pytest.mark.parametrize("name", REGIONS)
+def test_fog_takes_what_beer_and_lambert_say(make: Any, name: str) -> None:
+    """Fog that scatters nothing weakens the lit wall by exp(−σ × the way in fog), source to wall to lens.
+
+    The camera stands in it, before it, or the source does: what Mitsuba leaves out silently where a sensor does
+    not name its medium. Expected: pixels away from the edges of the fog's shadow to 0.5 %, the mean to 0.1 %.
+    """
+    region, low_m, high_m = REGIONS[name]
+    source_m = np.array([2.0, 0.5, 1.0])
+    scene = make(
+        _document(
+            {"c": _camera(64, 48)}, {"r": _source(tuple(source_m.tolist()), 0.002)}, samples=256, max_depth=2,
+            materials=PAINT, shapes=WALL,
+            fog={"extinction": "0.7 /m", "albedo": 0.0, "phase": {"type": "henyey_greenstein", "g": 0.85}, **region},
+        )
+    )  # fmt: skip
+    rays = _rays(64, 48)
+    clear, points_m = _lit_wall(source_m, rays)
+    inside = [
+        _length_inside_m(
+            np.broadcast_to(start_m, points_m.shape), points_m, np.array(low_m), np.array(high_m)
+        )
+        for start_m in (np.zeros(3), source_m)
+    ]
+    expected = clear * np.exp(-0.7 * (inside[0] + inside[1]))
+    radiance = _radiance(scene)[0]
+    assert radiance.mean() == pytest.approx(expected.mean(), rel=0.001)
+    np.testing.assert_allclose(radiance, expected, rtol=0.005)
+
+
+def _dark(scene: Scene) -> bool:
+    return bool((_radiance(scene) == 0.0).all())
+
+
+def test_a_black_wall_gives_nothing_back(make: Any) -> None:
+    """One black wall that fills the view, and a white one behind the camera which it must not show."""
+    shapes = {**WALL, "behind": _rectangle((-1, 0, 0), (4, 4), (1, 0, 0), "white")}
+    materials = {
+        "paint": {"type": "diffuse", "reflectance": 0.0},
+        "white": {"type": "diffuse", "reflectance": 0.9},
+    }
+    document = _document(
+        {"c": _camera(16, 12)}, {"r": _source((1.0, 0.2, 0.9), 0.01)}, samples=64, max_depth=8, materials=materials,
+        shapes=shapes,
+    )  # fmt: skip
+    assert _dark(make(document))
+
+
+def test_a_source_in_a_closed_box_lights_nothing_outside(make: Any) -> None:
+    """And opening one side lets light out, so that the darkness is the box's doing."""
+    sides = {
+        side: _rectangle(
+            tuple(2.0 * (axis == 0) + 0.25 * n for axis, n in enumerate(normal)), (0.5, 0.5), tuple(-n for n in normal), "paint"
+        )
+        for side, normal in SIDES.items()
+    }  # fmt: skip
+    document = _document(
+        {"c": _camera(32, 24)}, {"r": _source((2.0, 0.0, 0.0), 0.01)}, samples=256, max_depth=8, materials=PAINT,
+        shapes={**WALL, **sides},
+    )  # fmt: skip
+    assert _dark(make(document))
+    del document["shapes"]["left"]
+    assert _radiance(make(document))[0].mean() > 1e-4
+
+
+def test_a_source_within_a_solid_box_lights_nothing_outside(make: Any) -> None:
+    crate = {"type": "box", "center": "[2, 0, 0] m", "size": "[0.5, 0.5, 0.5] m", "material": "paint"}
+    document = _document(
+        {"c": _camera(32, 24)}, {"r": _source((2.0, 0.0, 0.0), 0.01)}, samples=256, max_depth=8, materials=PAINT,
+        shapes={**WALL, "crate": crate},
+    )  # fmt: skip
+    assert _dark(make(document))
+
+
+@pytest.mark.parametrize("fog", [{}, {"fog": {"extinction": "0.2 /m", "albedo": 1.0}}])
+def test_nothing_shines_in_an_empty_world_but_fog(make: Any, fog: dict[str, Any]) -> None:
+    """A source with nothing around it has no indirect light; in fog it has, at most what it sends."""
+    document = _document(
+        {"c": _camera(32, 24)}, {"r": _source((2.0, 0.1, 0.0), 0.01)}, samples=256, max_depth=64, **fog
+    )
+    light = render(make(document), "eye.c", seed=1)
+    if not fog:
+        assert light.indirect is None
+        return
+    assert light.indirect is not None
+    radiance = light.indirect.radiance_per_w[0, 0].astype(float)
+    assert np.isfinite(radiance).all()
+    assert radiance.min() >= 0.0
+    solid_angle_sr = _rays(32, 24)[..., 0] ** 3 / FOCAL_PX**2
+    assert 0.0 < (radiance * solid_angle_sr).sum() < 1.0 / (4.0 * math.pi * 4.01)
