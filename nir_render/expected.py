@@ -81,17 +81,14 @@ def group_electrons(mean: Expected, scene: Scene, group: int) -> NDArray[np.floa
     return blur(camera, _diffuse(mean.light, scene, per_w, only, mean.exposure_s))
 
 
-def emitters(light: Light, scene: Scene) -> list[Emitter]:
+def _emitters(light: Light, scene: Scene) -> list[Emitter]:
     """Return what each group of a light is."""
-    known: dict[str, Emitter] = {name: source for name, (_, source) in scene.sources().items()}
-    known |= {f"lamps.{name}": lamp for name, lamp in scene.document.lamps.items()}
-    if scene.document.sun is not None:
-        known["sun"] = scene.document.sun
+    known = scene.emitters()
     return [known[name] for name in light.groups]
 
 
 def _fluxes(light: Light, scene: Scene) -> NDArray[np.float64]:
-    return np.array([emission_units(emitter) for emitter in emitters(light, scene)])
+    return np.array([emission_units(emitter) for emitter in _emitters(light, scene)])
 
 
 def _spectrum_key(emitter: Emitter) -> Hashable:
@@ -131,7 +128,7 @@ def _by_spectrum(
 ) -> list[tuple[Emitter, NDArray[np.float64]]]:
     """Return weighted sums of arrays, shape (group, node, row, column), over the groups of each spectrum."""
     sums: dict[Hashable, tuple[Emitter, NDArray[np.float64]]] = {}
-    for group, emitter in enumerate(emitters(light, scene)):
+    for group, emitter in enumerate(_emitters(light, scene)):
         if weights[group] == 0.0:
             continue
         key = _spectrum_key(emitter)
@@ -142,7 +139,7 @@ def _by_spectrum(
 
 def _windows(light: Light, scene: Scene, camera: Camera, exposure_s: float) -> list[Window]:
     """Return the expected electrons of each row of the direct table."""
-    known = emitters(light, scene)
+    known = _emitters(light, scene)
     table = light.direct
     windows = []
     for row, group in enumerate(table.group):

@@ -14,6 +14,7 @@ from nir_render.scene.base import merge, read_yaml, without_alternatives
 from nir_render.scene.checks import check
 from nir_render.scene.devices import Camera, Source
 from nir_render.scene.document import Robot, SceneDocument
+from nir_render.scene.world import Lamp, Sun
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,12 @@ class Scene:
             for name, robot in self.document.robots.items()
             for source_name, source in robot.rig.sources.items()
         }
+
+    def emitters(self) -> dict[str, Source | Lamp | Sun]:
+        """Return what each light group is, by name: `robot.source`, then `lamps.name`, then `sun`."""
+        known: dict[str, Source | Lamp | Sun] = {name: source for name, (_, source) in self.sources().items()}
+        known |= {f"lamps.{name}": lamp for name, lamp in self.document.lamps.items()}
+        return known if self.document.sun is None else known | {"sun": self.document.sun}
 
     def calibration(self, camera: str) -> Any:
         """Return what perception may know about a camera, a `perception.Calibration`, exact."""

@@ -33,8 +33,7 @@ SUN_RADIUS_RAD = Sun.angular_radius_rad
 
 def groups(scene: Scene) -> tuple[str, ...]:
     """Return the light groups: each source, `robot.source`, each lamp, `lamps.name`, then `sun`."""
-    sun = () if scene.document.sun is None else ("sun",)
-    return (*scene.sources(), *(f"lamps.{name}" for name in scene.document.lamps), *sun)
+    return tuple(scene.emitters())
 
 
 def sun_direction(sun: Sun) -> NDArray[np.float64]:

@@ -18,6 +18,13 @@ pytestmark = pytest.mark.mitsuba
 
 Array = NDArray[np.float64]
 
+
+@pytest.fixture(autouse=True)
+def _needs_llvm() -> None:
+    if not backend().vectorised:
+        pytest.skip("without LLVM light groups are rendered by Mitsuba's own path tracer")
+
+
 FOCAL_PX = 80.0
 SPECTRUM = {"gaussian": {"centroid": "940 nm", "fwhm": "42 nm"}}
 

@@ -18,6 +18,13 @@ pytestmark = pytest.mark.mitsuba
 
 Array = NDArray[np.float64]
 
+
+@pytest.fixture(autouse=True)
+def _needs_llvm() -> None:
+    if not backend().vectorised:
+        pytest.skip("without LLVM light groups are rendered by Mitsuba's own path tracer")
+
+
 SEEDS = 64
 TILE_PX = 16
 
@@ -78,8 +85,6 @@ np.savez(case["out"], radiance=light.indirect.radiance_per_w, variance=light.ind
 @pytest.mark.parametrize("room", ["diffuse room", pytest.param("thin fog", marks=pytest.mark.verify)])
 def test_one_thread_and_two_give_the_same_bits(room: str, tmp_path: Path) -> None:
     """In processes of their own, as a worker would."""
-    if not backend().vectorised:
-        pytest.skip("the scalar variants know nothing of Dr.Jit's threads")
     scene = tmp_path / "room.yaml"
     scene.write_text(yaml.safe_dump(plain(room), sort_keys=False))
     arrays = []

@@ -21,10 +21,14 @@ _SMALL_SR = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """A ray towards a light: unit direction, length, density per sr of having been drawn, and the radiance."""
+    """A ray towards a light: unit direction, length, density per sr of having been drawn, and the radiance.
+
+    Shadow rays stop short of its end by `gap`: float32 places the surface of a small far sphere no better.
+    """
 
     direction: Any
     reach: Any
+    gap: Any
     density: Any
     radiance: Any
 
@@ -79,7 +83,11 @@ def aim(lights: Lights, row: Any, place: Any, u: Any, v: Any, active: Any) -> Ai
             dr.select(kind == SUN, new, old)
             for new, old in zip(other, (direction, reach, density), strict=True)
         )
-    return Aim(direction, reach, density, radiance)
+    gap = reach * SHORTER
+    if lights.has_spheres:
+        radius = dr.gather(mi.Float, lights.radius, row, active)
+        gap = dr.select(radius > 0.0, reach * 1e-3 + radius, gap)
+    return Aim(direction, reach, gap, density, radiance)
 
 
 def density_of(lights: Lights, row: Any, place: Any, direction: Any, active: Any) -> Any:
@@ -231,8 +239,7 @@ def _aim_at_sphere(lights: Lights, row: Any, place: Any, u: Any, v: Any, active:
     sine2 = versine * (2.0 - versine)
     direction = _around(to / distance, dr.safe_sqrt(sine2), versine, v)
     reach = distance * (1.0 - versine) - dr.safe_sqrt(radius * radius - distance2 * sine2)
-    # Short of the sphere's own surface, which float32 does not place better where a ray grazes it.
-    return direction, reach - 0.02 * radius, dr.rcp(2.0 * dr.pi * whole)
+    return direction, reach, dr.rcp(2.0 * dr.pi * whole)
 
 
 def _aim_at_sun(lights: Lights, row: Any, u: Any, v: Any, active: Any) -> tuple[Any, Any, Any]:

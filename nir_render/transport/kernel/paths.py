@@ -206,9 +206,9 @@ def _step(
     seen = surface & (brought > 0.0) & dr.isfinite(brought)
     shadow = si.spawn_ray(aim.direction)
     # Mitsuba lifts a ray's origin off the surface, up to 1e-4 of the coordinates; it aims at the same point.
-    to = aim.direction * aim.reach - (shadow.o - si.p)
+    to = aim.direction * (aim.reach - aim.gap) - (shadow.o - si.p)
     reach = dr.norm(to)
-    lifted = replace(aim, direction=to / reach, reach=reach)
+    lifted = replace(aim, direction=to / reach, reach=reach + aim.gap)
     arriving = _arriving(world, row, shadow.o, lifted, state.depth, max_depth, seen)
     add(brought * arriving, row, seen & (arriving > 0.0))
 
@@ -433,10 +433,11 @@ def _arriving(
             further = foggy.transmittance(world.fog, second.place, second.direction, rest)
             factor = dr.select(shown, factor * further, factor)
         active = active & ((stretches < max_depth) & (factor > 0.0))
-        active = active & (~(shown & _hidden(world, second.place, second.direction, rest, active & shown)))
+        active = active & (~(shown & _hidden(world, second.place, second.direction, rest - aim.gap, active & shown)))
     else:
         active = active & ((stretches < max_depth) & (factor > 0.0))
-    active = active & (~_hidden(world, origin, aim.direction, reach, active))
+    end = dr.select(shown, reach * (1.0 - connect.SHORTER), reach - aim.gap)
+    active = active & ~_hidden(world, origin, aim.direction, end, active)
     factor = factor * (
         connect.emission(lights, dr.gather(mi.UInt32, lights.group, row, active), leaving, active)
     )
@@ -446,7 +447,7 @@ def _arriving(
 def _hidden(world: World, origin: Any, direction: Any, reach: Any, active: Any) -> Any:
     mi = backend().mi
     ray = mi.Ray3f(origin, direction)
-    ray.maxt = reach * (1.0 - connect.SHORTER)
+    ray.maxt = reach
     return world.opaque.ray_test(ray, coherent=mi.Bool(False), active=active)
 
 
