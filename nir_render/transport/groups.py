@@ -57,7 +57,13 @@ def rays_of(camera: Camera, pose: Pose) -> Rays:
 
 
 def indirect(
-    scene: Scene, rays: Rays, time_s: float, seed: int, power: NDArray[np.float64], values_at_once: int = _VALUES_AT_ONCE
+    scene: Scene,
+    rays: Rays,
+    time_s: float,
+    seed: int,
+    power: NDArray[np.float64],
+    samples: NDArray[np.int64] | int | None = None,
+    values_at_once: int = _VALUES_AT_ONCE,
 ) -> Indirect | None:
     """Return the indirect light of all groups, or None where nothing reflects or scatters and no lamp shines.
 
@@ -70,32 +76,35 @@ def indirect(
     power
         What a unit of each group's emission counts when a light is chosen, shape (groups,). It moves only
         noise from one group to another.
+    samples
+        Samples in each pixel of the film, powers of two, shape (rows, columns) / scale, or one for all; without,
+        the scene's.
     values_at_once
         Float32 numbers that one launch may fill.
     """
     if not scene.document.has_indirect_light():
         return None
     settings = scene.document.render.indirect
-    built = _world(scene, time_s, power)
+    built = world_on_device(scene, time_s, power)
     groups = len(world.groups(scene))
-    batches = min(BATCHES, settings.samples)
-    rows, columns = (count - 1 for count in rays.corners.shape[:2])
-    pixels = (rows // settings.scale) * (columns // settings.scale)
-    part = int(np.clip(values_at_once // (groups * batches), 1, pixels))
-    radiance = _array((groups, pixels))
-    variance = _array((groups, pixels))
-    for first in range(0, pixels, part):
-        count = min(part, pixels - first)
-        film = _film(rays, settings.scale, first, count)
-        mean, spread = _part(built, film, seed, groups, batches, settings.samples // batches, settings.max_depth)
-        radiance[:, first : first + count] = mean
-        variance[:, first : first + count] = spread
-    shape = (groups, 1, rows // settings.scale, columns // settings.scale)
+    shape = tuple((count - 1) // settings.scale for count in rays.corners.shape[:2])
+    counts = np.broadcast_to(settings.samples if samples is None else samples, shape).ravel()
+    radiance, variance = (_array((groups, counts.size)) for _ in range(2))
+    for count in np.unique(counts):
+        pixels = np.flatnonzero(counts == count)
+        batches = min(BATCHES, int(count))
+        part = int(np.clip(values_at_once // (groups * batches), 1, pixels.size))
+        for first in range(0, pixels.size, part):
+            some = pixels[first : first + part]
+            film = film_on_device(rays, settings.scale, some)
+            radiance[:, some], variance[:, some] = estimate(
+                built, film, seed, groups, int(count), settings.max_depth
+            )
     return Indirect(
-        radiance_per_w=radiance.reshape(shape),
-        variance=variance.reshape(shape),
+        radiance_per_w=radiance.reshape(groups, 1, *shape),
+        variance=variance.reshape(groups, 1, *shape),
         scale=settings.scale,
-        samples=settings.samples,
+        samples=int(np.median(counts)),
     )
 
 
@@ -105,16 +114,20 @@ def light_seed(*key: object) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
-def _part(
-    built: World, film: Film, seed: int, groups: int, batches: int, samples: int, max_depth: int
+def estimate(
+    built: World, film: Film, seed: int, groups: int, samples: int, max_depth: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return mean and variance of the mean for a part of the film, shape (groups, pixels)."""
+    """Return radiance per unit of each group in some pixels, and the variance of it, shape (groups, pixels).
+
+    The samples make up to 8 batches, independent of each other; the variance is that of their mean.
+    """
     mi, dr = backend().mi, backend().dr
-    pixels = film.pixel_count
-    lanes = pixels * batches
+    batches = min(BATCHES, samples)
+    pixels, lanes = film.pixel_count, film.pixel_count * batches
     lane = dr.arange(mi.UInt32, lanes)
-    draw = draws(film.first_pixel + lane % film.pixels, lane // film.pixels, seed, dr.opaque(mi.UInt32, samples))
-    sums = walk(built, film, draw, lanes, groups, dr.opaque(mi.UInt32, max_depth))
+    pixel = dr.gather(mi.UInt32, film.index, lane % film.pixels)
+    draw = draws(pixel, lane // film.pixels, seed, dr.opaque(mi.UInt32, samples // batches))
+    sums = walk(built, film, pixel, draw, lanes, groups, dr.opaque(mi.UInt32, max_depth))
     place = dr.arange(mi.UInt32, groups * pixels)
     group = place // film.pixels
     first = group * dr.opaque(mi.UInt32, lanes) + (place - group * film.pixels)
@@ -126,24 +139,25 @@ def _part(
     square = sum((dr.square(one - mean) for one in estimates), mi.Float(0))
     variance = square / max(batches * (batches - 1), 1)
     dr.eval(mean, variance)
-    return tuple(np.array(array).reshape(groups, pixels) for array in (mean, variance))
+    return np.array(mean).reshape(groups, pixels), np.array(variance).reshape(groups, pixels)
 
 
-def _film(rays: Rays, scale: int, first: int, count: int) -> Film:
+def film_on_device(rays: Rays, scale: int, pixels: NDArray[np.int64]) -> Film:
+    """Bring some pixels, numbered row by row, of a film of scale × scale sensor pixels each to the device."""
     mi, dr = backend().mi, backend().dr
     return Film(
         origin=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in rays.origin_m)),
         corners=mi.Float(rays.corners.astype(np.float32).ravel()),
         columns=dr.opaque(mi.UInt32, rays.corners.shape[1] - 1),
         scale=dr.opaque(mi.UInt32, scale),
-        first_pixel=dr.opaque(mi.UInt32, first),
-        pixels=dr.opaque(mi.UInt32, count),
-        pixel_count=count,
+        index=mi.UInt32(pixels.astype(np.uint32)),
+        pixels=dr.opaque(mi.UInt32, pixels.size),
+        pixel_count=pixels.size,
     )
 
 
-def _world(scene: Scene, time_s: float, power: NDArray[np.float64]) -> World:
-    """Bring a scene to the device."""
+def world_on_device(scene: Scene, time_s: float, power: NDArray[np.float64]) -> World:
+    """Bring a scene at a time to the device; `power` as for `indirect`."""
     bodies = world.build(scene, time_s)
     flat = facets(scene)
     shining = emitters(scene, time_s, flat)

@@ -59,7 +59,9 @@ def guide(emitters: Emitters, facets: Facets, power: Array, low_m: Array, high_m
     axes = [low_m[k] + step_m[k] * (np.arange(counts[k]) + 0.5) for k in range(3)]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     places_m = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-    weight = np.stack([_brought(emitters, facets, row, places_m, step_m) for row in range(len(emitters.kind))])
+    weight = np.stack(
+        [_brought(emitters, facets, row, places_m, step_m) for row in range(len(emitters.kind))]
+    )
     weight = (weight * power[emitters.group][:, None]).T
     total = weight.sum(axis=1, keepdims=True)
     even = 1.0 / len(emitters.kind)

@@ -47,14 +47,15 @@ class Film:
     """The rays of a camera and the part of its film to fill.
 
     `corners` holds directions at the corners of the sensor's pixels, `columns` + 1 to a row; a pixel of the
-    film is `scale` × `scale` of these. `pixels` is how many lanes one batch has, from `first_pixel` on.
+    film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels` and
+    `pixel_count` how many.
     """
 
     origin: Any
     corners: Any
     columns: Any
     scale: Any
-    first_pixel: Any
+    index: Any
     pixels: Any
     pixel_count: int
 
@@ -77,11 +78,15 @@ class _State:
     active: Any
 
 
-def walk(world: World, film: Film, draw: use.Draws, lanes: int, groups: int, max_depth: Any) -> Any:
+def walk(
+    world: World, film: Film, pixel: Any, draw: use.Draws, lanes: int, groups: int, max_depth: Any
+) -> Any:
     """Return the sum over a batch's samples of each pixel's radiance per unit of each group's emission.
 
     Parameters
     ----------
+    pixel
+        Number of each lane's pixel.
     lanes
         Batches × pixels; a batch's pixels lie together.
     max_depth
@@ -93,7 +98,6 @@ def walk(world: World, film: Film, draw: use.Draws, lanes: int, groups: int, max
     """
     mi, dr = backend().mi, backend().dr
     lane = dr.arange(mi.UInt32, lanes)
-    pixel = film.first_pixel + lane % film.pixels
     out = dr.zeros(mi.Float, groups * lanes)
     stride = dr.opaque(mi.UInt32, lanes)
 
@@ -433,7 +437,9 @@ def _arriving(
             further = foggy.transmittance(world.fog, second.place, second.direction, rest)
             factor = dr.select(shown, factor * further, factor)
         active = active & ((stretches < max_depth) & (factor > 0.0))
-        active = active & (~(shown & _hidden(world, second.place, second.direction, rest - aim.gap, active & shown)))
+        active = active & (
+            ~(shown & _hidden(world, second.place, second.direction, rest - aim.gap, active & shown))
+        )
     else:
         active = active & ((stretches < max_depth) & (factor > 0.0))
     end = dr.select(shown, reach * (1.0 - connect.SHORTER), reach - aim.gap)
