@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.apertures import Aperture, flare_aperture
 from nir_render.camera.emission import Emitter, emission_units
 from nir_render.camera.exposure import Beam, beam_window, blur, diffuse_electrons
 from nir_render.camera.psf import Window
@@ -32,6 +33,8 @@ class Expected:
         The part of it that each row of the light's direct table brings.
     render_noise_share
         Variance of the Monte Carlo render over the sensor's own temporal variance, median over the frame.
+    aperture_noise_share
+        The same of the sum over a flare's aperture, the largest of all flares; 0 where none is seen.
     """
 
     light: Light
@@ -39,6 +42,7 @@ class Expected:
     electrons: NDArray[np.float64]
     windows: tuple[Window, ...]
     render_noise_share: float
+    aperture_noise_share: float = 0.0
 
 
 def expected_electrons(light: Light, scene: Scene, exposure_s: float | None = None) -> NDArray[np.float64]:
@@ -57,7 +61,7 @@ def expected(light: Light, scene: Scene, exposure_s: float) -> Expected:
     _, camera = scene.camera(light.camera)
     electrons = np.zeros((camera.sensor.rows, camera.sensor.columns))
     flux = _fluxes(light, scene)
-    share = 0.0
+    share = aperture_share = 0.0
     if light.indirect is not None:
         electrons += blur(camera, _diffuse(light, scene, light.indirect.radiance_per_w, flux, exposure_s))
     windows = tuple(_windows(light, scene, camera, exposure_s))
@@ -66,8 +70,41 @@ def expected(light: Light, scene: Scene, exposure_s: float) -> Expected:
     electrons = np.maximum(electrons, 0.0)
     if light.indirect is not None:
         noise_e2 = _render_variance(light, light.indirect, scene, flux, exposure_s)
-        share = float(np.median(noise_e2 / (electrons + camera.sensor.read_noise_e**2 + _TINY_E2)))
-    return Expected(light, exposure_s, electrons, windows, share)
+        temporal_e2 = electrons + camera.sensor.read_noise_e**2 + _TINY_E2
+        share = float(np.median(noise_e2 / temporal_e2))
+        shares = aperture_shares(flare_apertures(light, camera), noise_e2, temporal_e2, light.indirect.scale)
+        aperture_share = float(shares.max(initial=0.0))
+    return Expected(light, exposure_s, electrons, windows, share, aperture_share)
+
+
+def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
+    """Return the apertures of what the direct table shows in the frame: sources, the sun, and their ghosts."""
+    table = light.direct
+    shown = (
+        flare_aperture(camera, table.direction[row], float(table.angular_radius_rad[row]))
+        for row in np.flatnonzero(table.irradiance_per_w[:, 0] > 0.0)
+    )
+    return [aperture for aperture in shown if aperture is not None]
+
+
+def aperture_shares(
+    apertures: list[Aperture], noise_e2: NDArray[np.float64], temporal_e2: NDArray[np.float64], scale: int
+) -> NDArray[np.float64]:
+    """Return the share of render noise in the sum over each aperture, shape (apertures,).
+
+    A sum over pixels has the sum of their temporal variances. The blur moves render noise to neighbours and
+    keeps its sum; and scale × scale pixels come from one of the film's, so their noise is the same: the sum
+    over many of these has scale² times the sum of the variances. Both arrays have shape (rows, columns).
+    """
+    return np.array([scale**2 * one.sum(noise_e2) / one.sum(temporal_e2) for one in apertures])
+
+
+def render_variance_e2(light: Light, scene: Scene, exposure_s: float) -> NDArray[np.float64]:
+    """Return the variance per pixel that rendering adds, the blur's averaging left out, (rows, columns)."""
+    _, camera = scene.camera(light.camera)
+    if light.indirect is None:
+        return np.zeros((camera.sensor.rows, camera.sensor.columns))
+    return _render_variance(light, light.indirect, scene, _fluxes(light, scene), exposure_s)
 
 
 def group_electrons(mean: Expected, scene: Scene, group: int) -> NDArray[np.float64]:

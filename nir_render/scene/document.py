@@ -9,8 +9,11 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from nir_render.scene.base import Document, expand_preset, preset_names
 from nir_render.scene.devices import Name, NotNegative, Orientation, Positive, Rig
 from nir_render.scene.fog import Fog
+from nir_render.scene.noise import NoiseTarget
 from nir_render.scene.units import Frequency, Position, Time
 from nir_render.scene.world import Diffuse, Lamp, MaterialDocument, ShapeDocument, Sun
+
+DEFAULT_NOISE = 0.05
 
 
 class Waypoint(Document):
@@ -52,16 +55,19 @@ class Clock(Document):
 
 
 class IndirectSettings(Document):
-    """How finely light by way of walls and lamps is sampled: pixels of scale × scale, samples in each."""
+    """How finely light by way of walls and lamps is sampled: pixels of scale × scale, samples in each.
+
+    Without `samples` the render settings' `noise` says how many each pixel gets.
+    """
 
     scale: Annotated[int, Field(ge=1, le=16)] = 2
-    samples: Annotated[int, Field(ge=4, le=65536)] = 16
+    samples: Annotated[int, Field(ge=4, le=65536)] | None = None
     max_depth: Annotated[int, Field(ge=2, le=64)] = 8
 
     @field_validator("samples")
     @classmethod
-    def _power_of_two(cls, samples: int) -> int:
-        if samples & (samples - 1):
+    def _power_of_two(cls, samples: int | None) -> int | None:
+        if samples is not None and samples & (samples - 1):
             raise ValueError(
                 f"{samples} is no power of two: only these render to the same bits on any machine"
             )
@@ -69,10 +75,26 @@ class IndirectSettings(Document):
 
 
 class RenderSettings(Document):
-    """How finely the transport of light is sampled."""
+    """How finely the transport of light is sampled.
 
+    `noise` is the target: the variance that rendering may add, as a share of shot and read noise; 5 % unless
+    `indirect.samples` fixes a count, then None.
+    """
+
+    noise: NoiseTarget | None = None
     indirect: IndirectSettings = IndirectSettings()
     visibility_rays: Annotated[int, Field(ge=16, le=65536)] = 1024
+
+    @model_validator(mode="after")
+    def _target_or_count(self) -> Self:
+        if self.noise is not None and self.indirect.samples is not None:
+            raise ValueError(
+                "'noise' is a target, 'indirect.samples' a fixed count: write one of them, "
+                "or set the other to null"
+            )
+        if self.noise is None and self.indirect.samples is None:
+            object.__setattr__(self, "noise", DEFAULT_NOISE)
+        return self
 
 
 class SceneDocument(Document):

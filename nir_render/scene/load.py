@@ -16,6 +16,9 @@ from nir_render.scene.devices import Camera, Source
 from nir_render.scene.document import Robot, SceneDocument
 from nir_render.scene.world import Lamp, Sun
 
+# Two ways to say how finely to sample; a change that writes one takes the other away.
+_RIVALS = ("render.noise", "render.indirect.samples")
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -122,6 +125,21 @@ def apply_overrides(raw: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
                 f"known: {', '.join(SceneDocument.model_fields)}"
             )
         changed = _set(changed, keys, value, path)
+    return _without_rivals(changed, overrides)
+
+
+def _without_rivals(changed: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Drop the fixed count of samples where a target for the noise has been set, and the other way round."""
+    set_now = {path for path in _RIVALS if overrides.get(path) is not None}
+    if len(set_now) != 1:
+        return changed
+    (rival,) = set(_RIVALS) - set_now
+    *way, last = rival.split(".")
+    node: Any = changed
+    for key in way:
+        node = node.get(key) if isinstance(node, dict) else None
+    if isinstance(node, dict):
+        node.pop(last, None)  # `_set` has copied all on the way to the other one; the rest is a deep copy
     return changed
 
 

@@ -23,13 +23,17 @@ from nir_render.transport.emitters import emitters
 from nir_render.transport.facets import PANE, Facets, facets
 from nir_render.transport.guide import guide
 from nir_render.transport.kernel.draws import draws
-from nir_render.transport.kernel.paths import Film, World, walk
-from nir_render.transport.kernel.tables import upload_fog, upload_guide, upload_lights, upload_surfaces
+from nir_render.transport.kernel.paths import Film, walk
+from nir_render.transport.kernel.tables import World, upload_fog, upload_guide, upload_lights, upload_surfaces
 from nir_render.transport.light import Indirect
 from nir_render.transport.medium import medium
 from nir_render.transport.pattern import pattern_of
 
 BATCHES = 8
+DEFAULT_SAMPLES = 16
+PILOT_SAMPLES = 16
+_PILOT_STEP = 4
+_PILOT_PIXELS = 1200
 _VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
 _MAPPED_FROM_BYTES = 2**30  # larger arrays lie in a file that the system may page out
 
@@ -85,27 +89,78 @@ def indirect(
     if not scene.document.has_indirect_light():
         return None
     settings = scene.document.render.indirect
+    shape = film_shape(rays, settings.scale)
+    if samples is None:
+        samples = settings.samples or DEFAULT_SAMPLES
+    counts = np.broadcast_to(samples, shape)
+    every = np.arange(counts.size)
+    radiance, variance = _pixels(scene, rays, time_s, seed, power, every, counts.ravel(), values_at_once)
+    return Indirect(
+        radiance_per_w=radiance.reshape(-1, 1, *shape),
+        variance=variance.reshape(-1, 1, *shape),
+        scale=settings.scale,
+        samples=int(np.median(counts)),
+        counts=None if (counts == counts.flat[0]).all() else counts.astype(np.int32),
+    )
+
+
+def pilot(
+    scene: Scene, rays: Rays, time_s: float, seed: int, power: NDArray[np.float64]
+) -> Indirect | None:
+    """Return a few samples in some pixels of the film, every fourth along each axis: what noise there is.
+
+    A small film's are closer, so that there are a thousand. The arguments are those of `indirect`.
+    """
+    if not scene.document.has_indirect_light():
+        return None
+    scale = scene.document.render.indirect.scale
+    rows, columns = film_shape(rays, scale)
+    step = int(np.clip((rows * columns / _PILOT_PIXELS) ** 0.5, 1, _PILOT_STEP))
+    row, column = (_middles(count, step) for count in (rows, columns))
+    chosen = (row[:, None] * columns + column).ravel()
+    counts = np.full(chosen.size, PILOT_SAMPLES)
+    radiance, variance = _pixels(scene, rays, time_s, seed, power, chosen, counts, _VALUES_AT_ONCE)
+    shape = (-1, 1, row.size, column.size)
+    return Indirect(radiance.reshape(shape), variance.reshape(shape), scale * step, PILOT_SAMPLES)
+
+
+def film_shape(rays: Rays, scale: int) -> tuple[int, int]:
+    """Return rows and columns of a film of scale × scale sensor pixels each."""
+    return (rays.corners.shape[0] - 1) // scale, (rays.corners.shape[1] - 1) // scale
+
+
+def _middles(count: int, step: int) -> NDArray[np.int64]:
+    """Return the middles of equal parts of an axis of so many pixels, each part at most a step long."""
+    parts = -(-count // step)
+    return ((2 * np.arange(parts) + 1) * count) // (2 * parts)
+
+
+def _pixels(
+    scene: Scene,
+    rays: Rays,
+    time_s: float,
+    seed: int,
+    power: NDArray[np.float64],
+    chosen: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    values_at_once: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return radiance per unit of each group and its variance in some pixels of the film, (groups, pixels)."""
+    settings = scene.document.render.indirect
     built = world_on_device(scene, time_s, power)
     groups = len(world.groups(scene))
-    shape = tuple((count - 1) // settings.scale for count in rays.corners.shape[:2])
-    counts = np.broadcast_to(settings.samples if samples is None else samples, shape).ravel()
-    radiance, variance = (_array((groups, counts.size)) for _ in range(2))
+    radiance, variance = (_array((groups, chosen.size)) for _ in range(2))
     for count in np.unique(counts):
-        pixels = np.flatnonzero(counts == count)
+        places = np.flatnonzero(counts == count)
         batches = min(BATCHES, int(count))
-        part = int(np.clip(values_at_once // (groups * batches), 1, pixels.size))
-        for first in range(0, pixels.size, part):
-            some = pixels[first : first + part]
-            film = film_on_device(rays, settings.scale, some)
+        part = int(np.clip(values_at_once // (groups * batches), 1, places.size))
+        for first in range(0, places.size, part):
+            some = places[first : first + part]
+            film = film_on_device(rays, settings.scale, chosen[some])
             radiance[:, some], variance[:, some] = estimate(
                 built, film, seed, groups, int(count), settings.max_depth
             )
-    return Indirect(
-        radiance_per_w=radiance.reshape(groups, 1, *shape),
-        variance=variance.reshape(groups, 1, *shape),
-        scale=settings.scale,
-        samples=int(np.median(counts)),
-    )
+    return radiance, variance
 
 
 def light_seed(*key: object) -> int:
@@ -176,7 +231,9 @@ def world_on_device(scene: Scene, time_s: float, power: NDArray[np.float64]) -> 
         opaque=world.build(scene, time_s, panes=False) if panes else bodies,
         lights=upload_lights(shining, power, patterns, np.array(axes)),
         surfaces=upload_surfaces(flat, _shape_columns(scene, bodies, flat)),
-        choice=upload_guide(guide(shining, flat, power, low_m, high_m)),
+        choice=upload_guide(
+            guide(shining, flat, power, low_m, high_m, 0.0 if fog is None else fog.extinction_per_m)
+        ),
         fog=None if fog is None else upload_fog(fog),
     )
 

@@ -41,7 +41,14 @@ class Guide:
     chance: NDArray[np.float32]
 
 
-def guide(emitters: Emitters, facets: Facets, power: Array, low_m: Array, high_m: Array) -> Guide:
+def guide(
+    emitters: Emitters,
+    facets: Facets,
+    power: Array,
+    low_m: Array,
+    high_m: Array,
+    extinction_per_m: float = 0.0,
+) -> Guide:
     """Return the chances of all emitters in a box.
 
     Parameters
@@ -50,6 +57,8 @@ def guide(emitters: Emitters, facets: Facets, power: Array, low_m: Array, high_m
         What one unit of each light group's emission counts, shape (groups,).
     low_m, high_m
         Corners of the box that holds the scene's bodies, shape (3,).
+    extinction_per_m
+        Of fog, which dims what is far.
     """
     extent_m = np.maximum(high_m - low_m, 1e-3 * max(float(np.max(high_m - low_m)), 1e-3))
     cells = int(np.clip(_ENTRIES // len(emitters.kind), 1, _CELLS))
@@ -59,8 +68,9 @@ def guide(emitters: Emitters, facets: Facets, power: Array, low_m: Array, high_m
     axes = [low_m[k] + step_m[k] * (np.arange(counts[k]) + 0.5) for k in range(3)]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     places_m = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    rows = range(len(emitters.kind))
     weight = np.stack(
-        [_brought(emitters, facets, row, places_m, step_m) for row in range(len(emitters.kind))]
+        [_brought(emitters, facets, row, places_m, step_m, extinction_per_m) for row in rows]
     )
     weight = (weight * power[emitters.group][:, None]).T
     total = weight.sum(axis=1, keepdims=True)
@@ -74,7 +84,9 @@ def guide(emitters: Emitters, facets: Facets, power: Array, low_m: Array, high_m
     return Guide(low_m, step_m, counts, cumulative, cumulative - before)
 
 
-def _brought(emitters: Emitters, facets: Facets, row: int, places_m: Array, step_m: Array) -> Array:
+def _brought(
+    emitters: Emitters, facets: Facets, row: int, places_m: Array, step_m: Array, extinction_per_m: float
+) -> Array:
     """Return what one unit of an emitter brings to places if nothing hides it, roughly, shape (places,)."""
     spread2_m2 = float(step_m @ step_m) / 12.0  # mean square distance within a cell from its middle
     facet = int(emitters.facet[row])
@@ -87,7 +99,9 @@ def _brought(emitters: Emitters, facets: Facets, row: int, places_m: Array, step
         to_m = emitters.center_m[row] - places_m
         distance2_m2 = (to_m**2).sum(axis=1)
         direction = to_m / np.sqrt(np.maximum(distance2_m2, 1e-12))[:, None]
-        irradiance = 1.0 / (4.0 * np.pi * (distance2_m2 + spread2_m2))
+        irradiance = np.exp(-extinction_per_m * np.sqrt(distance2_m2)) / (
+            4.0 * np.pi * (distance2_m2 + spread2_m2)
+        )
         if kind == RECTANGLE:
             height_m = -(to_m @ emitters.normal[row])
             slack_m = 0.5 * float(np.abs(emitters.normal[row]) @ step_m)

@@ -65,13 +65,16 @@ class Indirect:
     scale
         Camera pixels per pixel of these arrays, along each axis.
     samples
-        Samples per pixel of these arrays.
+        Samples per pixel of these arrays; where they differ, their median.
+    counts
+        Samples in each pixel, shape (row, column); None where all have the same.
     """
 
     radiance_per_w: NDArray[np.float32]
     variance: NDArray[np.float32]
     scale: int
     samples: int
+    counts: NDArray[np.int32] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,13 @@ def transmittance(fog: FogTable, origin: Any, direction: Any, reach: Any) -> Any
     return dr.exp(-fog.extinction * dr.maximum(end - begin, 0.0))
 
 
+def absorbed(depth: Any) -> Any:
+    """Return 1 − exp(−depth), with its digits where the depth is small."""
+    dr = backend().dr
+    series = depth * (1.0 - depth * (0.5 - depth * (1.0 / 6.0 - depth / 24.0)))
+    return dr.select(depth < 0.05, series, 1.0 - dr.exp(-depth))
+
+
 def phase(fog: FogTable, versine: Any) -> Any:
     """Return the phase function, 1/sr, for a turn of which 1 − cos is given."""
     mi, dr = backend().mi, backend().dr
@@ -68,14 +75,23 @@ def arc(fog: FogTable, angle: Any) -> Any:
     return dr.lerp(dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1), share)
 
 
-def angle_of_arc(fog: FogTable, value: Any) -> tuple[Any, Any]:
-    """Return the angle up to which `arc` is `value`, and the slope of `arc` there."""
+def arc_slope(fog: FogTable, angle: Any) -> Any:
+    """Return the slope of `arc`, rad/sr per rad: what `angle_of_arc` draws by."""
+    mi, dr = backend().mi, backend().dr
+    cell = _cell(angle)
+    before, after = dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1)
+    low, high = dr.gather(mi.Float, fog.angle, cell), dr.gather(mi.Float, fog.angle, cell + 1)
+    return (after - before) / (high - low)
+
+
+def angle_of_arc(fog: FogTable, value: Any) -> Any:
+    """Return the angle up to which `arc` is `value`."""
     mi, dr = backend().mi, backend().dr
     cell = dr.binary_search(0, CELLS - 1, lambda k: dr.gather(mi.Float, fog.arc, k + 1) <= value)
     before, after = dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1)
     low, high = dr.gather(mi.Float, fog.angle, cell), dr.gather(mi.Float, fog.angle, cell + 1)
     share = dr.clip((value - before) / dr.maximum(after - before, 1e-20), 0.0, 1.0)
-    return dr.lerp(low, high, share), (after - before) / (high - low)
+    return dr.lerp(low, high, share)
 
 
 def _angle(versine: Any) -> Any:

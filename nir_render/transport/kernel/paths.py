@@ -14,32 +14,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from nir_render.transport.backend import backend
-from nir_render.transport.emitters import RECTANGLE, SUN
+from nir_render.transport.emitters import RECTANGLE
 from nir_render.transport.kernel import connect
 from nir_render.transport.kernel import draws as use
 from nir_render.transport.kernel import fog as foggy
-from nir_render.transport.kernel.tables import Choice, FogTable, Lights, Surfaces
+from nir_render.transport.kernel.arrive import arriving
+from nir_render.transport.kernel.scatter import scatter_on_the_way
+from nir_render.transport.kernel.tables import Surfaces, World
 
 # How a path came here since its last vertex that scatters evenly: straight on (through panes at most), by one
 # facet (its number), or by smooth surfaces that no image stands for.
 _STRAIGHT, _OTHERWISE = -1, -2
 _FAR = 1e15
 _ROULETTE_DEPTH = 2
-# Up to so many lights fog weighs each of them for each stretch; with more, the guide proposes so many.
-_WEIGHED_LIGHTS = 8
-_CANDIDATES = 4
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes."""
-
-    bodies: Any
-    opaque: Any
-    lights: Lights
-    surfaces: Surfaces
-    choice: Choice
-    fog: FogTable | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,17 +158,22 @@ def _step(
     # Fog: what it scatters on this stretch, how much it leaves of the light beyond, and whether the path itself
     # turns in it. What lies at the end of the stretch is asked for whether it turns or not, so that this choice
     # brings no noise into it.
-    turns, passing = mi.Bool(False), state.weight
+    turns, passing, turned_weight = mi.Bool(False), state.weight, mi.Float(0)
     turned_at, turned_to = mi.Point3f(0), mi.Vector3f(0, 0, 1)
     if world.fog is not None:
         reach = dr.select(met, si.t, _FAR)
         begin, end = foggy.interval(world.fog, state.origin, state.direction, reach)
         in_fog = state.active & ~state.inside & (end > begin)
-        _scatter_on_the_way(world, state, begin, end, in_fog & further, max_depth, number, add)
-        flight = begin - dr.log(1.0 - number(use.FLIGHT)) / world.fog.extinction
-        turns = in_fog & (flight < end)
-        passing = passing * (dr.select(in_fog, dr.exp(-world.fog.extinction * (end - begin)), 1.0))
-        turned_at = state.origin + state.direction * flight
+        distance, density = scatter_on_the_way(
+            world, state, begin, end, in_fog & further, max_depth, number, add
+        )
+        lost = foggy.absorbed(world.fog.extinction * (end - begin))
+        passing = dr.select(in_fog, state.weight * (1.0 - lost), state.weight)
+        # The path turns as often as light would on this stretch, but where the light was asked for: near lights.
+        turns = in_fog & further & (number(use.FLIGHT) < lost)
+        flown = world.fog.extinction * dr.exp(-world.fog.extinction * (distance - begin))
+        turned_weight = world.fog.albedo * flown / (density * lost)
+        turned_at = state.origin + state.direction * distance
         turned_to = foggy.turned(world.fog, state.direction, number(use.TURN_U), number(use.TURN_V))
 
     # Light that the path meets.
@@ -213,8 +205,8 @@ def _step(
     to = aim.direction * (aim.reach - aim.gap) - (shadow.o - si.p)
     reach = dr.norm(to)
     lifted = replace(aim, direction=to / reach, reach=reach + aim.gap)
-    arriving = _arriving(world, row, shadow.o, lifted, state.depth, max_depth, seen)
-    add(brought * arriving, row, seen & (arriving > 0.0))
+    share = arriving(world, row, shadow.o, lifted, state.depth, max_depth, seen)
+    add(brought * share, row, seen & (share > 0.0))
 
     # On to the next vertex.
     smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
@@ -231,10 +223,10 @@ def _step(
     onward = si.spawn_ray(si.to_world(sample.wo))
     surface = surface & (~turns)
     evenly = (surface & ~smooth) | turns
-    weight = state.weight * dr.select(turns, _albedo(world), sampled_weight[0])
+    weight = state.weight * dr.select(turns, turned_weight, sampled_weight[0])
     depth = state.depth + 1
     survival = dr.select(depth >= _ROULETTE_DEPTH, dr.minimum(weight, 0.95), 1.0)
-    goes_on = ((surface & (sampled_weight[0] > 0.0)) | (turns & further)) & (number(use.SURVIVAL) < survival)
+    goes_on = ((surface & (sampled_weight[0] > 0.0)) | turns) & (number(use.SURVIVAL) < survival)
     sample_next = state.sample + dr.select(goes_on, mi.UInt32(0), mi.UInt32(1))
     return _State(
         sample=sample_next,
@@ -251,210 +243,6 @@ def _step(
         inside=goes_on & dr.select(surface & glass, sample.wo.z < 0.0, state.inside),
         active=state.active & (sample_next < draw.samples),
     )
-
-
-def _scatter_on_the_way(
-    world: World, state: _State, begin: Any, end: Any, active: Any, max_depth: Any, number: Any, add: Any
-) -> None:
-    """Add the light of one light that fog on a stretch scatters into the path."""
-    mi, dr = backend().mi, backend().dr
-    fog = world.fog
-    assert fog is not None  # noqa: S101 (only called in fog)
-    row, chance = _light_for_stretch(world, state, begin, end, active, number(use.FOG_LIGHT))
-    distance, density = _place_on_stretch(world, row, state, begin, end, number(use.FOG_PLACE), active)
-    place = state.origin + state.direction * distance
-    aim = connect.aim(world.lights, row, place, number(use.FOG_U), number(use.FOG_V), active)
-    turn = 0.5 * dr.squared_norm(aim.direction - state.direction)
-    brought = (
-        state.weight * fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin))
-        * foggy.phase(fog, turn) * aim.radiance / (chance * density * aim.density)
-    )  # fmt: skip
-    seen = active & (brought > 0.0) & dr.isfinite(brought)
-    arriving = _arriving(world, row, place, aim, state.depth, max_depth, seen)
-    add(brought * arriving, row, seen & (arriving > 0.0))
-
-
-def _light_for_stretch(
-    world: World, state: _State, begin: Any, end: Any, active: Any, u: Any
-) -> tuple[Any, Any]:
-    """Return a light drawn by what it brings to the fog on a stretch, and the chance of it.
-
-    Without shadows and extinction that is power · ∫ p(β) / d² dt = power · (arc(β₁) − arc(β₀)) / D, with D the
-    ray's distance from the light. Few lights are all weighed by it. Of many, the guide proposes some for places
-    along the stretch, and one of these is taken by its weight (resampling, Talbot et al. 2005); the chance
-    returned is then the one that makes the estimate right on average.
-    """
-    mi, dr = backend().mi, backend().dr
-    fog, lights = world.fog, world.lights
-    few = lights.rows <= _WEIGHED_LIGHTS
-
-    def more(k: Any, *_rest: Any) -> Any:
-        return k < (lights.count if few else _CANDIDATES)
-
-    def weigh(k: Any, row: Any, mine: Any, total: Any, rest: Any) -> tuple[Any, ...]:
-        candidate, chance = (k, 1.0) if few else _candidate(world, state, begin, end, k, u)
-        weight = _brought_to_stretch(world, candidate, state, begin, end, active)
-        total = total + weight / chance
-        share = weight / (chance * total)
-        taken = rest < share
-        # The same number serves all the way: what is left of it is even again after each choice.
-        rest = dr.select(taken, rest / share, (rest - share) / dr.maximum(1.0 - share, 1e-9))
-        return (
-            k + 1, dr.select(taken, candidate, row), dr.select(taken, weight, mine), total,
-            dr.clip(rest, 0.0, 1.0),
-        )  # fmt: skip
-
-    zero = dr.zeros(mi.UInt32, dr.width(u))
-    nothing = dr.zeros(mi.Float, dr.width(u))
-    _, row, mine, total, _ = dr.while_loop(
-        (zero, mi.UInt32(zero), nothing, mi.Float(nothing), mi.Float(u)), more, weigh
-    )
-    return row, mine / total if few else _CANDIDATES * mine / total
-
-
-def _candidate(world: World, state: _State, begin: Any, end: Any, number: Any, u: Any) -> tuple[Any, Any]:
-    """Return a light that the guide draws at one of the places spread over a stretch, and its chance there."""
-    mi, dr = backend().mi, backend().dr
-    # Fractions of the one number, scaled up, stand for numbers of their own.
-    along = u * 1021.0 - dr.floor(u * 1021.0)
-    pick = u * 16381.0 + mi.Float(number) * 0.6180339887
-    pick = dr.minimum(pick - dr.floor(pick), 1.0 - 2.0**-24)
-    distance = _flight_within(world, begin, end, (mi.Float(number) + along) / _CANDIDATES)
-    cell = connect.cell_of(world.choice, state.origin + state.direction * distance)
-    return connect.choose(world.choice, world.lights, cell, pick)
-
-
-def _brought_to_stretch(world: World, row: Any, state: _State, begin: Any, end: Any, active: Any) -> Any:
-    """Return what a light brings to the fog on a stretch, towards its begin, if nothing hides or weakens it."""
-    mi, dr = backend().mi, backend().dr
-    fog, lights = world.fog, world.lights
-    assert fog is not None  # noqa: S101 (only called in fog)
-    _, off, low, high = _arcs(world, row, state, begin, end, active)
-    weight = dr.maximum(high - low, 1e-6) / (4.0 * dr.pi * off)
-    if lights.sun >= 0:
-        kind = dr.gather(mi.UInt32, lights.kind, row, active)
-        to_sun = dr.gather(mi.Vector3f, lights.normal, row, active)
-        turn = 0.5 * dr.squared_norm(to_sun - state.direction)
-        of_sun = foggy.phase(fog, turn) * _absorbed(fog.extinction * (end - begin)) / fog.extinction
-        weight = dr.select(kind == SUN, of_sun, weight)
-    return weight * dr.gather(mi.Float, lights.power, row, active)
-
-
-def _place_on_stretch(
-    world: World, row: Any, state: _State, begin: Any, end: Any, u: Any, active: Any
-) -> tuple[Any, Any]:
-    """Return a distance on a stretch, and the density per metre with which it was drawn.
-
-    The angle β at which a light stands off the ray grows along it by D/d² for each metre. Drawn evenly in the
-    integral of the phase function over β, inverse square and phase function cancel. Where that integral is too
-    short for float32, and for the sun, the distance is drawn by the extinction.
-    """
-    mi, dr = backend().mi, backend().dr
-    fog = world.fog
-    middle, off, low, high = _arcs(world, row, state, begin, end, active)
-    angle, slope = foggy.angle_of_arc(fog, dr.lerp(low, high, u))
-    sine, cosine = dr.sincos(angle)
-    by_arc = middle - off * cosine / dr.maximum(sine, 1e-9)
-    density = slope / (high - low) * off / (off * off + dr.square(by_arc - middle))
-    short = high - low <= 1e-4
-    if world.lights.sun >= 0:
-        short = short | (dr.gather(mi.UInt32, world.lights.kind, row, active) == SUN)
-    by_arc = dr.clip(by_arc, begin, end)
-    by_flight = _flight_within(world, begin, end, u)
-    whole = _absorbed(fog.extinction * (end - begin))
-    flight_density = fog.extinction * dr.exp(-fog.extinction * (by_flight - begin)) / whole
-    return dr.select(short, by_flight, by_arc), dr.select(short, flight_density, density)
-
-
-def _arcs(
-    world: World, row: Any, state: _State, begin: Any, end: Any, active: Any
-) -> tuple[Any, Any, Any, Any]:
-    """Return where a ray is nearest to a light, how near, and `arc` at both ends of a stretch of it."""
-    mi, dr = backend().mi, backend().dr
-    to = dr.gather(mi.Point3f, world.lights.center, row, active) - state.origin
-    middle = dr.dot(to, state.direction)
-    off = dr.norm(to - state.direction * middle)
-    off = dr.maximum(off, dr.gather(mi.Float, world.lights.spread, row, active))
-    low = foggy.arc(world.fog, dr.atan2(off, middle - begin))
-    high = foggy.arc(world.fog, dr.atan2(off, middle - end))
-    return middle, off, low, high
-
-
-def _flight_within(world: World, begin: Any, end: Any, u: Any) -> Any:
-    """Return a distance on a stretch, drawn by the extinction, never beyond its end."""
-    dr = backend().dr
-    assert world.fog is not None  # noqa: S101 (only called in fog)
-    whole = _absorbed(world.fog.extinction * (end - begin))
-    return dr.minimum(begin - dr.log(1.0 - u * whole) / world.fog.extinction, end)
-
-
-def _absorbed(depth: Any) -> Any:
-    """Return 1 − exp(−depth), with its digits where the depth is small."""
-    dr = backend().dr
-    series = depth * (1.0 - depth * (0.5 - depth * (1.0 / 6.0 - depth / 24.0)))
-    return dr.select(depth < 0.05, series, 1.0 - dr.exp(-depth))
-
-
-def _arriving(
-    world: World, row: Any, origin: Any, aim: connect.Aim, depth: Any, max_depth: Any, active: Any
-) -> Any:
-    """Return the share of a light's mean radiance that reaches a place along a ray; 0 where it is in shadow.
-
-    Mirrored images are followed by both their legs, each pane weakens and counts as a stretch of the path, as
-    it does where a path meets it by itself.
-    """
-    mi, dr = backend().mi, backend().dr
-    lights = world.lights
-    factor, stretches = mi.Float(1), depth + 1
-    reach, leaving = aim.reach, -aim.direction
-    second, shown = None, mi.Bool(False)
-    facet = mi.Int32(-1)
-    if lights.has_images:
-        facet = dr.gather(mi.Int32, lights.facet, row, active)
-        shown = active & (facet >= 0)
-        second = connect.reflected(world.surfaces, mi.UInt32(facet), origin, aim.direction, aim.reach, shown)
-        active = active & (~shown | second.valid)
-        factor = dr.select(shown, second.reflectance, factor)
-        stretches = dr.select(shown, stretches + 1, stretches)
-        reach = dr.select(shown, second.distance, reach)
-        leaving = dr.select(shown, -second.direction, leaving)
-    if world.surfaces.pane_count:
-        left, count = connect.through_panes(world.surfaces, origin, aim.direction, reach, facet, active)
-        factor, stretches = factor * left, stretches + count
-    if world.fog is not None:
-        factor = factor * (foggy.transmittance(world.fog, origin, aim.direction, reach))
-    if second is not None:
-        rest = aim.reach - second.distance
-        if world.surfaces.pane_count:
-            left, count = connect.through_panes(
-                world.surfaces, second.place, second.direction, rest, facet, shown
-            )
-            factor, stretches = (
-                dr.select(shown, factor * left, factor),
-                dr.select(shown, stretches + count, stretches),
-            )
-        if world.fog is not None:
-            further = foggy.transmittance(world.fog, second.place, second.direction, rest)
-            factor = dr.select(shown, factor * further, factor)
-        active = active & ((stretches < max_depth) & (factor > 0.0))
-        active = active & (
-            ~(shown & _hidden(world, second.place, second.direction, rest - aim.gap, active & shown))
-        )
-    else:
-        active = active & ((stretches < max_depth) & (factor > 0.0))
-    end = dr.select(shown, reach * (1.0 - connect.SHORTER), reach - aim.gap)
-    active = active & ~_hidden(world, origin, aim.direction, end, active)
-    factor = factor * (
-        connect.emission(lights, dr.gather(mi.UInt32, lights.group, row, active), leaving, active)
-    )
-    return dr.select(active, factor, 0.0)
-
-
-def _hidden(world: World, origin: Any, direction: Any, reach: Any, active: Any) -> Any:
-    mi = backend().mi
-    ray = mi.Ray3f(origin, direction)
-    ray.maxt = reach
-    return world.opaque.ray_test(ray, coherent=mi.Bool(False), active=active)
 
 
 def _add_met_light(world: World, state: _State, weight: Any, light: Any, active: Any, add: Any) -> None:
@@ -498,7 +286,3 @@ def _power(mine: Any, other: Any) -> Any:
     dr = backend().dr
     ratio = other / dr.maximum(mine, 1e-30)
     return dr.select(mine > 0.0, 1.0 / (1.0 + ratio * ratio), 0.0)
-
-
-def _albedo(world: World) -> Any:
-    return backend().mi.Float(1) if world.fog is None else world.fog.albedo

@@ -98,6 +98,18 @@ class FogTable:
     arc: Any
 
 
+@dataclass(frozen=True, eq=False)
+class World:
+    """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes."""
+
+    bodies: Any
+    opaque: Any
+    lights: Lights
+    surfaces: Surfaces
+    choice: Choice
+    fog: FogTable | None
+
+
 def upload_lights(
     emitters: Emitters, power: NDArray[np.float64], patterns: list[Pattern | None], axes: NDArray[np.float64]
 ) -> Lights:

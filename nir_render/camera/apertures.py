@@ -1,0 +1,58 @@
+"""Where a flare lies in the image: the pixels over which its flux is measured."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.lens import intrinsics_of
+from nir_render.scene.devices import Camera
+
+LEAST_RADIUS_PX = 3.0
+_BLUR_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Aperture:
+    """The pixels of a disc: the rectangle around it, and which of that are inside, shape (rows, columns)."""
+
+    rows: slice
+    columns: slice
+    inside: NDArray[np.bool_]
+
+    def sum(self, image: NDArray[np.float64]) -> float:
+        """Return the sum of an image over the pixels."""
+        return float(image[self.rows, self.columns][self.inside].sum())
+
+
+def flare_aperture(
+    camera: Camera, direction: NDArray[np.float64], angular_radius_rad: float
+) -> Aperture | None:
+    """Return the aperture of a flare: its image's radius and three σ of the point spread, at least 3 px.
+
+    Parameters
+    ----------
+    direction
+        Unit vector to the source's centre in camera axes, shape (3,).
+    angular_radius_rad
+        Half the angle that the source fills.
+
+    Returns
+    -------
+    None where no pixel's centre lies in it: beyond the sensor, or behind the lens.
+    """
+    lens = intrinsics_of(camera)
+    if direction[2] <= 0.0:
+        return None
+    u_px, v_px = lens.project(direction)
+    # A rectilinear image grows by 1/cos² θ along the radius, more than across it.
+    image_px = lens.fx_px * math.tan(min(angular_radius_rad, 1.5)) / max(float(direction[2]), 0.05) ** 2
+    radius_px = max(image_px + _BLUR_SIGMAS * camera.point_spread.sigma_px, LEAST_RADIUS_PX)
+    rows, columns = (
+        slice(max(math.ceil(middle_px - radius_px), 0), min(math.floor(middle_px + radius_px) + 1, count))
+        for middle_px, count in ((v_px, lens.height_px), (u_px, lens.width_px))
+    )
+    down, across = np.arange(rows.start, rows.stop) - v_px, np.arange(columns.start, columns.stop) - u_px
+    inside = down[:, None] ** 2 + across**2 <= radius_px**2
+    return Aperture(rows, columns, inside) if inside.any() else None
