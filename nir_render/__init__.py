@@ -9,6 +9,7 @@ from nir_render.errors import InputError
 from nir_render.expected import expected_electrons
 from nir_render.scene.load import Scene, load_scene
 from nir_render.simulate import Shot, expose, render, simulate
+from nir_render.transport.cache import LightCache
 from nir_render.transport.light import DirectTable, Indirect, Light
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Indirect",
     "InputError",
     "Light",
+    "LightCache",
     "Scene",
     "Shot",
     "expected_electrons",

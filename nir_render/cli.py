@@ -268,12 +268,15 @@ def _say_what_is_lowered(scene: "Scene") -> None:
     """Tell, on standard error, where this machine renders with fewer samples than the scene asks for."""
     if not scene.document.has_indirect_light():
         return
+    from nir_render.transport.backend import backend
     from nir_render.transport.stock import samples_of
 
-    asked, used = scene.document.render.indirect.samples, samples_of(scene)
-    if used < asked:
+    settings, used = scene.document.render, samples_of(scene)
+    asked = settings.indirect.samples
+    wanted = "what the target for the noise needs" if asked is None else str(asked)
+    if not backend().vectorised and used != asked:
         _errors.print(
-            f"no usable LLVM: indirect light with {used} samples per pixel instead of {asked}; "
+            f"no usable LLVM: indirect light with {used} samples per pixel instead of {wanted}; "
             "'nir-render doctor' says more",
             soft_wrap=True,
         )

@@ -2,12 +2,14 @@
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.apertures import Aperture, flare_aperture
 from nir_render.camera.emission import Emitter, emission_units
+from nir_render.camera.enlarge import enlarge, enlarge_deviation
 from nir_render.camera.exposure import Beam, beam_window, blur, diffuse_electrons
 from nir_render.camera.psf import Window
 from nir_render.camera.response import response
@@ -60,10 +62,10 @@ def expected(light: Light, scene: Scene, exposure_s: float) -> Expected:
         raise InputError(f"exposure_s is {exposure_s!r}; wanted seconds greater than 0")
     _, camera = scene.camera(light.camera)
     electrons = np.zeros((camera.sensor.rows, camera.sensor.columns))
-    flux = _fluxes(light, scene)
+    flux = fluxes(light, scene)
     share = aperture_share = 0.0
     if light.indirect is not None:
-        electrons += blur(camera, _diffuse(light, scene, light.indirect.radiance_per_w, flux, exposure_s))
+        electrons += blur(camera, diffuse_image(light, light.indirect, scene, flux, exposure_s))
     windows = tuple(_windows(light, scene, camera, exposure_s))
     for window in windows:
         window.add_to(electrons)
@@ -78,7 +80,7 @@ def expected(light: Light, scene: Scene, exposure_s: float) -> Expected:
 
 
 def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
-    """Return the apertures of what the direct table shows in the frame: sources, the sun, and their ghosts."""
+    """Return the apertures of what the direct table shows in the frame: sources, the sun, their ghosts."""
     table = light.direct
     shown = (
         flare_aperture(camera, table.direction[row], float(table.angular_radius_rad[row]))
@@ -104,7 +106,7 @@ def render_variance_e2(light: Light, scene: Scene, exposure_s: float) -> NDArray
     _, camera = scene.camera(light.camera)
     if light.indirect is None:
         return np.zeros((camera.sensor.rows, camera.sensor.columns))
-    return _render_variance(light, light.indirect, scene, _fluxes(light, scene), exposure_s)
+    return _render_variance(light, light.indirect, scene, fluxes(light, scene), exposure_s)
 
 
 def group_electrons(mean: Expected, scene: Scene, group: int) -> NDArray[np.float64]:
@@ -113,9 +115,8 @@ def group_electrons(mean: Expected, scene: Scene, group: int) -> NDArray[np.floa
     if mean.light.indirect is None:
         return np.zeros_like(mean.electrons)
     only = np.zeros(len(mean.light.groups))
-    only[group] = _fluxes(mean.light, scene)[group]
-    per_w = mean.light.indirect.radiance_per_w
-    return blur(camera, _diffuse(mean.light, scene, per_w, only, mean.exposure_s))
+    only[group] = fluxes(mean.light, scene)[group]
+    return blur(camera, diffuse_image(mean.light, mean.light.indirect, scene, only, mean.exposure_s))
 
 
 def _emitters(light: Light, scene: Scene) -> list[Emitter]:
@@ -124,7 +125,8 @@ def _emitters(light: Light, scene: Scene) -> list[Emitter]:
     return [known[name] for name in light.groups]
 
 
-def _fluxes(light: Light, scene: Scene) -> NDArray[np.float64]:
+def fluxes(light: Light, scene: Scene) -> NDArray[np.float64]:
+    """Return how many units of emission each group sends, shape (groups,)."""
     return np.array([emission_units(emitter) for emitter in _emitters(light, scene)])
 
 
@@ -134,14 +136,19 @@ def _spectrum_key(emitter: Emitter) -> Hashable:
     return emitter.temperature_k if isinstance(emitter, Lamp) else emitter.spectrum
 
 
-def _diffuse(
-    light: Light, scene: Scene, per_w: NDArray[np.float32], flux_w: NDArray[np.float64], exposure_s: float
+def diffuse_image(
+    light: Light, indirect: Indirect, scene: Scene, flux_w: NDArray[np.float64], exposure_s: float
 ) -> NDArray[np.float64]:
     """Return the electrons of indirect light before the blur; groups of one spectrum are summed first."""
     _, camera = scene.camera(light.camera)
-    image = np.zeros((camera.sensor.rows, camera.sensor.columns))
-    for emitter, radiance in _by_spectrum(light, scene, per_w, flux_w):
-        image += diffuse_electrons(camera, radiance, emitter, exposure_s)
+    rows, columns = camera.sensor.rows, camera.sensor.columns
+    image = np.zeros((rows, columns))
+    edges = indirect.edges
+    parts = by_spectrum(light, scene, indirect.radiance_per_w, flux_w)
+    patches = [] if edges is None else by_spectrum(light, scene, edges.radiance_per_w, flux_w)
+    for (emitter, radiance), patch in zip_longest(parts, (patch for _, patch in patches)):
+        whole = enlarge(radiance, rows, columns, edges and edges.enlargement, patch)
+        image += diffuse_electrons(camera, whole, emitter, exposure_s)
     return image
 
 
@@ -154,16 +161,21 @@ def _render_variance(
     deviation of each spectrum's light goes the way of its radiance.
     """
     _, camera = scene.camera(light.camera)
-    total = np.zeros((camera.sensor.rows, camera.sensor.columns))
-    for emitter, variance in _by_spectrum(light, scene, indirect.variance, flux_w**2):
-        total += diffuse_electrons(camera, np.sqrt(variance), emitter, exposure_s) ** 2
+    rows, columns = camera.sensor.rows, camera.sensor.columns
+    total = np.zeros((rows, columns))
+    edges = indirect.edges
+    parts = by_spectrum(light, scene, indirect.variance, flux_w**2)
+    patches = [] if edges is None else by_spectrum(light, scene, edges.variance, flux_w**2)
+    for (emitter, variance), patch in zip_longest(parts, (patch for _, patch in patches)):
+        deviation = enlarge_deviation(variance, rows, columns, edges and edges.enlargement, patch)
+        total += diffuse_electrons(camera, deviation, emitter, exposure_s) ** 2
     return total
 
 
-def _by_spectrum(
+def by_spectrum(
     light: Light, scene: Scene, per_group: NDArray[np.float32], weights: NDArray[np.float64]
 ) -> list[tuple[Emitter, NDArray[np.float64]]]:
-    """Return weighted sums of arrays, shape (group, node, row, column), over the groups of each spectrum."""
+    """Return weighted sums of arrays, shape (group, node, …), over the groups of each spectrum."""
     sums: dict[Hashable, tuple[Emitter, NDArray[np.float64]]] = {}
     for group, emitter in enumerate(_emitters(light, scene)):
         if weights[group] == 0.0:

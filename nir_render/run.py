@@ -18,7 +18,9 @@ from nir_render.evaluate.truth import SourceTruth, parse_truth
 from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene, load_scene
 from nir_render.simulate import simulate
-from nir_render.transport.light import Light
+from nir_render.transport.cache import LightCache
+from nir_render.transport.light import Indirect, Light
+from nir_render.transport.noise import MOST_SAMPLES
 from perception import (
     ESTIMATORS,
     Calibration,
@@ -46,11 +48,18 @@ Progress = Callable[[int, int], None]
 
 
 def render_run(
-    scene: Scene, folder: Path, *, overwrite: bool, progress: Progress, keep_light: bool = False
+    scene: Scene,
+    folder: Path,
+    *,
+    overwrite: bool,
+    progress: Progress,
+    keep_light: bool = False,
+    cache: LightCache | None = None,
 ) -> None:
     """Render the frames of a scene with their truth and calibration into a new run folder.
 
-    `keep_light` adds the light of each frame, as spectral EXR and direct table.
+    `keep_light` adds the light of each frame, as spectral EXR and direct table. `cache` keeps light from run
+    to run, which saves rendering it and changes nothing else.
 
     Raises
     ------
@@ -65,14 +74,19 @@ def render_run(
     total = scene.document.clock.frames * len(cameras)
     calibrations = {name: scene.calibration(name) for name in cameras}
     with run_folder.new_run_folder(folder, overwrite) as aside:
-        records, truth, noise_shares = [], [], []
+        records, truth, noise_shares, aperture_shares = [], [], [], []
+        sampled: dict[str, dict[str, Any]] = {}
+        cache = LightCache() if cache is None else cache
         kept: dict[str, tuple[str, Light]] = {}
-        for done, shot in enumerate(simulate(scene)):
+        for done, shot in enumerate(simulate(scene, cache=cache)):
             file = f"frames/{shot.frame.camera}/{shot.frame.index:06d}.png"
             run_folder.write_file(aside / file, encode_png16(shot.frame.data_dn))
             records.append(frame_record(shot.frame, file))
             truth += [row.record() for row in shot.truth]
             noise_shares.append(shot.render_noise_share)
+            aperture_shares.append(shot.aperture_noise_share)
+            if shot.frame.camera not in sampled and shot.light.indirect is not None:
+                sampled[shot.frame.camera] = _sample_facts(shot.light.indirect)
             if keep_light:
                 folder_of_light = aside / "light" / shot.frame.camera
                 kept[shot.frame.camera] = _write_light(
@@ -91,13 +105,17 @@ def render_run(
             "variant": backend().variant,
             "variant_reason": backend().reason,
             "seconds": {"render": round(seconds, 3)},
-            "indirect": _indirect_facts(scene),
-            # Variance of the Monte Carlo part over shot and read noise, medians over each frame; the direct
-            # part is closed form and carries none.
+            "indirect": _indirect_facts(scene) | {"samples_by_camera": sampled},
+            # Variance of the Monte Carlo part over shot and read noise: the median over each frame, and the
+            # largest of the sums over flares' apertures; the direct part is closed form and carries none.
             "render_noise": {
+                "target_share": scene.document.render.noise,
                 "share_of_temporal_variance": round(float(np.median(noise_shares)), 6),
                 "largest_share": round(max(noise_shares), 6),
+                "share_in_apertures": round(float(np.median(aperture_shares)), 6),
+                "largest_share_in_apertures": round(max(aperture_shares), 6),
             },
+            "lights": {"rendered": cache.missed, "reused": cache.reused},
         }
         run_folder.write_manifest(aside, facts)
 
@@ -119,13 +137,30 @@ def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tu
 
 
 def _indirect_facts(scene: Scene) -> dict[str, Any]:
+    """Return how the indirect light of a run was asked for; `samples` is null where a target ruled."""
     from nir_render.transport import stock
+    from nir_render.transport.backend import backend
 
-    settings = scene.document.render.indirect
-    samples = stock.samples_of(scene)
-    note = "" if samples == settings.samples else f"{settings.samples} asked for; no usable LLVM"
+    settings = scene.document.render
+    used = None if backend().vectorised and settings.noise is not None else stock.samples_of(scene)
+    asked = settings.indirect.samples
+    wanted = "a target for the noise was" if asked is None else f"{asked}"
+    note = "" if used == asked else f"{wanted} asked for; no usable LLVM"
     rendered = scene.document.has_indirect_light()
-    return {"rendered": rendered, "scale": settings.scale, "samples": samples, "note": note}
+    return {"rendered": rendered, "scale": settings.indirect.scale, "samples": used, "note": note}
+
+
+def _sample_facts(indirect: Indirect) -> dict[str, Any]:
+    """Return the samples per pixel of a light; some of the `pixels_at_cap` may have needed more."""
+    counts = np.array([indirect.samples]) if indirect.counts is None else indirect.counts
+    at_cap = 0 if indirect.counts is None else int((counts == MOST_SAMPLES).sum())
+    return {
+        "least": int(counts.min()),
+        "median": float(np.median(counts)),
+        "mean": round(float(counts.mean()), 3),
+        "most": int(counts.max()),
+        "pixels_at_cap": at_cap,
+    }
 
 
 def chosen_estimators(names: Sequence[str]) -> dict[str, Estimator]:

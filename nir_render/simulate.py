@@ -4,7 +4,7 @@ Light is rendered once for a geometry; exposing it is arithmetic.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from nir_render.expected import Expected, expected
 from nir_render.randomness import generator
 from nir_render.scene.devices import AutoExposure, Camera
 from nir_render.scene.load import Scene
-from nir_render.scene.motion import robot_pose
+from nir_render.transport.cache import LightCache
 from nir_render.transport.light import Light
 from perception.types import RawFrame
 
@@ -25,18 +25,28 @@ _SETTLING_FRAMES = 8  # steps of at most 4: enough for a factor of 65 000
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame, the light it is made of, the truth about its sources, and the render's share of its noise."""
+    """A frame, the light it is made of, the truth about its sources, and the render's share of its noise.
+
+    The two shares are those of `Expected`.
+    """
 
     frame: RawFrame
     light: Light
     truth: tuple[SourceTruth, ...]
     render_noise_share: float
+    aperture_noise_share: float
 
 
-def render(scene: Scene, camera: str, time_s: float = 0.0, seed: int | None = None) -> Light:
+def render(
+    scene: Scene,
+    camera: str,
+    time_s: float = 0.0,
+    seed: int | None = None,
+    cache: LightCache | None = None,
+) -> Light:
     """Return the light that reaches a camera, `robot.camera`, with the scene's geometry at `time_s`.
 
-    `seed` replaces the scene's own.
+    `seed` replaces the scene's own. `cache` keeps lights: what it holds is not rendered again.
 
     Raises
     ------
@@ -45,7 +55,7 @@ def render(scene: Scene, camera: str, time_s: float = 0.0, seed: int | None = No
     """
     from nir_render.transport import render as transport  # Mitsuba loads only where light is rendered
 
-    return transport.render(scene, camera, time_s, scene.document.seed if seed is None else seed)
+    return transport.render(scene, camera, time_s, scene.document.seed if seed is None else seed, cache)
 
 
 def expose(
@@ -62,45 +72,30 @@ def expose(
     return _frame(expected(light, scene, exposure_s), scene, seed, index)
 
 
-def simulate(scene: Scene, seed: int | None = None) -> Iterator[Shot]:
+def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = None) -> Iterator[Shot]:
     """Yield frames with their truth: for each time of the clock, each observing camera.
 
     `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
+    Light is rendered only where geometry is new; `cache` keeps it beyond this run.
     """
     run_seed = scene.document.seed if seed is None else seed
+    cache = LightCache() if cache is None else cache
     exposures_s: dict[str, float] = {}
-    lights: dict[str, tuple[bytes, Light]] = {}
     for index, time_s in enumerate(scene.document.frame_times_s()):
         for name in scene.cameras():
             _, camera = scene.camera(name)
             control = camera.auto_exposure
             if name not in exposures_s and control is not None:
-                lights[name] = _light(scene, name, time_s, run_seed, lights.get(name))
-                exposures_s[name] = _settled_exposure(scene, lights[name][1], camera, control, run_seed)
+                light = render(scene, name, time_s, run_seed, cache)
+                exposures_s[name] = _settled_exposure(scene, light, camera, control, run_seed)
             exposure_s = exposures_s.setdefault(name, camera.exposure_s)
-            lights[name] = _light(scene, name, time_s + 0.5 * exposure_s, run_seed, lights.get(name))
-            mean = expected(lights[name][1], scene, exposure_s)
+            light = render(scene, name, time_s + 0.5 * exposure_s, run_seed, cache)
+            mean = expected(light, scene, exposure_s)
             frame = _frame(mean, scene, run_seed, index)
             truth = tuple(truth_of(scene, mean, frame))
-            yield Shot(frame, mean.light, truth, mean.render_noise_share)
+            yield Shot(frame, light, truth, mean.render_noise_share, mean.aperture_noise_share)
             if control is not None:
                 exposures_s[name] = next_exposure_s(control, camera.sensor, frame.data_dn, exposure_s)
-
-
-def _light(
-    scene: Scene, name: str, time_s: float, seed: int, last: tuple[bytes, Light] | None
-) -> tuple[bytes, Light]:
-    """Return the light at a time, rendered anew only where something has moved since the last."""
-    geometry = geometry_key(scene, time_s)
-    if last is not None and last[0] == geometry:
-        return geometry, replace(last[1], time_s=time_s)
-    return geometry, render(scene, name, time_s, seed)
-
-
-def geometry_key(scene: Scene, time_s: float) -> bytes:
-    """Return what tells two geometries of a scene apart: where all that can move is at a time."""
-    poses = [robot_pose(robot, time_s) for robot in scene.document.robots.values()]
-    return b"".join(pose.rotation.tobytes() + pose.position_m.tobytes() for pose in poses)
 
 
 def _settled_exposure(scene: Scene, light: Light, camera: Camera, control: AutoExposure, seed: int) -> float:

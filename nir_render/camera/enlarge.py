@@ -1,9 +1,9 @@
 """Light that was rendered in blocks of pixels, enlarged to the sensor without smearing it across edges.
 
-Where the blocks around a pixel all show its own surface, light is interpolated linearly between their centres.
-Beside an edge a plane is fitted (weighted least squares) to the blocks near by that show one surface alone and
-the same: blocks that an edge cuts hold averages over several surfaces and are left out. A pixel that an edge
-cuts has its share of each surface. All of it is linear in the light, with weights that geometry alone decides.
+Where the blocks around a pixel all show its own surface, light is interpolated linearly between their
+centres. Beside an edge a plane is fitted (weighted least squares) to the blocks near by that show this surface
+alone: blocks that an edge cuts hold averages over several surfaces and are left out. A pixel that an edge cuts
+has its share of each surface. All of it is linear in the light, with weights that geometry alone decides.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class Labels:
     within
         Labels at places spread evenly over each of these, shape (n, places).
     nearness_per_m
-        One over the distance of what is in the middle of each pixel, 0 where nothing is, shape (rows, columns).
+        One over the distance of what is in the middle of each pixel, 0 where nothing is, as `middle`.
     shining
         Whether a lamp is seen there, by label.
     """
@@ -62,8 +62,8 @@ class Enlargement:
     block, weight
         Numbers of blocks, and what they weigh, shape (m,).
     patch
-        Numbers of the pixels that no block tells of, or that the edge of a lamp cuts: they are rendered one by
-        one. Shape (p,).
+        Numbers of the pixels that no block tells of, or that the edge of a lamp cuts, shape (p,): they are
+        rendered one by one.
     """
 
     rows: int
@@ -124,6 +124,23 @@ def enlarge_deviation(
     return deviation
 
 
+def interpolated_variance(
+    variance: Array, rows: int, columns: int, pixels: NDArray[np.int64]
+) -> Array:
+    """Return the variance of pixels, numbered row by row, that are linear between independent blocks."""
+    weights, places = [], []
+    for at, count, blocks in zip(np.divmod(pixels, columns), (rows, columns), variance.shape, strict=True):
+        place = np.clip((at + 0.5) * blocks / count - 0.5, 0.0, blocks - 1.0)
+        low = np.minimum(place.astype(np.int64), max(blocks - 2, 0))
+        weights.append((1.0 - (place - low), place - low))
+        places.append((low, np.minimum(low + 1, blocks - 1)))
+    total = np.zeros(len(pixels))
+    for down, row in zip(weights[0], places[0], strict=True):
+        for across, column in zip(weights[1], places[1], strict=True):
+            total += (down * across) ** 2 * variance[row, column]
+    return total
+
+
 def enlargement(labels: Labels, scale: int) -> Enlargement:
     """Return how light in blocks of scale × scale pixels is enlarged, where these pixels have labels."""
     rows, columns = labels.middle.shape
@@ -176,7 +193,7 @@ def _between_equals(pure: NDArray[np.int32], rows: int, columns: int, scale: int
 def _parts(
     labels: Labels, pixels: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
-    """Return the surfaces in pixels: pixel, in rising order, label, and share of the pixel, shape (parts,)."""
+    """Return the surfaces in pixels: pixel, rising, label, and share of the pixel, shape (parts,)."""
     edge = np.isin(labels.edge, pixels, assume_unique=True)
     whole = np.setdiff1d(pixels, labels.edge, assume_unique=True)
     within = np.sort(labels.within[edge], axis=1)
@@ -197,9 +214,9 @@ def _fit(
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
     """Return blocks around parts of pixels, their weights, shape (parts, blocks), and which parts have any.
 
-    The weights give the value at the pixel of the plane a + b x + c y that fits the blocks of the part's label
-    best, each block counted by a Gaussian of its distance; b and c are held towards 0 (ridge regression), so
-    that a single block is continued flat.
+    The weights give the value at the pixel of the plane a + b x + c y that fits the blocks of the part's
+    label best, each block counted by a Gaussian of its distance; b and c are held towards 0 (ridge
+    regression), so that a single block is continued flat.
     """
     row, column = ((at + 0.5) / scale - 0.5 for at in np.divmod(pixel, columns))
     steps = np.arange(-_REACH, _REACH + 1)
@@ -219,19 +236,17 @@ def _fit(
     xx = (kernel * x * x).sum(axis=1) + _RIDGE
     yy = (kernel * y * y).sum(axis=1) + _RIDGE
     xy = (kernel * x * y).sum(axis=1)
-    # a at the pixel: the mean, and from there along the slopes to the pixel.
-    scale_of = 1.0 / (xx * yy - xy**2)
-    along_x, along_y = (yy * mean_x - xy * mean_y) * scale_of, (xx * mean_y - xy * mean_x) * scale_of
+    # The value at the pixel, x = y = 0: the mean of the blocks, and from there along the slopes.
+    determinant = xx * yy - xy**2
+    along_x, along_y = (yy * mean_x - xy * mean_y) / determinant, (xx * mean_y - xy * mean_x) / determinant
     return block, kernel * (1.0 - along_x[:, None] * x - along_y[:, None] * y), found
 
 
-def _foreshortened(
-    labels: Labels, scale: int, block: NDArray[np.int64], weight: Array
-) -> NDArray[np.bool_]:
+def _foreshortened(labels: Labels, scale: int, block: NDArray[np.int64], weight: Array) -> NDArray[np.bool_]:
     """Tell which parts are too far off their blocks, for all that these are close in the image.
 
-    One over the distance of a flat surface is linear in the image, so a fitted plane is right for it. Where it
-    differs from that of the blocks themselves by much, light on the surface changes by much between them.
+    One over the distance of a flat surface is linear in the image, so a fitted plane is right for it. Where
+    it differs much from that of the blocks, light on the surface may change much between them.
     """
     nearness = labels.nearness_per_m
     near = nearness.reshape(nearness.shape[0] // scale, scale, -1, scale).mean(axis=(1, 3)).ravel()[block]

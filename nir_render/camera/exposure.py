@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from nir_render.camera.emission import Emitter
+from nir_render.camera.enlarge import enlarge
 from nir_render.camera.lens import aperture_area_m2, intrinsics_of
 from nir_render.camera.psf import Window, source_window
 from nir_render.camera.response import Response, response_map
@@ -67,7 +67,7 @@ def diffuse_electrons(
     Parameters
     ----------
     radiance_w_per_m2_sr
-        Mean radiance, shape (rows / scale, columns / scale); pixels between are interpolated.
+        Mean radiance, shape (rows, columns), or (rows / scale, columns / scale): then it is interpolated.
     emitter
         Whose spectrum the light has.
 
@@ -77,13 +77,6 @@ def diffuse_electrons(
     """
     radiance = enlarge(radiance_w_per_m2_sr, camera.sensor.rows, camera.sensor.columns)
     return radiance * (_collected_per_radiance(camera) * exposure_s) * response_map(camera, emitter)
-
-
-def enlarge(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
-    """Return an image at the size of the sensor, linear between the centres of its own pixels."""
-    if values.shape == (rows, columns):
-        return values
-    return np.asarray(cv2.resize(values, (columns, rows), interpolation=cv2.INTER_LINEAR))
 
 
 def blur(camera: Camera, image_e: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ from nir_render.transport.medium import medium
 from nir_render.transport.pattern import pattern_of
 
 BATCHES = 8
-DEFAULT_SAMPLES = 16
+_DEFAULT_SAMPLES = 16
 PILOT_SAMPLES = 16
 _PILOT_STEP = 4
 _PILOT_PIXELS = 1200
@@ -81,8 +81,8 @@ def indirect(
         What a unit of each group's emission counts when a light is chosen, shape (groups,). It moves only
         noise from one group to another.
     samples
-        Samples in each pixel of the film, powers of two, shape (rows, columns) / scale, or one for all; without,
-        the scene's.
+        Samples in each pixel of the film, powers of two, shape (rows, columns) / scale, or one for all;
+        without, the scene's, 16 where it has a target.
     values_at_once
         Float32 numbers that one launch may fill.
     """
@@ -91,7 +91,7 @@ def indirect(
     settings = scene.document.render.indirect
     shape = film_shape(rays, settings.scale)
     if samples is None:
-        samples = settings.samples or DEFAULT_SAMPLES
+        samples = settings.samples or _DEFAULT_SAMPLES
     counts = np.broadcast_to(samples, shape)
     every = np.arange(counts.size)
     radiance, variance = _pixels(scene, rays, time_s, seed, power, every, counts.ravel(), values_at_once)
@@ -104,9 +104,7 @@ def indirect(
     )
 
 
-def pilot(
-    scene: Scene, rays: Rays, time_s: float, seed: int, power: NDArray[np.float64]
-) -> Indirect | None:
+def pilot(scene: Scene, rays: Rays, time_s: float, seed: int, power: NDArray[np.float64]) -> Indirect | None:
     """Return a few samples in some pixels of the film, every fourth along each axis: what noise there is.
 
     A small film's are closer, so that there are a thousand. The arguments are those of `indirect`.
@@ -145,7 +143,7 @@ def _pixels(
     counts: NDArray[np.int64],
     values_at_once: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return radiance per unit of each group and its variance in some pixels of the film, (groups, pixels)."""
+    """Return radiance per unit of each group in some pixels, and its variance, shape (groups, pixels)."""
     settings = scene.document.render.indirect
     built = world_on_device(scene, time_s, power)
     groups = len(world.groups(scene))

@@ -16,7 +16,7 @@ from nir_render.transport.emitters import RECTANGLE
 from nir_render.transport.facets import PANE
 from nir_render.transport.kernel.tables import World
 
-_PLACES = 64  # in a pixel where labels meet
+_PLACES = 32  # in a pixel where labels meet
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 _FACES = 8  # at least the faces of a box
 
@@ -32,40 +32,38 @@ def labels_of(built: World, origin_m: NDArray[np.float64], corners: NDArray[np.f
         Directions at the corners of the pixels, any length, shape (rows + 1, columns + 1, 3).
     """
     rows, columns = (count - 1 for count in corners.shape[:2])
-    every = np.arange(rows * columns)
-    middle, nearness_per_m = _key(built, origin_m, _directions(corners, every, np.array([[0.5, 0.5]])))
+    small = corners.astype(np.float32)
+    middles = small[:-1, :-1] + small[:-1, 1:] + small[1:, :-1] + small[1:, 1:]
+    middle, nearness_per_m = _key(built, origin_m, middles.reshape(-1, 3))
     edge = np.flatnonzero(_beside_another(middle.reshape(rows, columns)))
-    # A lattice all of whose rows and columns differ, so that level edges too find their place.
-    steps = np.arange(_PLACES) + 0.5
-    places = np.stack([steps / _PLACES, (steps * _GOLDEN) % 1.0], axis=1)
-    fine, _ = _key(built, origin_m, _directions(corners, edge, places))
-    keys, label = np.unique(np.concatenate([np.zeros(1, np.int64), middle, fine]), return_inverse=True)
+    fine, _ = _key(built, origin_m, _directions(small, edge))
+    keys, first, label = np.unique(
+        np.concatenate([np.zeros(1, np.int64), middle, fine]), return_index=True, return_inverse=True
+    )
     # Numbered by where they are first seen: Mitsuba's own numbers change from one scene built to the next.
-    _, first = np.unique(label, return_index=True)
     rank = np.empty(len(keys), dtype=np.int32)
     rank[np.argsort(first)] = np.arange(len(keys))
     label = rank[label.ravel()]
     shining = np.empty(len(keys), dtype=bool)
     shining[rank] = _shows_lamp(built, keys)
     return Labels(
-        middle=label[1 : 1 + every.size].reshape(rows, columns),
+        middle=label[1 : 1 + rows * columns].reshape(rows, columns),
         edge=edge,
-        within=label[1 + every.size :].reshape(edge.size, _PLACES),
+        within=label[1 + rows * columns :].reshape(edge.size, _PLACES),
         nearness_per_m=nearness_per_m.reshape(rows, columns),
         shining=shining,
     )
 
 
-def _directions(
-    corners: NDArray[np.float64], pixels: NDArray[np.int64], places: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Return directions at places, (right, down) in shares of a pixel, shape (pixels · places, 3)."""
-    columns = corners.shape[1] - 1
-    row, column = np.divmod(pixels, columns)
-    small = corners.astype(np.float32)
-    across, down = places.astype(np.float32).T[:, None, :, None]
+def _directions(corners: NDArray[np.float32], pixels: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return directions at places spread evenly over pixels, shape (pixels · places, 3)."""
+    row, column = np.divmod(pixels, corners.shape[1] - 1)
+    # A lattice all of whose rows and columns differ, so that level edges too find their place.
+    steps = np.arange(_PLACES) + 0.5
+    down = (steps / _PLACES).astype(np.float32)[:, None]
+    across = ((steps * _GOLDEN) % 1.0).astype(np.float32)[:, None]
     above, above_right, below, below_right = (
-        small[row + i, column + j][:, None, :] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))
+        corners[row + i, column + j][:, None, :] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))
     )
     top, bottom = above + (above_right - above) * across, below + (below_right - below) * across
     return np.asarray(top + (bottom - top) * down, dtype=np.float32).reshape(-1, 3)

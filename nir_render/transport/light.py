@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.enlarge import Enlargement
+
 
 @dataclass(frozen=True, eq=False)
 class DirectTable:
@@ -52,6 +54,19 @@ class DirectTable:
 
 
 @dataclass(frozen=True, eq=False)
+class Edges:
+    """What keeps the edges of light that was rendered in blocks sharp.
+
+    `radiance_per_w` and `variance`, shape (group, node, pixel), are those of the pixels
+    `enlargement.patch`, which are rendered one by one.
+    """
+
+    enlargement: Enlargement
+    radiance_per_w: NDArray[np.float32]
+    variance: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
 class Indirect:
     """All other light: off walls and floor, mirrored more than once, through glass, from lamps, off fog.
 
@@ -68,6 +83,9 @@ class Indirect:
         Samples per pixel of these arrays; where they differ, their median.
     counts
         Samples in each pixel, shape (row, column); None where all have the same.
+    edges
+        How these arrays are enlarged where surfaces meet; None where the scale is 1 and where they are not
+        known, and everything is interpolated.
     """
 
     radiance_per_w: NDArray[np.float32]
@@ -75,6 +93,7 @@ class Indirect:
     scale: int
     samples: int
     counts: NDArray[np.int32] | None = None
+    edges: Edges | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,17 +1,17 @@
 """How many samples each pixel of the film needs, so that render noise stays a known share of the sensor's.
 
-A pilot of few samples in few pixels, thrown away afterwards and drawn with random numbers of its own, tells the
-variance that one sample brings to the electrons of a pixel. The counts follow from it alone, and not from the
-samples that they weigh: so the render stays unbiased.
+A pilot of few samples in few pixels, thrown away afterwards and drawn with random numbers of its own, tells
+the variance that one sample brings to the electrons of a pixel. The counts follow from it alone, and not from
+the samples that they weigh: so the render stays unbiased.
 
-The need of a pixel is the count that brings its render variance to a share of shot and read variance. A pilot's
-variance, from 8 batches, is itself noisy, and where rare paths carry the light most of its values are too small;
-its mean is right. So needs are means over 5 × 5 pixels of the pilot, and taken a tenth larger.
+The need of a pixel is the count that brings its render variance to a share of shot and read variance. A
+pilot's variance, from 8 batches, is itself noisy, and where rare paths carry the light most of its values are
+too small; its mean is right. So needs are means over 5 × 5 pixels of the pilot, and taken a tenth larger.
 
 - The frame's count is the median of the needs. A pixel gets its own need or the frame's count, whichever is
   less: at least half of all pixels then keep the target.
-- No pixel may look like a flare by render noise: each gets what brings its σ to half of the sensor's, up to 16
-  times the frame's count.
+- No pixel may look like a flare by render noise: each gets what brings its σ to half of the sensor's, up to
+  16 times the frame's count.
 - Every flare's aperture gets what brings the sum over it to the target.
 
 Counts are powers of two from 8 to 4096.
@@ -55,14 +55,16 @@ def samples_map(pilot: Light, scene: Scene, noise_share: float, shape: tuple[int
     at_one_second = expected(pilot, scene, 1.0)
     exposure_s = settled_exposure_s(camera, float(at_one_second.electrons.max()))
     temporal_e2 = at_one_second.electrons * exposure_s + camera.sensor.read_noise_e**2 + _TINY_E2
-    noise_e2 = render_variance_e2(pilot, scene, exposure_s) * (pilot.indirect.samples * _CAUTION)  # of one sample
+    of_one_sample = pilot.indirect.samples * _CAUTION
+    noise_e2 = render_variance_e2(pilot, scene, exposure_s) * of_one_sample
     parts = pilot.indirect.variance.shape[-1:-3:-1]
     ratio = cv2.resize(noise_e2 / temporal_e2, parts, interpolation=cv2.INTER_AREA)
     ratio = cv2.blur(ratio, (_NEIGHBOURS, _NEIGHBOURS), borderType=cv2.BORDER_REPLICATE)
     ratio = np.asarray(cv2.resize(ratio, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float64)
     need = ratio / noise_share
     frame = max(float(np.median(need)), LEAST_SAMPLES)
-    need = np.maximum(np.minimum(need, frame), np.minimum(ratio / _FLARE_LIKE_SHARE, _FLARE_LIKE_RISE * frame))
+    flare_like = np.minimum(ratio / _FLARE_LIKE_SHARE, _FLARE_LIKE_RISE * frame)
+    need = np.maximum(np.minimum(need, frame), flare_like)
     scale = camera.sensor.rows // shape[0]
     apertures = flare_apertures(pilot, camera)
     shares = aperture_shares(apertures, noise_e2, temporal_e2, scale)
@@ -75,7 +77,7 @@ def samples_map(pilot: Light, scene: Scene, noise_share: float, shape: tuple[int
 
 
 def settled_exposure_s(camera: Camera, brightest_e_per_s: float) -> float:
-    """Return a camera's exposure; an automatic one's as it settles, but for the noise of its brightest pixel."""
+    """Return a camera's exposure; an automatic one's as it settles, but for noise in its brightest pixel."""
     control, sensor = camera.auto_exposure, camera.sensor
     if control is None:
         return camera.exposure_s

@@ -33,6 +33,9 @@ class PhaseTable:
     arc
         ∫ of the phase function over the angle itself, from 0, in rad/sr: what a straight ray past a source
         scatters towards the eye (Kulla & Fajardo 2012: the inverse square cancels against the angle's rate).
+    halo
+        Cumulated share of the shine of the fog around a light, against the angle off it: a ray that passes it at
+        an angle θ collects what is left of `arc` beyond θ, over sin θ.
     """
 
     angle_rad: Array
@@ -40,6 +43,7 @@ class PhaseTable:
     density_per_sr: Array
     cumulative: Array
     arc: Array
+    halo: Array
 
 
 def phase_table(phase_function: Callable[[Array], Array]) -> PhaseTable:
@@ -56,13 +60,17 @@ def phase_table(phase_function: Callable[[Array], Array]) -> PhaseTable:
     shares = np.pi * (density[1:] + density[:-1]) * np.diff(versine)  # 2π ∫ p d(1 − cos θ), trapezoids
     density = density / shares.sum()
     shares = shares / shares.sum()
-    arcs = 0.5 * (density[1:] + density[:-1]) * np.diff(angle_rad)
+    arc = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(angle_rad))])
+    # A tenth evenly, so that no direction is left out.
+    shine = (arc[-1] - 0.5 * (arc[1:] + arc[:-1])) * np.diff(angle_rad)
+    shine = 0.9 * shine / shine.sum() + 0.1 * np.diff(angle_rad) / np.pi
     return PhaseTable(
         angle_rad=angle_rad,
         versine=versine,
         density_per_sr=density,
         cumulative=np.concatenate([[0.0], np.cumsum(shares)]),
-        arc=np.concatenate([[0.0], np.cumsum(arcs)]),
+        arc=arc,
+        halo=np.concatenate([[0.0], np.cumsum(shine)]),
     )
 
 

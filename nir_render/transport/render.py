@@ -1,5 +1,9 @@
 """From a scene to the light that reaches one camera."""
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,23 +14,125 @@ from nir_render.scene.checks import indivisible_sensor, solid_around
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import camera_pose
-from nir_render.transport import groups, stock, world
+from nir_render.transport import groups, noise, stock, world
 from nir_render.transport.backend import backend
+from nir_render.transport.cache import LightCache
 from nir_render.transport.direct import direct_table
 from nir_render.transport.facets import facets
-from nir_render.transport.light import Light
+from nir_render.transport.key import Site, geometry_key, light_key, versions
+from nir_render.transport.light import DirectTable, Indirect, Light
+from nir_render.transport.sharpen import sharpened
 
 _STEP, _STEPS = 4, 6
+_PILOT = "pilot"
+
+Samples = NDArray[np.int64] | int
 
 
-def render(scene: Scene, camera: str, time_s: float, seed: int) -> Light:
+def render(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCache | None = None) -> Light:
     """Return the light that reaches a camera, `robot.camera`, with the geometry at a time.
+
+    What `cache` holds is not rendered again. Equal geometry gives equal bits at any time.
 
     Raises
     ------
     InputError
         No such camera, or the camera is inside a body.
     """
+    work = _work(scene, camera, time_s, seed, cache)
+    return replace(work.light(work.samples()), time_s=time_s, seed=seed)
+
+
+def mean_samples(scene: Scene, camera: str, time_s: float, seed: int) -> float:
+    """Return how many samples a pixel of the film gets on average; 0 without indirect light.
+
+    Errors as `render`.
+    """
+    samples = _work(scene, camera, time_s, seed, None).samples()
+    return 0.0 if samples is None else float(np.mean(samples))
+
+
+def geometry_of(scene: Scene, camera: str, time_s: float) -> str:
+    """Return the hash of the geometry that a camera sees at a time; errors as `render`."""
+    return geometry_key(_work(scene, camera, time_s, 0, None).site)
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """The light of one camera at one time, to be found or rendered."""
+
+    site: Site
+    seed: int
+    cache: LightCache
+
+    def samples(self) -> Samples | None:
+        """Return the samples in each pixel of the film, None where there is no indirect light."""
+        document = self.site.scene.document
+        share = document.render.noise
+        if not document.has_indirect_light():
+            return None
+        if share is None or not backend().vectorised:
+            return stock.samples_of(self.site.scene)
+        shape = groups.film_shape(self._rays, document.render.indirect.scale)
+        return noise.samples_map(self._kept(_PILOT, self._pilot), self.site.scene, share, shape)
+
+    def light(self, samples: Samples | None) -> Light:
+        """Return the light with so many samples in each pixel."""
+        return self._kept(samples, lambda: self._light(self._indirect(samples)))
+
+    def _kept(self, samples: Samples | str | None, rendered: Callable[[], Light]) -> Light:
+        made_by = versions(backend().variant)
+        key = light_key(self.site, self._geometry, self.seed, self._power, samples, made_by)
+        light = self.cache.get(key, counts=rendered is not self._pilot)
+        if light is None:
+            light = rendered()
+            self.cache.put(key, light)
+        return light
+
+    def _pilot(self) -> Light:
+        site = self.site
+        key = groups.light_seed(self.seed, "pilot", site.name, self._geometry)
+        return self._light(groups.pilot(site.scene, self._rays, site.time_s, key, self._power))
+
+    def _indirect(self, samples: Samples | None) -> Indirect | None:
+        scene, time_s, name = self.site.scene, self.site.time_s, self.site.name
+        key = groups.light_seed(self.seed, "indirect", name, self._geometry)
+        if not backend().vectorised:
+            return stock.indirect(scene, name, self.site.camera, self.site.pose, time_s, key, self._direct)
+        light = groups.indirect(scene, self._rays, time_s, key, self._power, samples)
+        if light is None:
+            return None
+        return sharpened(scene, self._rays, time_s, key, self._power, light)
+
+    def _light(self, indirect: Indirect | None) -> Light:
+        site = self.site
+        mirrors = facets(site.scene).name if backend().vectorised else ()
+        groups_of_light = world.groups(site.scene)
+        return Light(
+            site.name, site.time_s, self.seed, groups_of_light, (940e-9,), self._direct, indirect, mirrors
+        )
+
+    @cached_property
+    def _geometry(self) -> str:
+        return geometry_key(self.site)
+
+    @cached_property
+    def _rays(self) -> groups.Rays:
+        return groups.rays_of(self.site.camera, self.site.pose)
+
+    @cached_property
+    def _power(self) -> NDArray[np.float64]:
+        return _power(self.site.scene, self.site.camera)
+
+    @cached_property
+    def _direct(self) -> DirectTable:
+        site = self.site
+        world.check_meshes(site.scene, site.pose.position_m, f"the camera {site.name} at {site.time_s:g} s")
+        return direct_table(site.scene, site.pose, site.time_s, specular=backend().vectorised)
+
+
+def _work(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCache | None) -> _Work:
+    """Return the work of a camera that stands where it can see; errors as `render`."""
     robot, device = scene.camera(camera)
     pose = camera_pose(robot, device, time_s)
     inside = solid_around(scene.document, pose.position_m)
@@ -37,17 +143,8 @@ def render(scene: Scene, camera: str, time_s: float, seed: int) -> Light:
     indivisible = indivisible_sensor(scene.document, camera)
     if indivisible is not None:
         raise InputError(f"{scene.path}: {indivisible}")
-    world.check_meshes(scene, pose.position_m, f"the camera {camera} at {time_s:g} s")
-    grouped = backend().vectorised
-    direct = direct_table(scene, pose, time_s, specular=grouped)
-    names = world.groups(scene)
-    if not grouped:
-        light = stock.indirect(scene, camera, device, pose, time_s, seed, direct)
-        return Light(camera, time_s, seed, names, (940e-9,), direct, light)
-    key = groups.light_seed(seed, "indirect", camera, time_s)
-    power = _power(scene, device)
-    light = groups.indirect(scene, groups.rays_of(device, pose), time_s, key, power)
-    return Light(camera, time_s, seed, names, (940e-9,), direct, light, facets(scene).name)
+    site = Site(scene, camera, device, pose, time_s)
+    return _Work(site, seed, LightCache() if cache is None else cache)
 
 
 def _power(scene: Scene, camera: Camera) -> NDArray[np.float64]:

@@ -34,6 +34,7 @@ _SMALLEST_SPHERE = 0.01
 _CLEARANCE_RAYS = 256
 # The scalar variants are 4 to 6 times slower; they get by with fewer samples, and the noise says so.
 _SCALAR_SAMPLES = 4
+_DEFAULT_SAMPLES = 16
 # Mitsuba's camera looks along z with x to the left and y up; ours has x right and y down.
 _CAMERA_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0])
 
@@ -68,7 +69,7 @@ def indirect(
     for group, emitter in enumerate(groups):
         small = emitter in sources and sources[emitter][1].radius_m < small_m
         view = _view(scene, time_s, emitter, small=small and not smooth, seen=group in seen)
-        keys = [_seed(seed, name, time_s, emitter, batch) for batch in range(batches)]
+        keys = [_seed(seed, name, emitter, batch) for batch in range(batches)]
         renders = np.stack(
             [_batch(view, sensor, samples // batches, settings.max_depth, key) for key in keys]
         )
@@ -99,8 +100,11 @@ def _refuse_what_only_groups_render(scene: Scene) -> None:
 
 
 def samples_of(scene: Scene) -> int:
-    """Return the samples per pixel that this machine renders a scene with: fewer without LLVM."""
-    asked = scene.document.render.indirect.samples
+    """Return the samples per pixel that this machine renders a scene with: fewer without LLVM.
+
+    A target for the noise is nothing that this renderer knows.
+    """
+    asked = scene.document.render.indirect.samples or _DEFAULT_SAMPLES
     return asked if backend().vectorised else min(asked, _SCALAR_SAMPLES)
 
 

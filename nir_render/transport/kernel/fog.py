@@ -75,20 +75,20 @@ def arc(fog: FogTable, angle: Any) -> Any:
     return dr.lerp(dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1), share)
 
 
-def arc_slope(fog: FogTable, angle: Any) -> Any:
-    """Return the slope of `arc`, rad/sr per rad: what `angle_of_arc` draws by."""
+def slope(fog: FogTable, table: Any, angle: Any) -> Any:
+    """Return the slope of a table over angles, `arc` or `halo`: the density by which `drawn_angle` draws."""
     mi, dr = backend().mi, backend().dr
     cell = _cell(angle)
-    before, after = dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1)
+    before, after = dr.gather(mi.Float, table, cell), dr.gather(mi.Float, table, cell + 1)
     low, high = dr.gather(mi.Float, fog.angle, cell), dr.gather(mi.Float, fog.angle, cell + 1)
     return (after - before) / (high - low)
 
 
-def angle_of_arc(fog: FogTable, value: Any) -> Any:
-    """Return the angle up to which `arc` is `value`."""
+def drawn_angle(fog: FogTable, table: Any, value: Any) -> Any:
+    """Return the angle up to which a table over angles, `arc` or `halo`, is `value`."""
     mi, dr = backend().mi, backend().dr
-    cell = dr.binary_search(0, CELLS - 1, lambda k: dr.gather(mi.Float, fog.arc, k + 1) <= value)
-    before, after = dr.gather(mi.Float, fog.arc, cell), dr.gather(mi.Float, fog.arc, cell + 1)
+    cell = dr.binary_search(0, CELLS - 1, lambda k: dr.gather(mi.Float, table, k + 1) <= value)
+    before, after = dr.gather(mi.Float, table, cell), dr.gather(mi.Float, table, cell + 1)
     low, high = dr.gather(mi.Float, fog.angle, cell), dr.gather(mi.Float, fog.angle, cell + 1)
     share = dr.clip((value - before) / dr.maximum(after - before, 1e-20), 0.0, 1.0)
     return dr.lerp(low, high, share)

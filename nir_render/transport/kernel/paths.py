@@ -19,7 +19,7 @@ from nir_render.transport.kernel import connect
 from nir_render.transport.kernel import draws as use
 from nir_render.transport.kernel import fog as foggy
 from nir_render.transport.kernel.arrive import arriving
-from nir_render.transport.kernel.scatter import scatter_on_the_way
+from nir_render.transport.kernel.scatter import scatter_on_the_way, turned
 from nir_render.transport.kernel.tables import Surfaces, World
 
 # How a path came here since its last vertex that scatters evenly: straight on (through panes at most), by one
@@ -164,7 +164,7 @@ def _step(
         reach = dr.select(met, si.t, _FAR)
         begin, end = foggy.interval(world.fog, state.origin, state.direction, reach)
         in_fog = state.active & ~state.inside & (end > begin)
-        distance, density = scatter_on_the_way(
+        row, distance, density = scatter_on_the_way(
             world, state, begin, end, in_fog & further, max_depth, number, add
         )
         lost = foggy.absorbed(world.fog.extinction * (end - begin))
@@ -174,7 +174,10 @@ def _step(
         flown = world.fog.extinction * dr.exp(-world.fog.extinction * (distance - begin))
         turned_weight = world.fog.albedo * flown / (density * lost)
         turned_at = state.origin + state.direction * distance
-        turned_to = foggy.turned(world.fog, state.direction, number(use.TURN_U), number(use.TURN_V))
+        turned_to, share = turned(
+            world, row, turned_at, state.direction, number(use.TURN_U), number(use.TURN_V), in_fog
+        )
+        turned_weight = turned_weight * share
 
     # Light that the path meets.
     shape = dr.reinterpret_array(mi.UInt32, si.shape)

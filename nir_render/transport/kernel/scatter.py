@@ -22,12 +22,12 @@ _CANDIDATES = 4
 
 def scatter_on_the_way(
     world: World, state: Any, begin: Any, end: Any, active: Any, max_depth: Any, number: Any, add: Any
-) -> tuple[Any, Any]:
+) -> tuple[Any, Any, Any]:
     """Add the light of one light that fog on a stretch scatters into the path.
 
     Returns
     -------
-    The distance at which it was scattered, and the density per metre with which that was drawn.
+    The light, the distance at which its light was scattered, and the density per metre with which that was drawn.
     """
     mi, dr = backend().mi, backend().dr
     fog = world.fog
@@ -44,7 +44,7 @@ def scatter_on_the_way(
     seen = active & (brought > 0.0) & dr.isfinite(brought)
     share = arriving(world, row, place, aim, state.depth, max_depth, seen)
     add(brought * share, row, seen & (share > 0.0))
-    return distance, density
+    return row, distance, density
 
 
 def _light_for_stretch(
@@ -135,12 +135,12 @@ def _place_on_stretch(
         far = far | (dr.gather(mi.UInt32, world.lights.kind, row, active) == SUN)
     by_arc = ~far & (u < 0.5)
     u = dr.select(far, u, dr.select(by_arc, 2.0 * u, 2.0 * u - 1.0))
-    angle = foggy.angle_of_arc(fog, dr.lerp(low, high, u))
+    angle = foggy.drawn_angle(fog, fog.arc, dr.lerp(low, high, u))
     sine, cosine = dr.sincos(angle)
     distance = dr.clip(middle - off * cosine / dr.maximum(sine, 1e-9), begin, end)
     distance = dr.select(by_arc, distance, _flight_within(world, begin, end, u))
     beside = distance - middle
-    slope = foggy.arc_slope(fog, dr.atan2(off, -beside))
+    slope = foggy.slope(fog, fog.arc, dr.atan2(off, -beside))
     arc_density = slope / dr.maximum(high - low, 1e-9) * off / (off * off + beside * beside)
     whole = foggy.absorbed(fog.extinction * (end - begin))
     flight_density = fog.extinction * dr.exp(-fog.extinction * (distance - begin)) / whole
@@ -165,3 +165,46 @@ def _flight_within(world: World, begin: Any, end: Any, u: Any) -> Any:
     assert world.fog is not None  # noqa: S101 (only called in fog)
     whole = foggy.absorbed(world.fog.extinction * (end - begin))
     return dr.minimum(begin - dr.log(1.0 - u * whole) / world.fog.extinction, end)
+
+
+def turned(
+    world: World, row: Any, place: Any, direction: Any, u: Any, v: Any, active: Any
+) -> tuple[Any, Any]:
+    """Return the direction of a path that turns in fog, and its weight.
+
+    Half of the draws go by the phase function, half into the halo of a light.
+    """
+    dr = backend().dr
+    halo = Halo(world, row, place, active)
+    by_phase = u < 0.5
+    u = dr.select(by_phase, 2.0 * u, 2.0 * u - 1.0)
+    onward = dr.select(by_phase, foggy.turned(world.fog, direction, u, v), halo.direction(u, v))
+    phase = foggy.phase(world.fog, 0.5 * dr.squared_norm(onward - direction))
+    return onward, phase / (0.5 * (phase + halo.density(onward)))
+
+
+class Halo:
+    """The shining fog around a light, as seen from a place: directions drawn by how it shines, roughly."""
+
+    def __init__(self, world: World, row: Any, place: Any, active: Any) -> None:
+        mi, dr = backend().mi, backend().dr
+        assert world.fog is not None  # noqa: S101 (only in fog)
+        self.fog = world.fog
+        axis = dr.normalize(dr.gather(mi.Point3f, world.lights.center, row, active) - place)
+        if world.lights.sun >= 0:
+            sun = dr.gather(mi.UInt32, world.lights.kind, row, active) == SUN
+            axis = dr.select(sun, dr.gather(mi.Vector3f, world.lights.normal, row, active), axis)
+        self.axis = axis
+
+    def direction(self, u: Any, v: Any) -> Any:
+        mi, dr = backend().mi, backend().dr
+        sine, cosine = dr.sincos(foggy.drawn_angle(self.fog, self.fog.halo, u))
+        sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * v)
+        return mi.Frame3f(self.axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, cosine))
+
+    def density(self, direction: Any) -> Any:
+        """Return the density per sr: that of the angle θ off the light over 2π sin θ."""
+        dr = backend().dr
+        across = dr.norm(dr.cross(direction, self.axis))
+        angle = dr.atan2(across, dr.dot(direction, self.axis))
+        return foggy.slope(self.fog, self.fog.halo, angle) / (2.0 * dr.pi * dr.maximum(across, 1e-7))

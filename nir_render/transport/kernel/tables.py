@@ -96,6 +96,7 @@ class FogTable:
     density: Any
     cumulative: Any
     arc: Any
+    halo: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +222,7 @@ def upload_fog(medium: Medium) -> FogTable:
         density=_real(medium.phase.density_per_sr),
         cumulative=_real(medium.phase.cumulative),
         arc=_real(medium.phase.arc),
+        halo=_real(medium.phase.halo),
     )
 
 

@@ -1,0 +1,180 @@
+"""Lights that have been rendered, by the hash of what determines them: in memory, and on disk where asked.
+
+A file is an uncompressed NumPy archive (.npz), named by its key: one array for each array of the light, and
+a JSON header with the rest. It is written aside, synced and renamed, so several processes may share a folder;
+the archive's checksums are tested on reading, and a file that is damaged counts as none.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import tempfile
+import time
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.errors import InputError
+from nir_render.transport import light as light_module
+from nir_render.transport.light import Light
+
+_SUFFIX = ".light.npz"
+_ASIDE = ".partial-"
+_ABANDONED_AFTER_S = 3600.0
+_HEADER = "header"
+
+
+class LightCache:
+    """Lights by key; the least recently used go first.
+
+    The last light of each camera stays in memory whatever the limit. On disk the folder may hold `limit_bytes`.
+    `reused` and `missed` count the lights that were asked for.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path | None = None,
+        limit_bytes: int = 4 * 2**30,
+        memory_limit_bytes: int = 2**30,
+    ) -> None:
+        """Open a cache; without a folder it lives in memory alone.
+
+        Raises
+        ------
+        InputError
+            The folder cannot be made, or a limit is negative.
+        """
+        if min(limit_bytes, memory_limit_bytes) < 0:
+            raise InputError("the light cache's limit is negative; wanted bytes, 0 or more")
+        self._folder = None if folder is None else Path(folder)
+        self._limit_bytes, self._memory_limit_bytes = limit_bytes, memory_limit_bytes
+        self._held: OrderedDict[str, Light] = OrderedDict()
+        self.reused = self.missed = 0
+        if self._folder is not None:
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(
+                    f"{folder}: cannot be a light cache ({error.strerror or error}); give another folder"
+                ) from None
+
+    def get(self, key: str, *, counts: bool = True) -> Light | None:
+        """Return the light of a key, None where it is not there or its file is damaged."""
+        light = self._held.get(key) or self._read(key)
+        if counts:
+            self.missed += light is None
+            self.reused += light is not None
+        if light is not None:
+            self._hold(key, light)
+        return light
+
+    def put(self, key: str, light: Light) -> None:
+        """Keep a light. A disk that is full, or a light above the limit, leaves the folder as it was."""
+        self._hold(key, light)
+        if self._folder is None or bytes_of(light) > self._limit_bytes:
+            return
+        with contextlib.suppress(OSError):
+            _write(self._folder / f"{key}{_SUFFIX}", light)
+        self._shrink(self._folder)
+
+    def _hold(self, key: str, light: Light) -> None:
+        self._held[key] = light
+        self._held.move_to_end(key)
+        newest = {one.camera: name for name, one in self._held.items()}
+        excess_bytes = sum(map(bytes_of, self._held.values())) - self._memory_limit_bytes
+        for name, one in list(self._held.items()):
+            if excess_bytes <= 0:
+                break
+            if newest[one.camera] != name:
+                del self._held[name]
+                excess_bytes -= bytes_of(one)
+
+    def _read(self, key: str) -> Light | None:
+        if self._folder is None:
+            return None
+        path = self._folder / f"{key}{_SUFFIX}"
+        try:
+            light = _load(path)
+            os.utime(path)  # used now
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+            return None
+        return light
+
+    def _shrink(self, folder: Path) -> None:
+        """Remove the least recently used files beyond the limit, and what killed writers have left."""
+        files = []
+        for path in folder.iterdir():
+            with contextlib.suppress(OSError):  # another process may have removed it
+                state = path.stat()
+                if _ASIDE in path.name and time.time() - state.st_mtime > _ABANDONED_AFTER_S:
+                    path.unlink()
+                elif path.name.endswith(_SUFFIX):
+                    files.append((state.st_mtime_ns, path, state.st_size))
+        excess_bytes = sum(size for _, _, size in files) - self._limit_bytes
+        for _, path, size in sorted(files):
+            if excess_bytes <= 0:
+                break
+            with contextlib.suppress(OSError):
+                path.unlink()
+            excess_bytes -= size
+
+
+def bytes_of(light: Light) -> int:
+    """Return the size of a light's arrays."""
+    return sum(array.nbytes for array in _taken_apart(light)[1].values())
+
+
+def _write(path: Path, light: Light) -> None:
+    header, arrays = _taken_apart(light)
+    handle, aside = tempfile.mkstemp(prefix=f".{path.name}{_ASIDE}", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+            np.savez(file, **{_HEADER: text, **arrays})
+            file.flush()
+            os.fsync(file.fileno())
+        Path(aside).replace(path)
+    finally:
+        Path(aside).unlink(missing_ok=True)
+
+
+def _load(path: Path) -> Light:
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    header = json.loads(arrays.pop(_HEADER).tobytes())
+    light = _put_together(header, arrays, "light")
+    if not isinstance(light, Light):
+        raise TypeError(f"{path}: holds no light")
+    return light
+
+
+def _taken_apart(value: Any, name: str = "light") -> tuple[Any, dict[str, NDArray[Any]]]:
+    """Return a dataclass as plain data, and its arrays by the names of the fields that lead to them."""
+    if isinstance(value, np.ndarray):
+        return {"array": name}, {name: value}
+    if not dataclasses.is_dataclass(value):
+        return value, {}
+    fields, arrays = {}, {}
+    for field in dataclasses.fields(value):
+        fields[field.name], inner = _taken_apart(getattr(value, field.name), f"{name}.{field.name}")
+        arrays |= inner
+    return {"class": type(value).__name__, "fields": fields}, arrays
+
+
+def _put_together(data: Any, arrays: dict[str, NDArray[Any]], name: str) -> Any:
+    """Undo `_taken_apart`; what is no class of the light's module raises AttributeError."""
+    if isinstance(data, list):
+        return tuple(data)
+    if not isinstance(data, dict):
+        return data
+    if "array" in data:
+        return arrays[data["array"]]
+    fields = {
+        field: _put_together(inner, arrays, f"{name}.{field}") for field, inner in data["fields"].items()
+    }
+    return getattr(light_module, data["class"])(**fields)

@@ -1,0 +1,184 @@
+"""What determines light, as a hash: two lights of one key are the same bits.
+
+In it: bodies and their materials, where and how large what shines is and how it spreads its light, fog, the
+camera's rays, how finely is sampled, the seed, and the versions of what computes. Not in it: what is
+arithmetic afterwards, such as flux, spectra, filter, exposure, gain and noise.
+
+Everything goes into SHA-256 in one way: each value behind a tag of its type and its length, floats by their
+bytes.
+"""
+
+import hashlib
+import importlib.metadata
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from nir_render.camera.lens import corner_directions
+from nir_render.scene.devices import Camera
+from nir_render.scene.load import Scene
+from nir_render.scene.motion import Pose
+from nir_render.scene.world import Mesh, ShapeDocument
+from nir_render.transport import world
+
+_PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
+# Files of this package that decide the bits of light: a change of one is another version.
+_CODE = ("transport/**/*.py", "scene/*.py", "geometry.py", "camera/lens.py", "camera/enlarge.py")
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A camera, `robot.camera`, of a scene with the geometry at a time; `pose` is that of its axes."""
+
+    scene: Scene
+    name: str
+    camera: Camera
+    pose: Pose
+    time_s: float
+
+
+def geometry_key(site: Site) -> str:
+    """Return the hash of what is where, and of the rays that look at it: 64 hexadecimal digits."""
+    document = site.scene.document
+    turns = world.source_rotations(site.scene, site.time_s)
+    positions_m = world.source_positions_m(site.scene, site.time_s)
+    return _digest(
+        {
+            "shapes": [
+                (name, _shape(shape), document.materials[shape.material])
+                for name, shape in document.shapes.items()
+            ],
+            "lamps": [
+                (name, lamp.center_m, lamp.size_m, lamp.normal) for name, lamp in document.lamps.items()
+            ],
+            "sun": None if document.sun is None else document.sun.direction,
+            "sources": [
+                (name, positions_m[name], source.radius_m)
+                # A source that shines the same in all directions may turn as it likes.
+                + (() if source.pattern is None else (source.pattern, turns[name]))
+                for name, (_, source) in site.scene.sources().items()
+            ],
+            "fog": document.fog,
+            "camera": (site.name, site.pose.position_m, site.pose.rotation, _corners(site.camera)),
+        }
+    )
+
+
+def light_key(
+    site: Site,
+    geometry: str,
+    seed: int,
+    power: NDArray[np.float64],
+    samples: NDArray[np.int64] | int | str | None,
+    made_by: Sequence[str],
+) -> str:
+    """Return the hash of everything that determines a light: 64 hexadecimal digits.
+
+    Parameters
+    ----------
+    geometry
+        The site's `geometry_key`.
+    power
+        What each group counts when lights are chosen, shape (groups,).
+    samples
+        Samples per pixel: one number, one for each pixel, "pilot", or None where there is no indirect light.
+    made_by
+        What computes it: `versions`.
+    """
+    settings = site.scene.document.render
+    return _digest(
+        {
+            "geometry": geometry,
+            "seed": seed,
+            "power": power,
+            "samples": samples,
+            "settings": (settings.indirect.scale, settings.indirect.max_depth, settings.visibility_rays),
+            "made_by": list(made_by),
+        }
+    )
+
+
+def versions(variant: str) -> tuple[str, ...]:
+    """Return Mitsuba's variant, the versions of what computes light, the hash of this package's part."""
+    return (variant, *_versions())
+
+
+def _shape(shape: ShapeDocument) -> tuple[str, dict[str, Any]]:
+    """Return a shape without the name of its material, and a mesh by what its file holds."""
+    fields = {name: getattr(shape, name) for name in type(shape).model_fields if name != "material"}
+    if isinstance(shape, Mesh):
+        file = Path(shape.file)
+        state = file.stat()
+        fields["file"] = (file.suffix.lower(), _content(str(file), state.st_mtime_ns, state.st_size))
+    return type(shape).__name__, fields
+
+
+@lru_cache(maxsize=64)
+def _content(file: str, _changed_ns: int, _size: int) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+@lru_cache(maxsize=64)
+def _corners(camera: Camera) -> str:
+    return _digest(corner_directions(camera))
+
+
+@cache
+def _versions() -> tuple[str, ...]:
+    root = Path(__file__).parents[1]
+    own = hashlib.sha256()
+    for file in sorted(file for pattern in _CODE for file in root.glob(pattern)):
+        own.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return (*(f"{name} {_version(name)}" for name in _PACKAGES), own.hexdigest())
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _digest(value: Any) -> str:
+    hashed = hashlib.sha256()
+    for part in _parts(value):
+        hashed.update(part)
+    return hashed.hexdigest()
+
+
+def _parts(value: Any) -> Iterable[bytes]:
+    """Yield the canonical bytes of plain data, arrays and models."""
+    match value:
+        case None:
+            yield b"n"
+        case bool() | int() | np.integer():
+            yield f"i{int(value)};".encode()
+        case float():
+            yield b"d" + struct.pack("<d", value)
+        case str():
+            yield f"s{len(value.encode())};{value}".encode()
+        case np.ndarray():
+            array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
+            yield f"a{array.dtype.str}{array.shape};".encode()
+            yield array.tobytes()
+        case tuple() | list():
+            yield f"l{len(value)};".encode()
+            for item in value:
+                yield from _parts(item)
+        case BaseModel():
+            fields = {name: getattr(value, name) for name in type(value).model_fields}
+            yield from _parts((type(value).__name__, fields))
+        case Mapping():
+            yield f"m{len(value)};".encode()
+            for key, item in value.items():
+                yield from _parts(key)
+                yield from _parts(item)
+        case _:
+            raise TypeError(f"{type(value).__name__} has no canonical bytes")

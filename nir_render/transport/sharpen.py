@@ -1,0 +1,70 @@
+"""Sharp edges for indirect light that was rendered in blocks of pixels."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.enlarge import enlargement
+from nir_render.scene.load import Scene
+from nir_render.transport import groups, world
+from nir_render.transport.kernel.tables import World
+from nir_render.transport.labels import labels_of
+from nir_render.transport.light import Edges, Indirect
+
+
+def sharpened(
+    scene: Scene, rays: groups.Rays, time_s: float, seed: int, power: NDArray[np.float64], light: Indirect
+) -> Indirect:
+    """Return a light with what its enlargement needs: weights beside edges, and pixels rendered one by one.
+
+    These have as many samples as the block that they lie in. Of scale 1 nothing is enlarged.
+
+    Parameters
+    ----------
+    rays, time_s, seed, power
+        Those with which the light was rendered, as for `groups.indirect`.
+    """
+    if light.scale == 1:
+        return light
+    built = groups.world_on_device(scene, time_s, power)
+    how = enlargement(labels_of(built, rays.origin_m, rays.corners), light.scale)
+    blocks = light.radiance_per_w.shape[2:]
+    row, column = (at // light.scale for at in np.divmod(how.patch.astype(np.int64), how.columns))
+    counts = np.broadcast_to(light.samples if light.counts is None else light.counts, blocks)[row, column]
+    radiance, variance = estimated(
+        scene, built, rays, groups.light_seed(seed, "edges"), how.patch.astype(np.int64), counts
+    )
+    return replace(light, edges=Edges(how, radiance[:, None], variance[:, None]))
+
+
+def estimated(
+    scene: Scene,
+    built: World,
+    rays: groups.Rays,
+    seed: int,
+    pixels: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return radiance per unit of each group in some pixels of the sensor, and its variance.
+
+    Parameters
+    ----------
+    pixels
+        Numbers of the pixels, row by row, shape (pixels,).
+    counts
+        Samples in each, powers of two, shape (pixels,).
+
+    Returns
+    -------
+    Shape (groups, pixels) each.
+    """
+    number = len(world.groups(scene))
+    radiance, variance = (np.zeros((number, pixels.size), dtype=np.float32) for _ in range(2))
+    for count in np.unique(counts):
+        some = np.flatnonzero(counts == count)
+        film = groups.film_on_device(rays, 1, pixels[some])
+        radiance[:, some], variance[:, some] = groups.estimate(
+            built, film, seed, number, int(count), scene.document.render.indirect.max_depth
+        )
+    return radiance, variance
