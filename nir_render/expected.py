@@ -144,10 +144,11 @@ def diffuse_image(
     rows, columns = camera.sensor.rows, camera.sensor.columns
     image = np.zeros((rows, columns))
     edges = indirect.edges
+    how = None if edges is None else edges.enlargement
     parts = by_spectrum(light, scene, indirect.radiance_per_w, flux_w)
     patches = [] if edges is None else by_spectrum(light, scene, edges.radiance_per_w, flux_w)
     for (emitter, radiance), patch in zip_longest(parts, (patch for _, patch in patches)):
-        whole = enlarge(radiance, rows, columns, edges and edges.enlargement, patch)
+        whole = enlarge(radiance, rows, columns, how, patch)
         image += diffuse_electrons(camera, whole, emitter, exposure_s)
     return image
 
@@ -164,10 +165,11 @@ def _render_variance(
     rows, columns = camera.sensor.rows, camera.sensor.columns
     total = np.zeros((rows, columns))
     edges = indirect.edges
+    how = None if edges is None else edges.enlargement
     parts = by_spectrum(light, scene, indirect.variance, flux_w**2)
     patches = [] if edges is None else by_spectrum(light, scene, edges.variance, flux_w**2)
     for (emitter, variance), patch in zip_longest(parts, (patch for _, patch in patches)):
-        deviation = enlarge_deviation(variance, rows, columns, edges and edges.enlargement, patch)
+        deviation = enlarge_deviation(variance, rows, columns, how, patch)
         total += diffuse_electrons(camera, deviation, emitter, exposure_s) ** 2
     return total
 

@@ -17,7 +17,7 @@ from nir_render.evaluate.metrics import Evaluation, FrameKey, evaluate
 from nir_render.evaluate.truth import SourceTruth, parse_truth
 from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene, load_scene
-from nir_render.simulate import simulate
+from nir_render.simulate import Shot, simulate
 from nir_render.transport.cache import LightCache
 from nir_render.transport.light import Indirect, Light
 from nir_render.transport.noise import MOST_SAMPLES
@@ -76,6 +76,7 @@ def render_run(
     with run_folder.new_run_folder(folder, overwrite) as aside:
         records, truth, noise_shares, aperture_shares = [], [], [], []
         sampled: dict[str, dict[str, Any]] = {}
+        enlarged: dict[str, dict[str, float]] = {}
         cache = LightCache() if cache is None else cache
         kept: dict[str, tuple[str, Light]] = {}
         for done, shot in enumerate(simulate(scene, cache=cache)):
@@ -87,6 +88,7 @@ def render_run(
             aperture_shares.append(shot.aperture_noise_share)
             if shot.frame.camera not in sampled and shot.light.indirect is not None:
                 sampled[shot.frame.camera] = _sample_facts(shot.light.indirect)
+                enlarged |= _enlarging_facts(scene, shot)
             if keep_light:
                 folder_of_light = aside / "light" / shot.frame.camera
                 kept[shot.frame.camera] = _write_light(
@@ -105,7 +107,8 @@ def render_run(
             "variant": backend().variant,
             "variant_reason": backend().reason,
             "seconds": {"render": round(seconds, 3)},
-            "indirect": _indirect_facts(scene) | {"samples_by_camera": sampled},
+            "indirect": _indirect_facts(scene)
+            | {"samples_by_camera": sampled, "upsampling_error_share_of_shot_variance": enlarged},
             # Variance of the Monte Carlo part over shot and read noise: the median over each frame, and the
             # largest of the sums over flares' apertures; the direct part is closed form and carries none.
             "render_noise": {
@@ -134,6 +137,20 @@ def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tu
     except RuntimeError as error:  # how OpenEXR says that the disk is full
         raise InputError(f"{stem}.exr: cannot be written ({error})") from None
     return file, light
+
+
+def _enlarging_facts(scene: Scene, shot: Shot) -> dict[str, dict[str, float]]:
+    """Return how far a frame's enlarged light is off the full render, by camera; none at full resolution."""
+    from nir_render.upsampling import upsampling_error
+
+    frame = shot.frame
+    sensor = scene.camera(frame.camera)[1].sensor
+    mean_e = float(frame.data_dn.mean() - frame.black_level_dn) / sensor.system_gain_dn_per_e
+    error = upsampling_error(shot.light, scene, frame.exposure_s, mean_e)
+    if error is None:
+        return {}
+    facts = {"mean": round(error.share, 6), "standard_error": round(error.standard_error, 6)}
+    return {frame.camera: facts | {"pixels": error.pixels}}
 
 
 def _indirect_facts(scene: Scene) -> dict[str, Any]:

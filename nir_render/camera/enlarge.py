@@ -1,9 +1,9 @@
 """Light that was rendered in blocks of pixels, enlarged to the sensor without smearing it across edges.
 
 Where the blocks around a pixel all show its own surface, light is interpolated linearly between their
-centres. Beside an edge a plane is fitted (weighted least squares) to the blocks near by that show this surface
-alone: blocks that an edge cuts hold averages over several surfaces and are left out. A pixel that an edge cuts
-has its share of each surface. All of it is linear in the light, with weights that geometry alone decides.
+centres. Beside an edge a plane is fitted (weighted least squares) to the blocks near by that show this
+surface alone: blocks that an edge cuts hold averages over several surfaces and are left out. A pixel that an
+edge cuts has its share of each surface. All of it is linear in the light, with weights of geometry alone.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 
 Array = NDArray[np.float64]
 
 _REACH = 2  # blocks on each side from which a plane is fitted
-_KERNEL_BLOCKS = 1.0  # σ of the Gaussian weights of that fit
-_RIDGE = 0.1  # σ² in squared blocks that stands against a slope: what few blocks say of it counts less
+_KERNEL_BLOCKS = 1.4  # σ of the Gaussian weights of that fit
+_RIDGE = 0.03  # σ² in squared blocks that stands against a slope: what few blocks say of it counts less
+_MOST_NOISE = 2.0  # variance that a fitted pixel may have, in variances of a block
 _FAR_OFF = 0.15  # how much nearer or farther a pixel may be than the blocks that tell of it
 _PATCH_SHARE = 0.05  # of all pixels, at most, are rendered one by one
 
@@ -62,8 +63,8 @@ class Enlargement:
     block, weight
         Numbers of blocks, and what they weigh, shape (m,).
     patch
-        Numbers of the pixels that no block tells of, or that the edge of a lamp cuts, shape (p,): they are
-        rendered one by one.
+        Numbers of the pixels that no block tells of well enough, or that the edge of a lamp cuts, shape (p,):
+        they are rendered one by one.
     """
 
     rows: int
@@ -95,7 +96,9 @@ def enlarge(
     """
     if values.shape == (rows, columns):
         return values
-    image = np.asarray(cv2.resize(values, (columns, rows), interpolation=cv2.INTER_LINEAR))
+    image: Array = np.asarray(
+        cv2.resize(values, (columns, rows), interpolation=cv2.INTER_LINEAR), dtype=np.float64
+    )
     if how is not None:
         image.ravel()[how.pixels] = how.matrix(values.size) @ values.ravel()
         if patch is not None:
@@ -124,21 +127,24 @@ def enlarge_deviation(
     return deviation
 
 
-def interpolated_variance(
-    variance: Array, rows: int, columns: int, pixels: NDArray[np.int64]
-) -> Array:
-    """Return the variance of pixels, numbered row by row, that are linear between independent blocks."""
-    weights, places = [], []
-    for at, count, blocks in zip(np.divmod(pixels, columns), (rows, columns), variance.shape, strict=True):
-        place = np.clip((at + 0.5) * blocks / count - 0.5, 0.0, blocks - 1.0)
-        low = np.minimum(place.astype(np.int64), max(blocks - 2, 0))
-        weights.append((1.0 - (place - low), place - low))
-        places.append((low, np.minimum(low + 1, blocks - 1)))
-    total = np.zeros(len(pixels))
-    for down, row in zip(weights[0], places[0], strict=True):
-        for across, column in zip(weights[1], places[1], strict=True):
-            total += (down * across) ** 2 * variance[row, column]
-    return total
+def weights_of(pixels: NDArray[np.int64], scale: int, how: Enlargement) -> csr_array:
+    """Return what each block weighs in some pixels that no patch holds, shape (pixels, blocks)."""
+    blocks = (how.rows // scale, how.columns // scale)
+    sides = []
+    for at, count in zip(np.divmod(pixels, how.columns), blocks, strict=True):
+        place = np.clip((at + 0.5) / scale - 0.5, 0.0, count - 1.0)
+        low = np.minimum(place.astype(np.int64), max(count - 2, 0))
+        sides.append(((low, 1.0 - (place - low)), (np.minimum(low + 1, count - 1), place - low)))
+    block = np.stack([row * blocks[1] + column for row, _ in sides[0] for column, _ in sides[1]], axis=1)
+    weight = np.stack([down * across for _, down in sides[0] for _, across in sides[1]], axis=1)
+    first = 4 * np.arange(len(pixels) + 1)
+    found = csr_array((weight.ravel(), block.ravel(), first), shape=(len(pixels), blocks[0] * blocks[1]))
+    if not len(how.pixels):
+        return found
+    place = np.minimum(np.searchsorted(how.pixels, pixels), len(how.pixels) - 1)
+    fitted = how.pixels[place] == pixels
+    take = csr_array((fitted * 1.0, place, np.arange(len(pixels) + 1)), shape=(len(pixels), len(how.pixels)))
+    return csr_array(diags_array((~fitted) * 1.0) @ found + take @ how.matrix(found.shape[1]))
 
 
 def enlargement(labels: Labels, scale: int) -> Enlargement:
@@ -148,6 +154,7 @@ def enlargement(labels: Labels, scale: int) -> Enlargement:
     rough = np.flatnonzero(~_between_equals(pure, rows, columns, scale))
     pixel, label, share = _parts(labels, rough)
     block, weight, found = _fit(pure, pixel, label, scale, columns)
+    found &= (weight**2).sum(axis=1) < _MOST_NOISE
     found &= ~_foreshortened(labels, scale, block, weight)
     cut, lone = _chosen(pixel, labels.shining[label], ~found, rows * columns)
     patch = np.concatenate([cut, lone])[: int(_PATCH_SHARE * rows * columns)]

@@ -32,7 +32,8 @@ _HEADER = "header"
 class LightCache:
     """Lights by key; the least recently used go first.
 
-    The last light of each camera stays in memory whatever the limit. On disk the folder may hold `limit_bytes`.
+    The last light of each camera and film stays in memory whatever the limit; on disk the folder may hold
+    `limit_bytes`.
     `reused` and `missed` count the lights that were asked for.
     """
 
@@ -85,12 +86,12 @@ class LightCache:
     def _hold(self, key: str, light: Light) -> None:
         self._held[key] = light
         self._held.move_to_end(key)
-        newest = {one.camera: name for name, one in self._held.items()}
+        newest = {_film(one): name for name, one in self._held.items()}
         excess_bytes = sum(map(bytes_of, self._held.values())) - self._memory_limit_bytes
         for name, one in list(self._held.items()):
             if excess_bytes <= 0:
                 break
-            if newest[one.camera] != name:
+            if newest[_film(one)] != name:
                 del self._held[name]
                 excess_bytes -= bytes_of(one)
 
@@ -124,6 +125,10 @@ class LightCache:
             excess_bytes -= size
 
 
+def _film(light: Light) -> tuple[str, tuple[int, ...]]:
+    return light.camera, () if light.indirect is None else light.indirect.radiance_per_w.shape
+
+
 def bytes_of(light: Light) -> int:
     """Return the size of a light's arrays."""
     return sum(array.nbytes for array in _taken_apart(light)[1].values())
@@ -135,7 +140,8 @@ def _write(path: Path, light: Light) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-            np.savez(file, **{_HEADER: text, **arrays})
+            named: dict[str, Any] = {_HEADER: text, **arrays}
+            np.savez(file, **named)
             file.flush()
             os.fsync(file.fileno())
         Path(aside).replace(path)
@@ -147,7 +153,7 @@ def _load(path: Path) -> Light:
     with np.load(path, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     header = json.loads(arrays.pop(_HEADER).tobytes())
-    light = _put_together(header, arrays, "light")
+    light = _put_together(header, arrays)
     if not isinstance(light, Light):
         raise TypeError(f"{path}: holds no light")
     return light
@@ -159,14 +165,15 @@ def _taken_apart(value: Any, name: str = "light") -> tuple[Any, dict[str, NDArra
         return {"array": name}, {name: value}
     if not dataclasses.is_dataclass(value):
         return value, {}
-    fields, arrays = {}, {}
+    fields: dict[str, Any] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     for field in dataclasses.fields(value):
         fields[field.name], inner = _taken_apart(getattr(value, field.name), f"{name}.{field.name}")
         arrays |= inner
     return {"class": type(value).__name__, "fields": fields}, arrays
 
 
-def _put_together(data: Any, arrays: dict[str, NDArray[Any]], name: str) -> Any:
+def _put_together(data: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     """Undo `_taken_apart`; what is no class of the light's module raises AttributeError."""
     if isinstance(data, list):
         return tuple(data)
@@ -174,7 +181,5 @@ def _put_together(data: Any, arrays: dict[str, NDArray[Any]], name: str) -> Any:
         return data
     if "array" in data:
         return arrays[data["array"]]
-    fields = {
-        field: _put_together(inner, arrays, f"{name}.{field}") for field, inner in data["fields"].items()
-    }
+    fields = {field: _put_together(inner, arrays) for field, inner in data["fields"].items()}
     return getattr(light_module, data["class"])(**fields)

@@ -43,13 +43,13 @@ def labels_of(built: World, origin_m: NDArray[np.float64], corners: NDArray[np.f
     # Numbered by where they are first seen: Mitsuba's own numbers change from one scene built to the next.
     rank = np.empty(len(keys), dtype=np.int32)
     rank[np.argsort(first)] = np.arange(len(keys))
-    label = rank[label.ravel()]
+    labels: NDArray[np.int32] = rank[label.ravel()]
     shining = np.empty(len(keys), dtype=bool)
     shining[rank] = _shows_lamp(built, keys)
     return Labels(
-        middle=label[1 : 1 + rows * columns].reshape(rows, columns),
+        middle=labels[1 : 1 + rows * columns].reshape(rows, columns),
         edge=edge,
-        within=label[1 + rows * columns :].reshape(edge.size, _PLACES),
+        within=labels[1 + rows * columns :].reshape(edge.size, _PLACES),
         nearness_per_m=nearness_per_m.reshape(rows, columns),
         shining=shining,
     )

@@ -8,8 +8,8 @@ The need of a pixel is the count that brings its render variance to a share of s
 pilot's variance, from 8 batches, is itself noisy, and where rare paths carry the light most of its values are
 too small; its mean is right. So needs are means over 5 × 5 pixels of the pilot, and taken a tenth larger.
 
-- The frame's count is the median of the needs. A pixel gets its own need or the frame's count, whichever is
-  less: at least half of all pixels then keep the target.
+- The frame's count is the median of the needs, at least 8. Each pixel gets its own need, up to 4 times the
+  frame's count: more than half of all pixels then keep the target, and most of the rest too.
 - No pixel may look like a flare by render noise: each gets what brings its σ to half of the sensor's, up to
   16 times the frame's count.
 - Every flare's aperture gets what brings the sum over it to the target.
@@ -33,7 +33,7 @@ LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _CAUTION = 1.1
 _NEIGHBOURS = 5
 _FLARE_LIKE_SHARE = 0.25  # of temporal variance: half of its σ
-_FLARE_LIKE_RISE = 16  # times the frame's count
+_RISE, _FLARE_LIKE_RISE = 4, 16  # times the frame's count
 _TINY_E2 = 1e-12
 
 
@@ -64,7 +64,7 @@ def samples_map(pilot: Light, scene: Scene, noise_share: float, shape: tuple[int
     need = ratio / noise_share
     frame = max(float(np.median(need)), LEAST_SAMPLES)
     flare_like = np.minimum(ratio / _FLARE_LIKE_SHARE, _FLARE_LIKE_RISE * frame)
-    need = np.maximum(np.minimum(need, frame), flare_like)
+    need = np.maximum(np.minimum(need, _RISE * frame), flare_like)
     scale = camera.sensor.rows // shape[0]
     apertures = flare_apertures(pilot, camera)
     shares = aperture_shares(apertures, noise_e2, temporal_e2, scale)

@@ -122,7 +122,7 @@ class _Work:
 
     @cached_property
     def _power(self) -> NDArray[np.float64]:
-        return _power(self.site.scene, self.site.camera)
+        return group_power(self.site.scene, self.site.camera)
 
     @cached_property
     def _direct(self) -> DirectTable:
@@ -147,7 +147,7 @@ def _work(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCache
     return _Work(site, seed, LightCache() if cache is None else cache)
 
 
-def _power(scene: Scene, camera: Camera) -> NDArray[np.float64]:
+def group_power(scene: Scene, camera: Camera) -> NDArray[np.float64]:
     """Return what each group counts when lights are chosen: the electrons that it brings, roughly.
 
     In steps of 4 below the strongest: so a light is rendered anew seldom when a source's power, the spectrum or

@@ -32,21 +32,58 @@ def sharpened(
     blocks = light.radiance_per_w.shape[2:]
     row, column = (at // light.scale for at in np.divmod(how.patch.astype(np.int64), how.columns))
     counts = np.broadcast_to(light.samples if light.counts is None else light.counts, blocks)[row, column]
-    radiance, variance = estimated(
+    radiance, variance = _estimated(
         scene, built, rays, groups.light_seed(seed, "edges"), how.patch.astype(np.int64), counts
     )
     return replace(light, edges=Edges(how, radiance[:, None], variance[:, None]))
 
 
-def estimated(
+def rendered_again(
+    scene: Scene,
+    rays: groups.Rays,
+    time_s: float,
+    seed: int,
+    power: NDArray[np.float64],
+    pixels: dict[int, NDArray[np.int64]],
+    samples: int,
+) -> list[dict[int, NDArray[np.float32]]]:
+    """Return the indirect light of some pixels of films, twice, independent of each other and of the light.
+
+    Parameters
+    ----------
+    rays, time_s, seed, power
+        As for `groups.indirect`.
+    pixels
+        Their numbers, row by row, by the scale of the film.
+    samples
+        In each pixel, a power of two.
+
+    Returns
+    -------
+    By scale, radiance per unit of each group, shape (groups, nodes, pixels).
+    """
+    built = groups.world_on_device(scene, time_s, power)
+    renders: list[dict[int, NDArray[np.float32]]] = []
+    for number in range(2):
+        radiance = {}
+        for scale, some in pixels.items():
+            key = groups.light_seed(seed, "again", number, scale)
+            counts = np.full(some.size, samples)
+            radiance[scale] = _estimated(scene, built, rays, key, some, counts, scale)[0][:, None]
+        renders.append(radiance)
+    return renders
+
+
+def _estimated(
     scene: Scene,
     built: World,
     rays: groups.Rays,
     seed: int,
     pixels: NDArray[np.int64],
     counts: NDArray[np.int64],
+    scale: int = 1,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return radiance per unit of each group in some pixels of the sensor, and its variance.
+    """Return radiance per unit of each group in some pixels of a film, and its variance.
 
     Parameters
     ----------
@@ -63,7 +100,7 @@ def estimated(
     radiance, variance = (np.zeros((number, pixels.size), dtype=np.float32) for _ in range(2))
     for count in np.unique(counts):
         some = np.flatnonzero(counts == count)
-        film = groups.film_on_device(rays, 1, pixels[some])
+        film = groups.film_on_device(rays, scale, pixels[some])
         radiance[:, some], variance[:, some] = groups.estimate(
             built, film, seed, number, int(count), scene.document.render.indirect.max_depth
         )

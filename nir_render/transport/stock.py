@@ -58,7 +58,7 @@ def indirect(
     samples = samples_of(scene)
     batches = min(_BATCHES, samples)
     groups = world.groups(scene)
-    sensor = _sensor(camera, pose, settings.scale)
+    sensor = mitsuba_camera(camera, pose, settings.scale)
     seen = {
         int(group) for group, share in zip(direct.group, direct.visible_fraction, strict=True) if share > 0
     }
@@ -174,7 +174,8 @@ def _radiance_of(source: Source) -> float:
     return 1.0 / (4.0 * np.pi**2 * source.radius_m**2)
 
 
-def _sensor(camera: Camera, pose: Pose, scale: int) -> Any:
+def mitsuba_camera(camera: Camera, pose: Pose, scale: int, medium: Any = None) -> Any:
+    """Return a camera as Mitsuba has it, with pixels of scale × scale of its own, in a medium."""
     mi = backend().mi
     lens = intrinsics_of(camera)
     matrix = np.eye(4)
@@ -196,6 +197,7 @@ def _sensor(camera: Camera, pose: Pose, scale: int) -> Any:
                 "rfilter": {"type": "box"},
             },
             "sampler": {"type": "independent"},
+            **({} if medium is None else {"medium": medium}),
         }
     )
 

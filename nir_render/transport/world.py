@@ -1,5 +1,6 @@
 """A scene's bodies at one time as a Mitsuba scene."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,11 @@ def has_smooth_surface(scene: Scene) -> bool:
 
 
 def build(
-    scene: Scene, time_s: float, emitting: str | None = None, as_point: bool = False, panes: bool = True
+    scene: Scene,
+    time_s: float,
+    emitting: str | None = None,
+    as_point: bool = False,
+    panes: bool = True,
 ) -> Any:
     """Return the Mitsuba scene of all bodies at one time, lamps and the spheres of the sources included.
 
@@ -83,6 +88,18 @@ def build(
     lamps absorb what falls on them. With `as_point` the emitting source is a point without a body. Without
     `panes` these are left out: light passes them straight.
     """
+    bodies = described(scene, time_s, () if emitting is None else (emitting,), as_point, panes)
+    # optimize=False: merging equal spectra would tie sources together that must be changed apart.
+    try:
+        return backend().mi.load_dict(bodies, optimize=False)
+    except RuntimeError as error:
+        raise InputError(f"{scene.path}: Mitsuba refuses the scene: {' '.join(str(error).split())}") from None
+
+
+def described(
+    scene: Scene, time_s: float, emitting: Collection[str] = (), as_point: bool = False, panes: bool = True
+) -> dict[str, Any]:
+    """Return what `build` loads, as Mitsuba's dictionary; any number of groups may be `emitting`."""
     bodies: dict[str, Any] = {"type": "scene"}
     for name, shape in scene.document.shapes.items():
         material = scene.document.materials[shape.material]
@@ -94,13 +111,13 @@ def build(
     sources = scene.sources()
     for index, (name, centre_m) in enumerate(source_positions_m(scene, time_s).items()):
         radius_m = sources[name][1].radius_m
-        if name == emitting and as_point:
+        if name in emitting and as_point:
             intensity = _uniform(1.0 / (4.0 * np.pi))  # one watt in all directions
             bodies["point"] = {"type": "point", "position": centre_m.tolist(), "intensity": intensity}
             continue
         sphere = {"type": "sphere", "center": centre_m.tolist(), "radius": radius_m, "bsdf": _BLACK}
         # One watt from the whole sphere: L = 1 / (4π² r²).
-        shine = {"emitter": _area_light(1.0 / (4.0 * np.pi**2 * radius_m**2))} if name == emitting else {}
+        shine = {"emitter": _area_light(1.0 / (4.0 * np.pi**2 * radius_m**2))} if name in emitting else {}
         bodies[f"source_{index}"] = {**sphere, **shine}
     for name, lamp in scene.document.lamps.items():
         panel = Rectangle(
@@ -109,13 +126,9 @@ def build(
         )  # fmt: skip
         # One watt from one side: L = 1 / (π A).
         area_m2 = lamp.size_m[0] * lamp.size_m[1]
-        shine = {"emitter": _area_light(1.0 / (np.pi * area_m2))} if f"lamps.{name}" == emitting else {}
+        shine = {"emitter": _area_light(1.0 / (np.pi * area_m2))} if f"lamps.{name}" in emitting else {}
         bodies[f"lamp_{name}"] = {**_bodies(panel)[0], "bsdf": _BLACK, **shine}
-    # optimize=False: merging equal spectra would tie sources together that must be changed apart.
-    try:
-        return backend().mi.load_dict(bodies, optimize=False)
-    except RuntimeError as error:
-        raise InputError(f"{scene.path}: Mitsuba refuses the scene: {' '.join(str(error).split())}") from None
+    return bodies
 
 
 def source_spheres(bodies: Any) -> list[Any]:
