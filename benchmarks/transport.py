@@ -1,11 +1,11 @@
-"""How fast and how exact light is rendered, side by side with Mitsuba's own integrators; prints one JSON object.
+"""How fast and exact light is rendered, side by side with Mitsuba's own integrators: one JSON object.
 
     python benchmarks/transport.py [--quick] [--only groups,many,scaling,fog,smooth,memory]
 
-Times are medians of five renders of 640 × 480 pixels, 64 samples, depth 6, one after the other in this process.
-Variances are those between seeds (the same number for both sides), median over the pixels; a gain is variance ×
-time of Mitsuba over variance × time of ours. Light that comes straight is left out but where the field says
-otherwise. Mitsuba renders all sources at once, into one image; ours gives one array per source.
+Times are medians of five renders of 640 × 480 pixels, 64 samples, depth 6, one after the other in this
+process. Variances are those between seeds (the same number for both sides), median over the pixels; a gain is
+variance × time of Mitsuba over variance × time of ours. Light that comes straight is left out but where the
+field says otherwise. Mitsuba renders all sources at once, into one image; ours gives one array per source.
 """
 
 import argparse
@@ -71,7 +71,8 @@ def build(
     for box in range(boxes):
         x, y = random.uniform([-0.4 * length_m, -0.4 * width_m], [0.4 * length_m, 0.4 * width_m])
         shapes[f"box{box}"] = {
-            "type": "box", "center": f"[{x:.3f}, {y:.3f}, 0.3] m", "size": "[0.6, 0.6, 0.6] m", "material": "grey",
+            "type": "box", "center": f"[{x:.3f}, {y:.3f}, 0.3] m", "size": "[0.6, 0.6, 0.6] m",
+            "material": "grey",
         }  # fmt: skip
     places_m = random.uniform(
         [-0.45 * length_m, -0.45 * width_m, 0.3], [0.45 * length_m, 0.45 * width_m, 1.0], (robots, 3)
@@ -117,8 +118,8 @@ def _camera(columns: int) -> dict[str, Any]:
         "lens": {"focal_length": "1.8 mm", "f_number": 2.0, "transmission": 0.9},
         "sensor": {
             "columns": columns, "rows": columns * 3 // 4, "pixel_pitch": f"{3840.0 / columns} um",
-            "quantum_efficiency": 0.15, "full_well": "10500 e", "read_noise": "2.3 e", "system_gain": "0.35 DN/e",
-            "black_level": "60 DN", "bit_depth": "12 bit",
+            "quantum_efficiency": 0.15, "full_well": "10500 e", "read_noise": "2.3 e",
+            "system_gain": "0.35 DN/e", "black_level": "60 DN", "bit_depth": "12 bit",
         },
         "point_spread": {"sigma": "0.7 px"},
         "exposure": "1 ms",
@@ -259,7 +260,7 @@ def memory() -> dict[str, float]:
         "print(light.radiance_per_w[:, 0].sum(axis=0).mean())\n"
     )
     started = time.perf_counter()
-    subprocess.run(
+    subprocess.run(  # noqa: S603 (this program itself)
         [sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1], capture_output=True
     )
     peak_kib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss

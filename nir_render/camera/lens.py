@@ -68,7 +68,8 @@ def aperture_area_m2(camera: Camera) -> float:
 def corner_directions(camera: Camera) -> NDArray[np.float64]:
     """Return directions at the corners of all pixels in camera axes, shape (rows + 1, columns + 1, 3).
 
-    Their depth is 1, so that between corners of a rectilinear lens they are linear, and interpolation is exact.
+    Their depth is 1, so that between corners of a rectilinear lens they are linear, and interpolation is
+    exact.
     """
     lens = intrinsics_of(camera)
     x = (np.arange(lens.width_px + 1) - 0.5 - lens.cx_px) / lens.fx_px

@@ -1,6 +1,7 @@
-"""What shines, as arrays for next-event estimation: each light, and its images in the flat smooth surfaces."""
+"""What shines, as arrays for next-event estimation: each light, and its images in flat smooth surfaces."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,10 +77,10 @@ def emitters(scene: Scene, time_s: float, facets: Facets) -> Emitters:
     return Emitters(**columns, image=image)
 
 
-def _lights(scene: Scene, time_s: float) -> dict[str, NDArray[np.generic]]:
+def _lights(scene: Scene, time_s: float) -> dict[str, NDArray[Any]]:
     names = world.groups(scene)
     count = len(names)
-    rows: dict[str, NDArray[np.generic]] = {
+    rows: dict[str, NDArray[Any]] = {
         "group": np.arange(count),
         "kind": np.zeros(count, dtype=np.int64),
         **{name: np.zeros((count, 3)) for name in ("center_m", "half_u_m", "half_v_m", "normal")},
@@ -112,7 +113,7 @@ def _lights(scene: Scene, time_s: float) -> dict[str, NDArray[np.generic]]:
     return rows
 
 
-def _shown(rows: dict[str, NDArray[np.generic]], facets: Facets, facet: int) -> Index:
+def _shown(rows: dict[str, NDArray[Any]], facets: Facets, facet: int) -> Index:
     """Return the lights that stand before a facet, so that it can show them."""
     normal = facets.normal[facet]
     height_m = (rows["center_m"] - facets.center_m[facet]) @ normal
@@ -124,12 +125,10 @@ def _shown(rows: dict[str, NDArray[np.generic]], facets: Facets, facet: int) -> 
     return np.flatnonzero(before & reflects)
 
 
-def _mirrored(
-    rows: dict[str, NDArray[np.generic]], facets: Facets, facet: int
-) -> dict[str, NDArray[np.generic]]:
+def _mirrored(rows: dict[str, NDArray[Any]], facets: Facets, facet: int) -> dict[str, NDArray[Any]]:
     normal = facets.normal[facet]
 
-    def turned(vectors: NDArray[np.generic]) -> NDArray[np.generic]:
+    def turned(vectors: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(vectors - 2.0 * np.outer(vectors @ normal, normal))
 
     sun = (rows["kind"] == SUN)[:, None]

@@ -2,7 +2,8 @@
 
 The conductor: it gathers a scene's numbers, brings them to the device, has `kernel.paths` walk the samples of
 each pixel in batches, and makes mean and variance of what comes back. The film is cut into parts whose arrays
-fit into a bounded memory; as every random number is keyed by pixel, batch and sample, the cuts change nothing.
+fit into a bounded memory; as every random number is keyed by pixel, batch and sample, the cuts change
+nothing.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
 """Which light to ask next: the chance of each emitter, by the place of the surface that is lit.
 
 The scene's box is cut into cells. In each cell an emitter's chance goes with what it would bring to the
-cell's middle if nothing stood in between: its power over the distance squared. A small share is spread evenly,
-so that no emitter is ever left out. Drawing one costs the same for four emitters and for thousands.
+cell's middle if nothing stood in between: its power over the distance squared. A small share is spread
+evenly, so that no emitter is ever left out. Drawing one costs the same for four emitters and for thousands.
 """
 
 from dataclasses import dataclass
@@ -69,9 +69,7 @@ def guide(
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     places_m = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
     rows = range(len(emitters.kind))
-    weight = np.stack(
-        [_brought(emitters, facets, row, places_m, step_m, extinction_per_m) for row in rows]
-    )
+    weight = np.stack([_brought(emitters, facets, row, places_m, step_m, extinction_per_m) for row in rows])
     weight = (weight * power[emitters.group][:, None]).T
     total = weight.sum(axis=1, keepdims=True)
     even = 1.0 / len(emitters.kind)
@@ -81,7 +79,7 @@ def guide(
     cumulative = (cumulative / cumulative[:, -1:]).astype(np.float32)
     cumulative[:, -1] = 1.0
     before = np.concatenate([np.zeros((len(cumulative), 1), dtype=np.float32), cumulative[:, :-1]], axis=1)
-    return Guide(low_m, step_m, counts, cumulative, cumulative - before)
+    return Guide(low_m, step_m, counts, cumulative, np.subtract(cumulative, before, dtype=np.float32))
 
 
 def _brought(

@@ -34,8 +34,8 @@ class PhaseTable:
         ∫ of the phase function over the angle itself, from 0, in rad/sr: what a straight ray past a source
         scatters towards the eye (Kulla & Fajardo 2012: the inverse square cancels against the angle's rate).
     halo
-        Cumulated share of the shine of the fog around a light, against the angle off it: a ray that passes it at
-        an angle θ collects what is left of `arc` beyond θ, over sin θ.
+        Cumulated share of the shine of the fog around a light, against the angle off it: a ray that passes it
+        at an angle θ collects what is left of `arc` beyond θ, over sin θ.
     """
 
     angle_rad: Array

@@ -150,8 +150,8 @@ def _work(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCache
 def group_power(scene: Scene, camera: Camera) -> NDArray[np.float64]:
     """Return what each group counts when lights are chosen: the electrons that it brings, roughly.
 
-    In steps of 4 below the strongest: so a light is rendered anew seldom when a source's power, the spectrum or
-    the filter change, which otherwise matter only afterwards. It moves nothing but noise.
+    In steps of 4 below the strongest: so a light is rendered anew seldom when a source's power, the spectrum
+    or the filter change, which otherwise matter only afterwards. It moves nothing but noise.
     """
     known = scene.emitters().values()
     brought = np.array([emission_units(one) * float(response(camera, one)(0.0)) for one in known])

@@ -1,7 +1,7 @@
 """From a place to a light on the device: choosing one, aiming at it, and what arrives on the way.
 
-A light's image in a flat smooth facet is a light of its own that stands behind the facet: a ray towards it that
-crosses the facet goes on, mirrored, to the light itself. Panes weaken what passes and do not bend it.
+A light's image in a flat smooth facet is a light of its own that stands behind the facet: a ray towards it
+that crosses the facet goes on, mirrored, to the light itself. Panes weaken what passes and do not bend it.
 """
 
 from dataclasses import dataclass
@@ -117,7 +117,7 @@ def in_sun(lights: Lights, direction: Any) -> Any:
 
 
 def emission(lights: Lights, light: Any, leaving: Any, active: Any) -> Any:
-    """Return the radiance of a light (not an image) in a direction in which light leaves it, over its mean."""
+    """Return the radiance of a light, not an image, in a direction that leaves it, over its mean."""
     mi, dr = backend().mi, backend().dr
     if not lights.pattern_polars:
         return mi.Float(1)

@@ -19,8 +19,10 @@ STEP = 14
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Random numbers of the lanes: two keys each, and how many samples make a batch, a power of two
-    (an array of one number, so that another count is no other program)."""
+    """Random numbers of the lanes: two keys each, and how many samples make a batch, a power of two.
+
+    That number is an array, so that another count is no other program.
+    """
 
     key: Any
     key_too: Any
@@ -34,7 +36,7 @@ class Draws:
 
     def vertex(self, sample: Any, depth: Any, use: int) -> Any:
         """Return a number in [0, 1) for a vertex of a path, stratified for its first one."""
-        mi, dr = backend().mi, backend().dr
+        dr = backend().dr
         dimension = CAMERA_DIMENSIONS + depth * STEP + use
         bits = self._bits(sample, dimension)
         plain = _unit(bits)

@@ -8,7 +8,7 @@ from nir_render.transport.phase import CELLS
 
 
 def interval(fog: FogTable, origin: Any, direction: Any, reach: Any) -> tuple[Any, Any]:
-    """Return where along a ray, of unit direction, the fog begins and ends; an empty stretch has end ≤ begin."""
+    """Return where along a ray of unit direction the fog begins and ends; nowhere if end ≤ begin."""
     mi, dr = backend().mi, backend().dr
     begin, end = mi.Float(0.0), mi.Float(reach)
     for axis in range(3):

@@ -4,10 +4,10 @@ Every lane goes on to its next sample as soon as a path ends, so none waits for 
 A lane alone adds to its place in the result, in the order of its samples: the sums are the same bits on any
 number of threads.
 
-Each step is a stretch of a path, from a vertex to the next: fog on the way scatters light of one light towards
-the vertex (a place drawn where the phase function and the inverse square put it, Kulla & Fajardo 2012); at the
-surface one light is asked for (next-event estimation), and the path goes on by the surface's own scattering.
-Both ways to a light are weighted by the power heuristic (Veach 1995).
+Each step is a stretch of a path, from a vertex to the next: fog on the way scatters light of one light
+towards the vertex (a place drawn where the phase function and the inverse square put it, Kulla & Fajardo
+2012); at the surface one light is asked for (next-event estimation), and the path goes on by the surface's
+own scattering. Both ways to a light are weighted by the power heuristic (Veach 1995).
 """
 
 from dataclasses import dataclass, replace
@@ -120,7 +120,7 @@ def walk(
 
 
 def _camera_direction(film: Film, pixel: Any, draw: use.Draws, sample: Any) -> Any:
-    """Return a unit direction in a pixel, evenly drawn, between the directions at its sensor pixel's corners."""
+    """Return a unit direction in a pixel, evenly drawn between those at the sensor pixel's corners."""
     mi, dr = backend().mi, backend().dr
     width = film.columns // film.scale
     row = pixel // width
@@ -155,9 +155,9 @@ def _step(
     met = state.active & si.is_valid()
     further = state.depth + 1 < max_depth
 
-    # Fog: what it scatters on this stretch, how much it leaves of the light beyond, and whether the path itself
-    # turns in it. What lies at the end of the stretch is asked for whether it turns or not, so that this choice
-    # brings no noise into it.
+    # Fog: what it scatters on this stretch, how much it leaves of the light beyond, and whether the path
+    # itself turns in it. What lies at the end of the stretch is asked for whether it turns or not, so that
+    # this choice brings no noise into it.
     turns, passing, turned_weight = mi.Bool(False), state.weight, mi.Float(0)
     turned_at, turned_to = mi.Point3f(0), mi.Vector3f(0, 0, 1)
     if world.fog is not None:
@@ -169,7 +169,8 @@ def _step(
         )
         lost = foggy.absorbed(world.fog.extinction * (end - begin))
         passing = dr.select(in_fog, state.weight * (1.0 - lost), state.weight)
-        # The path turns as often as light would on this stretch, but where the light was asked for: near lights.
+        # The path turns as often as light would on this stretch, but where the light was asked for: near
+        # lights.
         turns = in_fog & further & (number(use.FLIGHT) < lost)
         flown = world.fog.extinction * dr.exp(-world.fog.extinction * (distance - begin))
         turned_weight = world.fog.albedo * flown / (density * lost)
@@ -285,7 +286,7 @@ def _facet(surfaces: Surfaces, si: Any, shape: Any, active: Any) -> Any:
 
 
 def _power(mine: Any, other: Any) -> Any:
-    """Return the power heuristic's weight of the way whose density is `mine`; written so as not to overflow."""
+    """Return the power heuristic's weight of the way whose density is `mine`."""
     dr = backend().dr
     ratio = other / dr.maximum(mine, 1e-30)
     return dr.select(mine > 0.0, 1.0 / (1.0 + ratio * ratio), 0.0)

@@ -1,8 +1,8 @@
 """Light that fog scatters into a stretch of a path, on the device: which light, and where on the way.
 
-One light is drawn for each stretch, and one place, both by what they bring: the phase function and the inverse
-square cancel where the place is drawn evenly in ∫ p dβ, β being the angle at which the light stands off the ray
-(equiangular sampling, Kulla & Fajardo 2012, with the phase function in it).
+One light is drawn for each stretch, and one place, both by what they bring: the phase function and the
+inverse square cancel where the place is drawn evenly in ∫ p dβ, β being the angle at which the light stands
+off the ray (equiangular sampling, Kulla & Fajardo 2012, with the phase function in it).
 """
 
 from typing import Any
@@ -27,9 +27,10 @@ def scatter_on_the_way(
 
     Returns
     -------
-    The light, the distance at which its light was scattered, and the density per metre with which that was drawn.
+    The light, the distance at which its light was scattered, and the density per metre with which that was
+    drawn.
     """
-    mi, dr = backend().mi, backend().dr
+    dr = backend().dr
     fog = world.fog
     assert fog is not None  # noqa: S101 (only called in fog)
     row, chance = _light_for_stretch(world, state, begin, end, active, number(use.FOG_LIGHT))
@@ -52,13 +53,13 @@ def _light_for_stretch(
 ) -> tuple[Any, Any]:
     """Return a light drawn by what it brings to the fog on a stretch, and the chance of it.
 
-    Without shadows and extinction that is power · ∫ p(β) / d² dt = power · (arc(β₁) − arc(β₀)) / D, with D the
-    ray's distance from the light. Few lights are all weighed by it. Of many, the guide proposes some for places
-    along the stretch, and one of these is taken by its weight (resampling, Talbot et al. 2005); the chance
-    returned is then the one that makes the estimate right on average.
+    Without shadows and extinction that is power · ∫ p(β) / d² dt = power · (arc(β₁) − arc(β₀)) / D, with D
+    the ray's distance from the light. Few lights are all weighed by it. Of many, the guide proposes some for
+    places along the stretch, and one of these is taken by its weight (resampling, Talbot et al. 2005); the
+    chance returned is then the one that makes the estimate right on average.
     """
     mi, dr = backend().mi, backend().dr
-    fog, lights = world.fog, world.lights
+    lights = world.lights
     few = lights.rows <= _WEIGHED_LIGHTS
 
     def more(k: Any, *_rest: Any) -> Any:
@@ -86,7 +87,7 @@ def _light_for_stretch(
 
 
 def _candidate(world: World, state: Any, begin: Any, end: Any, number: Any, u: Any) -> tuple[Any, Any]:
-    """Return a light that the guide draws at one of the places spread over a stretch, and its chance there."""
+    """Return a light that the guide draws at one of some places on a stretch, and its chance."""
     mi, dr = backend().mi, backend().dr
     # Fractions of the one number, scaled up, stand for numbers of their own.
     along = u * 1021.0 - dr.floor(u * 1021.0)
@@ -123,12 +124,13 @@ def _place_on_stretch(
 ) -> tuple[Any, Any]:
     """Return a distance on a stretch, and the density per metre with which it was drawn.
 
-    Half of the draws are even in the integral of the phase function over the angle β at which the light stands off
-    the ray, which grows by D/d² for each metre; half go by the extinction, which matters where the light is far.
-    Where the integral is too short for float32, and for the sun, all go by the extinction.
+    Half of the draws are even in the integral of the phase function over the angle β at which the light
+    stands off the ray, which grows by D/d² for each metre; half go by the extinction, which matters where the
+    light is far. Where the integral is too short for float32, and for the sun, all go by the extinction.
     """
     mi, dr = backend().mi, backend().dr
     fog = world.fog
+    assert fog is not None  # noqa: S101 (only called in fog)
     middle, off, low, high = _arcs(world, row, state, begin, end, active)
     far = high - low <= 1e-4
     if world.lights.sun >= 0:
@@ -154,8 +156,10 @@ def _arcs(world: World, row: Any, state: Any, begin: Any, end: Any, active: Any)
     middle = dr.dot(to, state.direction)
     off = dr.norm(to - state.direction * middle)
     off = dr.maximum(off, dr.gather(mi.Float, world.lights.spread, row, active))
-    low = foggy.arc(world.fog, dr.atan2(off, middle - begin))
-    high = foggy.arc(world.fog, dr.atan2(off, middle - end))
+    fog = world.fog
+    assert fog is not None  # noqa: S101 (only called in fog)
+    low = foggy.arc(fog, dr.atan2(off, middle - begin))
+    high = foggy.arc(fog, dr.atan2(off, middle - end))
     return middle, off, low, high
 
 
@@ -178,8 +182,8 @@ def turned(
     halo = Halo(world, row, place, active)
     by_phase = u < 0.5
     u = dr.select(by_phase, 2.0 * u, 2.0 * u - 1.0)
-    onward = dr.select(by_phase, foggy.turned(world.fog, direction, u, v), halo.direction(u, v))
-    phase = foggy.phase(world.fog, 0.5 * dr.squared_norm(onward - direction))
+    onward = dr.select(by_phase, foggy.turned(halo.fog, direction, u, v), halo.direction(u, v))
+    phase = foggy.phase(halo.fog, 0.5 * dr.squared_norm(onward - direction))
     return onward, phase / (0.5 * (phase + halo.density(onward)))
 
 
@@ -197,6 +201,7 @@ class Halo:
         self.axis = axis
 
     def direction(self, u: Any, v: Any) -> Any:
+        """Return a unit direction, drawn."""
         mi, dr = backend().mi, backend().dr
         sine, cosine = dr.sincos(foggy.drawn_angle(self.fog, self.fog.halo, u))
         sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * v)

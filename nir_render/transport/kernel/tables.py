@@ -19,7 +19,7 @@ _EDGELESS_M = 1e30  # stands for infinity, whose products with 0 are not numbers
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """Emitters on the device; see `transport.emitters.Emitters`. `has_*` say what a program must hold at all."""
+    """Emitters on the device; see `transport.emitters.Emitters`. `has_*`: what a program must hold."""
 
     count: Any
     rows: int

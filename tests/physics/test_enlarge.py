@@ -1,0 +1,153 @@
+"""Light rendered in blocks of pixels, enlarged by geometry, against the full render.
+
+Set up: cameras of 320 × 240 with the field of view of the demo's; blocks of 4 × 4 in the arena, of 2 × 2 in the
+corridor, whose lamp hangs 1 cm under the ceiling and lights the walls below it in a steep gradient. Two renders
+of each kind that are independent of each other: the mean of the product of two differences is the mean square
+of the error alone, without the noise of any of them.
+
+Why: perception must not find edges where blocks end. Expected: with labels the error variance is below 1 % of
+shot variance, where plain interpolation is far above it; the figure that a run writes down agrees with it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nir_render import Scene, load_scene, render
+from nir_render.camera.enlarge import Labels
+from nir_render.expected import diffuse_image, expected, fluxes
+from nir_render.scene.motion import camera_pose
+from nir_render.transport import groups, world
+from nir_render.transport.backend import backend
+from nir_render.transport.labels import labels_of
+from nir_render.transport.light import Light
+from nir_render.upsampling import upsampling_error
+
+pytestmark = pytest.mark.mitsuba
+SCENES = Path(__file__).parents[2] / "scenes"
+SMALL = {
+    "robots.r1.rig.cameras.front.sensor.columns": 320,
+    "robots.r1.rig.cameras.front.sensor.rows": 240,
+    "robots.r1.rig.cameras.front.sensor.pixel_pitch": "15 um",
+}
+EXPOSURE_S = 5e-5  # about what the demo's cameras find for pixels of this size
+
+
+@pytest.fixture(autouse=True)
+def _grouped() -> None:
+    if not backend().vectorised:
+        pytest.skip("edges are known where LLVM is")
+
+
+def _scene(name: str, scale: int, samples: int) -> Scene:
+    settings = {"render.indirect.scale": scale, "render.indirect.samples": samples}
+    return load_scene(SCENES / f"{name}.yaml", SMALL | settings)
+
+
+def _labels(scene: Scene, camera: str) -> Labels:
+    robot, device = scene.camera(camera)
+    rays = groups.rays_of(device, camera_pose(robot, device, 0.0))
+    built = groups.world_on_device(scene, 0.0, np.ones(len(world.groups(scene))))
+    return labels_of(built, rays.origin_m, rays.corners)
+
+
+ROOM = """
+format: 1
+observe: [r1.c]
+robots:
+  r1: {rig: {cameras: {c: {preset: infra_swarm, sensor: {preset: mt9m031, columns: 320, rows: 240, pixel_pitch: 15 um}}}}}
+  r2: {rig: {sources: {s: {preset: infra_swarm, radius: 5 cm}}}, position: "[1, 0.5, 0] m"}
+materials:
+  white: {type: diffuse, reflectance: 0.8}
+  silver: {type: mirror, reflectance: 0.9}
+shapes:
+  crate: {type: box, center: "[2, 0, 0] m", size: "[0.6, 0.6, 0.6] m", orientation: {yaw: 45 deg}, material: white}
+  glass: {type: rectangle, center: "[3, -1.5, 0] m", size: "[2, 2] m", normal: [-1, 0, 0], material: silver}
+  behind: {type: rectangle, center: "[-1, -1.5, 0] m", size: "[1, 1] m", normal: [1, 0, 0], material: white}
+lamps:
+  one: {center: "[2, 1.5, 0] m", size: "[0.3, 0.3] m", normal: [-1, 0, 0], luminous_flux: 100 lm, temperature: 2856 K}
+"""
+
+
+def test_labels_are_where_geometry_has_them(tmp_path: Path) -> None:
+    """f = 1.8 mm over 15 µm: 120 px; x px = 159.5 − 120 y / x.
+
+    The crate, turned by 45°, shows two faces that meet at its nearest edge, dead ahead; its edges on the left
+    and right, 0.424 m to the side at 2 m, are 25.5 px off: columns 134 to 185. The source at (1, 0.5): column
+    99.5, radius 5.4 px. The lamp at (2, 1.5) ± 0.15: 90 ± 9 px. The mirror's middle shows nothing at 3 m but
+    what stands 4 m before it: `behind`, mirrored to 7 m, 8.6 px to each side of column 185.2.
+    """
+    path = tmp_path / "room.yaml"
+    path.write_text(ROOM)
+    labels = _labels(load_scene(path), "r1.c")
+    row = labels.middle[120]
+    assert labels.middle[0, 0] == 0
+    assert row[140] != row[180]
+    assert row[140] != 0
+    changes = {int(column) for column in np.flatnonzero(np.diff(row)) + 1}
+    crate = {134, 160}
+    assert crate <= changes
+    assert labels.shining[row[70]]
+    assert labels.shining.sum() == 1
+    assert np.isclose(1.0 / labels.nearness_per_m[120, 70], np.hypot(2.0, 1.5), atol=0.02)
+    assert 9.0 <= (row == row[99]).sum() <= 12.0
+    mirrored = row[190:]
+    assert len(np.unique(mirrored)) >= 3  # `behind` in the mirror, the mirror without it, nothing
+
+
+def _images(
+    name: str, scale: int
+) -> tuple[Scene, list[Light], list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Return lights in blocks, and electrons of them enlarged, interpolated, and of full renders: two each."""
+    scene = _scene(name, scale, 256)
+    lights = [render(scene, "r1.front", seed=seed) for seed in (1, 2)]
+    full = [render(_scene(name, 1, 64), "r1.front", seed=seed) for seed in (3, 4)]
+
+    def electrons(light: Light, edges: bool) -> np.ndarray:
+        assert light.indirect is not None
+        indirect = light.indirect
+        if not edges:
+            indirect = type(indirect)(
+                indirect.radiance_per_w, indirect.variance, indirect.scale, indirect.samples
+            )
+        return diffuse_image(light, indirect, scene, fluxes(light, scene), EXPOSURE_S)
+
+    sharp, plain = ([electrons(light, edges) for light in lights] for edges in (True, False))
+    return scene, lights, sharp, plain, [electrons(light, False) for light in full]
+
+
+@pytest.mark.parametrize(("name", "scale"), [("arena", 4), ("corridor", 2)])
+def test_the_error_is_below_a_hundredth_of_shot_noise(name: str, scale: int) -> None:
+    scene, lights, sharp, plain, full = _images(name, scale)
+    assert lights[0].indirect is not None
+    edges = lights[0].indirect.edges
+    assert edges is not None
+    assert edges.enlargement.patch.size <= 0.05 * full[0].size
+    mean_e = float(expected(lights[0], scene, EXPOSURE_S).electrons.mean())
+
+    def share(images: list[np.ndarray]) -> tuple[float, float]:
+        square_e2 = (images[0] - full[0]) * (images[1] - full[1])
+        square_e2.ravel()[edges.enlargement.patch] = 0.0  # rendered as in the full render: noise alone
+        tiles = square_e2.reshape(60, 4, 80, 4).mean(axis=(1, 3))  # one block's noise is common to its pixels
+        return float(tiles.mean()) / mean_e, float(tiles.std()) / np.sqrt(tiles.size) / mean_e
+
+    (error, sigma), (before, _) = share(sharp), share(plain)
+    assert error + 3.0 * sigma < 0.01
+    assert before > 5.0 * error
+    assert before > 0.003
+    # Edges apart, energy is kept: the same total within 0.5 %.
+    assert sharp[0].sum() == pytest.approx(full[0].sum(), rel=0.005)
+    # What a run measures of itself is that figure.
+    told = upsampling_error(lights[0], scene, EXPOSURE_S, mean_e, pixels=1024, samples=256)
+    assert told is not None
+    assert told.pixels == pytest.approx(1024, abs=2)
+    assert abs(told.share - error) < 4.0 * np.hypot(told.standard_error, sigma)
+
+
+def test_full_resolution_has_nothing_to_measure() -> None:
+    scene = _scene("arena", 1, 8)
+    light = render(scene, "r1.front", seed=1)
+    assert light.indirect is not None
+    assert light.indirect.edges is None
+    assert upsampling_error(light, scene, EXPOSURE_S, 10.0) is None
