@@ -78,6 +78,7 @@ def render_run(
         sampled: dict[str, dict[str, Any]] = {}
         enlarged: dict[str, dict[str, float]] = {}
         cache = LightCache() if cache is None else cache
+        missed, reused = cache.missed, cache.reused
         kept: dict[str, tuple[str, Light]] = {}
         for done, shot in enumerate(simulate(scene, cache=cache)):
             file = f"frames/{shot.frame.camera}/{shot.frame.index:06d}.png"
@@ -118,7 +119,7 @@ def render_run(
                 "share_in_apertures": round(float(np.median(aperture_shares)), 6),
                 "largest_share_in_apertures": round(max(aperture_shares), 6),
             },
-            "lights": {"rendered": cache.missed, "reused": cache.reused},
+            "lights": {"rendered": cache.missed - missed, "reused": cache.reused - reused},
         }
         run_folder.write_manifest(aside, facts)
 

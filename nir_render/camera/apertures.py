@@ -21,6 +21,11 @@ class Aperture:
     columns: slice
     inside: NDArray[np.bool_]
 
+    def pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows and the columns of the pixels, shape (n,) each."""
+        row, column = np.nonzero(self.inside)
+        return row + self.rows.start, column + self.columns.start
+
     def sum(self, image: NDArray[np.float64]) -> float:
         """Return the sum of an image over the pixels."""
         return float(image[self.rows, self.columns][self.inside].sum())

@@ -150,7 +150,7 @@ def _write(path: Path, light: Light) -> None:
 
 
 def _load(path: Path) -> Light:
-    with np.load(path, allow_pickle=False) as archive:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     header = json.loads(arrays.pop(_HEADER).tobytes())
     light = _put_together(header, arrays)

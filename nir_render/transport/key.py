@@ -32,6 +32,8 @@ _PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
 # Files of this package that decide the bits of light: a change of one is another version.
 _CODE = ("transport/**/*.py", "scene/*.py", "geometry.py", "camera/lens.py", "camera/enlarge.py")
 
+Sampled = NDArray[np.int64] | int | str | tuple[str, NDArray[np.int64]] | None
+
 
 @dataclass(frozen=True, eq=False)
 class Site:
@@ -76,7 +78,7 @@ def light_key(
     geometry: str,
     seed: int,
     power: NDArray[np.float64],
-    samples: NDArray[np.int64] | int | str | None,
+    samples: Sampled,
     made_by: Sequence[str],
 ) -> str:
     """Return the hash of everything that determines a light: 64 hexadecimal digits.
@@ -88,7 +90,8 @@ def light_key(
     power
         What each group counts when lights are chosen, shape (groups,).
     samples
-        Samples per pixel: one number, one for each pixel, "pilot", or None where there is no indirect light.
+        Samples per pixel: one number, one for each pixel, or None where there is no indirect light; of a
+        pilot its name, and the pixels where they are chosen.
     made_by
         What computes it: `versions`.
     """

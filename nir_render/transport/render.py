@@ -19,7 +19,7 @@ from nir_render.transport.backend import backend
 from nir_render.transport.cache import LightCache
 from nir_render.transport.direct import direct_table
 from nir_render.transport.facets import facets
-from nir_render.transport.key import Site, geometry_key, light_key, versions
+from nir_render.transport.key import Sampled, Site, geometry_key, light_key, versions
 from nir_render.transport.light import DirectTable, Indirect, Light
 from nir_render.transport.sharpen import sharpened
 
@@ -74,16 +74,19 @@ class _Work:
         if share is None or not backend().vectorised:
             return stock.samples_of(self.site.scene)
         shape = groups.film_shape(self._rays, document.render.indirect.scale)
-        return noise.samples_map(self._kept(_PILOT, self._pilot), self.site.scene, share, shape)
+        pilot = self._kept(_PILOT, self._pilot, counts=False)
+        pixels = noise.flare_pixels(pilot, self.site.camera, shape)
+        flares = self._kept((_PILOT, pixels), lambda: self._flares(pixels), counts=False)
+        return noise.samples_map(pilot, flares, self.site.scene, share, shape)
 
     def light(self, samples: Samples | None) -> Light:
         """Return the light with so many samples in each pixel."""
-        return self._kept(samples, lambda: self._light(self._indirect(samples)))
+        return self._kept(samples, lambda: self._light(self._indirect(samples)), counts=True)
 
-    def _kept(self, samples: Samples | str | None, rendered: Callable[[], Light]) -> Light:
+    def _kept(self, samples: Sampled, rendered: Callable[[], Light], *, counts: bool) -> Light:
         made_by = versions(backend().variant)
         key = light_key(self.site, self._geometry, self.seed, self._power, samples, made_by)
-        light = self.cache.get(key, counts=rendered is not self._pilot)
+        light = self.cache.get(key, counts=counts)
         if light is None:
             light = rendered()
             self.cache.put(key, light)
@@ -93,6 +96,11 @@ class _Work:
         site = self.site
         key = groups.light_seed(self.seed, "pilot", site.name, self._geometry)
         return self._light(groups.pilot(site.scene, self._rays, site.time_s, key, self._power))
+
+    def _flares(self, pixels: NDArray[np.int64]) -> Light:
+        site = self.site
+        key = groups.light_seed(self.seed, "flares", site.name, self._geometry)
+        return self._light(groups.some_pixels(site.scene, self._rays, site.time_s, key, self._power, pixels))
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
         scene, time_s, name = self.site.scene, self.site.time_s, self.site.name

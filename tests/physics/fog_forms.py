@@ -35,43 +35,47 @@ def single_scatter_per_w(
     phase: PhaseFunction,
     *,
     steps: int = 512,
+    rings: int = 3,
 ) -> Array:
     """Return the radiance that one watt of a sphere sends by one scattering to the origin, in 1/(m² sr).
 
     Along the ray, at the angle φ seen from the source's foot point on it (distance s = s₀ + h tan φ, so that
     the measure ds/d² becomes dφ/h), fog scatters L_s ∫ p dΩ over the cone that the sphere fills,
-    L_s = 1/(4π² r²); on either leg it takes exp(−σ s). Gauss–Legendre in φ and over the cone.
+    L_s = 1/(4π² r²); on either leg it takes exp(−σ s). Gauss–Legendre in φ and over the cone. Rays end on the
+    sphere, else nowhere.
 
     Parameters
     ----------
     directions
-        Unit vectors of the rays, shape (n, 3), none of which meets the sphere.
+        Unit vectors of the rays, shape (n, 3), none of which points to the sphere's very centre.
     source_m
         The sphere's centre from the origin, shape (3,).
+    steps, rings
+        Nodes along the ray and across the cone; near the sphere, which fills half the sky there, 24 rings.
     """
     nodes, weights = np.polynomial.legendre.leggauss(steps)
     along_m = directions @ source_m
-    beside_m = np.sqrt(source_m @ source_m - along_m**2)
+    beside_m = np.linalg.norm(np.cross(directions, source_m), axis=-1)
     start = -np.arctan2(along_m, beside_m)
-    half = 0.5 * (0.5 * np.pi - start)
+    front_m = np.sqrt(np.maximum(radius_m**2 - beside_m**2, 0.0))
+    end = np.where(beside_m < radius_m, -np.arctan2(front_m, beside_m), 0.5 * np.pi)
+    half = 0.5 * (end - start)
     angle = start[:, None] + half[:, None] * (nodes + 1.0)  # (n, steps)
     distance_m = beside_m[:, None] / np.cos(angle)
     path_m = along_m[:, None] + beside_m[:, None] * np.tan(angle)
     toward = -np.sin(angle)  # cosine between the ray and the way from the point to the source
-    versines, shares = np.polynomial.legendre.leggauss(3)
-    spokes = np.cos(2.0 * np.pi * (np.arange(6) + 0.5) / 12.0)  # half a turn; the other half mirrors it
-    sine2 = (radius_m / distance_m) ** 2
+    versines, shares = np.polynomial.legendre.leggauss(rings)
+    spokes = np.cos(np.pi * (np.arange(2 * rings) + 0.5) / (2 * rings))  # half a turn; the other mirrors it
+    sine2 = np.minimum((radius_m / distance_m) ** 2, 1.0)
     versine_max = sine2 / (1.0 + np.sqrt(1.0 - sine2))
     scattered = np.zeros_like(distance_m)
     for versine, share in zip(versines, shares, strict=True):
         v = 0.5 * (versine + 1.0) * versine_max
         cos_cone, sin_cone = 1.0 - v, np.sqrt(v * (2.0 - v))
-        to_surface_m = distance_m * cos_cone - np.sqrt(radius_m**2 - (distance_m * sin_cone) ** 2)
-        mean_phase = np.mean(
-            [phase(cos_cone * toward + sin_cone * spoke * np.sqrt(1.0 - toward**2)) for spoke in spokes],
-            axis=0,
-        )
-        scattered += 0.5 * share * mean_phase * np.exp(-extinction_per_m * to_surface_m)
+        chord_m = np.sqrt(np.maximum(radius_m**2 - (distance_m * sin_cone) ** 2, 0.0))
+        aside = sin_cone * np.sqrt(1.0 - toward**2)
+        mean_phase = np.mean([phase(cos_cone * toward + spoke * aside) for spoke in spokes], axis=0)
+        scattered += 0.5 * share * mean_phase * np.exp(-extinction_per_m * (distance_m * cos_cone - chord_m))
     fluence_per_w = 2.0 * np.pi * versine_max / (4.0 * np.pi**2 * radius_m**2)  # L_s Ω
     integrand = fluence_per_w * scattered * np.exp(-extinction_per_m * path_m) * distance_m**2
     total: Array = albedo * extinction_per_m * half / beside_m * (integrand @ weights)

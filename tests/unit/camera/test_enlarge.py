@@ -38,11 +38,11 @@ def _labels(fine: np.ndarray, shining: tuple[bool, ...] = (False, False, False))
 
 
 def _pixels(fine: np.ndarray) -> np.ndarray:
-    return fine.reshape(ROWS, FINE, COLUMNS, FINE).mean(axis=(1, 3))
+    return np.asarray(fine.reshape(ROWS, FINE, COLUMNS, FINE).mean(axis=(1, 3)))
 
 
 def _blocks(image: np.ndarray, scale: int) -> np.ndarray:
-    return image.reshape(ROWS // scale, scale, COLUMNS // scale, scale).mean(axis=(1, 3))
+    return np.asarray(image.reshape(ROWS // scale, scale, COLUMNS // scale, scale).mean(axis=(1, 3)))
 
 
 def _both(

@@ -1,0 +1,69 @@
+"""Flares' apertures: which pixels, by hand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nir_render import load_scene
+from nir_render.camera.apertures import flare_aperture
+from nir_render.camera.lens import intrinsics_of
+from nir_render.scene.devices import Camera
+
+SCENES = Path(__file__).parents[3] / "scenes"
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    """1280 × 960, focal length 480 px, σ of the point spread 0.7 px."""
+    return load_scene(SCENES / "one_source.yaml").camera("r1.front")[1]
+
+
+def _towards(camera: Camera, u_px: float, v_px: float) -> NDArray[np.float64]:
+    return np.asarray(intrinsics_of(camera).unproject(np.array([u_px, v_px])))
+
+
+def test_a_point_gets_three_pixels_around_its_place(camera: Camera) -> None:
+    """Centred on a pixel: 29 pixels lie within 3 px of it. 3 σ are 2.1 px, less than 3."""
+    aperture = flare_aperture(camera, _towards(camera, 700.0, 500.0), 0.0)
+    assert aperture is not None
+    row, column = aperture.pixels()
+    assert row.size == 29
+    assert set(zip(row.tolist(), column.tolist(), strict=True)) == {
+        (500 + v, 700 + u) for v in range(-3, 4) for u in range(-3, 4) if u * u + v * v <= 9
+    }
+
+
+def test_a_disc_gets_its_radius_and_three_sigma(camera: Camera) -> None:
+    """On the axis 0.05 rad are 480 tan 0.05 = 24.02 px; with 2.1 px the area is π 26.12² = 2143 px."""
+    aperture = flare_aperture(camera, np.array([0.0, 0.0, 1.0]), 0.05)
+    assert aperture is not None
+    assert aperture.inside.sum() == pytest.approx(np.pi * 26.12**2, rel=0.005)
+
+
+def test_off_the_axis_the_image_is_larger(camera: Camera) -> None:
+    """At 45° a rectilinear image is stretched by 1/cos² = 2 along the radius."""
+    aperture = flare_aperture(camera, np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0), 0.01)
+    assert aperture is not None
+    assert aperture.columns.stop - aperture.columns.start == pytest.approx(2 * (9.6 + 2.1), abs=1.0)
+
+
+def test_it_ends_with_the_sensor(camera: Camera) -> None:
+    corner = flare_aperture(camera, _towards(camera, -1.0, -1.0), 0.0)
+    assert corner is not None
+    row, column = corner.pixels()
+    assert (row.min(), column.min()) == (0, 0)
+    assert row.size == 4  # (0, 0), (0, 1), (1, 0) and (1, 1): √8 px away at most
+    assert flare_aperture(camera, _towards(camera, -5.0, 300.0), 0.0) is None
+    assert flare_aperture(camera, _towards(camera, 640.0, 966.0), 0.0) is None
+    assert flare_aperture(camera, np.array([0.0, 0.0, -1.0]), 0.0) is None
+
+
+def test_the_sum_is_over_the_disc(camera: Camera) -> None:
+    aperture = flare_aperture(camera, _towards(camera, 700.0, 500.0), 0.0)
+    assert aperture is not None
+    image = np.zeros((960, 1280))
+    image[500, 700] = 2.0
+    image[503, 703] = 100.0  # in the rectangle, √18 px away
+    assert aperture.sum(image) == 2.0
