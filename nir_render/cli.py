@@ -23,6 +23,7 @@ from nir_render.errors import InputError
 
 if TYPE_CHECKING:
     from nir_render.scene.load import Scene
+    from nir_render.transport.cache import LightCache
     from perception import Estimator
 
 app = typer.Typer(
@@ -62,6 +63,22 @@ Estimators = Annotated[
 KeepLight = Annotated[
     bool, typer.Option("--keep-light", help="Keep the light of each frame: spectral EXR and direct table.")
 ]
+LightFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--light-cache",
+        metavar="DIR",
+        help="Keep rendered light here, and render none that is here already; runs may share the folder.",
+    ),
+]
+LightLimit = Annotated[
+    float,
+    typer.Option(
+        "--light-cache-gib",
+        min=0.0,
+        help="How large that folder may grow; the least recently used goes first.",
+    ),
+]
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else there.")
 ]
@@ -89,13 +106,16 @@ def run(
     seed: Seed = None,
     threads: Threads = None,
     keep_light: KeepLight = False,
+    light_cache: LightFolder = None,
+    light_cache_gib: LightLimit = 4.0,
     as_json: Json = False,
 ) -> None:
     """Render, perceive, evaluate and report a scene in one go."""
     from nir_render.run import evaluate_run, perceive_run, report_run
 
     chosen = _estimators(estimators)
-    folder = _render(scene, output, settings, overwrite, seed, threads, keep_light)
+    cache = _light_cache(light_cache, light_cache_gib)
+    folder = _render(scene, output, settings, overwrite, seed, threads, keep_light, cache)
     with _progress("perceive") as progress:
         perceive_run(folder, estimators=chosen, progress=progress)
     result = evaluate_run(folder)
@@ -114,6 +134,8 @@ def render(
     seed: Seed = None,
     threads: Threads = None,
     keep_light: KeepLight = False,
+    light_cache: LightFolder = None,
+    light_cache_gib: LightLimit = 4.0,
     only_estimate: Annotated[
         bool, typer.Option("--estimate", help="Only say how long it will take, from small trials.")
     ] = False,
@@ -123,7 +145,8 @@ def render(
     if only_estimate:
         _show_estimate(_load(scene, settings, seed), as_json)
         return
-    folder = _render(scene, output, settings, overwrite, seed, threads, keep_light)
+    cache = _light_cache(light_cache, light_cache_gib)
+    folder = _render(scene, output, settings, overwrite, seed, threads, keep_light, cache)
     frames = len((folder / "frames.jsonl").read_text(encoding="utf-8").splitlines())
     if as_json:
         _print_json({"folder": str(folder), "frames": frames})
@@ -303,6 +326,7 @@ def _render(
     seed: int | None,
     threads: int | None,
     keep_light: bool,
+    cache: "LightCache",
 ) -> Path:
     from nir_render.run import render_run
     from nir_render.run_folder import check_free
@@ -315,8 +339,14 @@ def _render(
     if threads is not None:
         set_threads(threads)
     with _progress("render") as progress:
-        render_run(scene, folder, overwrite=overwrite, progress=progress, keep_light=keep_light)
+        render_run(scene, folder, overwrite=overwrite, progress=progress, keep_light=keep_light, cache=cache)
     return folder
+
+
+def _light_cache(folder: Path | None, limit_gib: float) -> "LightCache":
+    from nir_render.transport.cache import LightCache
+
+    return LightCache(folder, limit_bytes=int(limit_gib * 2**30))
 
 
 def _setting(text: str) -> tuple[str, Any]:

@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import json
 import os
-import tempfile
+import secrets
 import time
 import zipfile
 from collections import OrderedDict
@@ -136,17 +136,17 @@ def bytes_of(light: Light) -> int:
 
 def _write(path: Path, light: Light) -> None:
     header, arrays = _taken_apart(light)
-    handle, aside = tempfile.mkstemp(prefix=f".{path.name}{_ASIDE}", dir=path.parent)
+    aside = path.with_name(f".{path.name}{_ASIDE}{os.getpid()}-{secrets.token_hex(4)}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with aside.open("xb") as file:
             text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
             named: dict[str, Any] = {_HEADER: text, **arrays}
             np.savez(file, **named)
             file.flush()
             os.fsync(file.fileno())
-        Path(aside).replace(path)
+        aside.replace(path)
     finally:
-        Path(aside).unlink(missing_ok=True)
+        aside.unlink(missing_ok=True)
 
 
 def _load(path: Path) -> Light:

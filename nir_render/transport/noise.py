@@ -10,8 +10,8 @@ too small; its mean is right. So needs are means over 5 × 5 pixels of the pilot
 
 - The frame's count is the median of the needs, at least 8. Each pixel gets its own need, up to 4 times the
   frame's count: more than half of all pixels then keep the target, and most of the rest too.
-- No pixel may look like a flare by render noise: each gets what brings its σ to half of the sensor's, up to
-  16 times the frame's count.
+- No pixel of the film may look like a flare by render noise: each gets what brings the σ of the sum over it,
+  scale × scale sensor pixels of the same noise, to half of the sensor's, up to 16 times the frame's count.
 - Every flare's aperture gets what brings the sum over it to the target; there the pilot has all pixels, as
   light is often brightest beside a flare.
 
@@ -69,7 +69,8 @@ def samples_map(
     ratio = np.asarray(cv2.resize(ratio, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float64)
     need = ratio / noise_share
     frame = max(float(np.median(need)), LEAST_SAMPLES)
-    flare_like = np.minimum(ratio / _FLARE_LIKE_SHARE, _FLARE_LIKE_RISE * frame)
+    scale = camera.sensor.rows // shape[0]
+    flare_like = np.minimum(scale**2 * ratio / _FLARE_LIKE_SHARE, _FLARE_LIKE_RISE * frame)
     need = np.maximum(np.minimum(need, _RISE * frame), flare_like).ravel()
     known = flare_pixels(pilot, camera, shape)
     noise_in_flares_e2 = np.full(need.size, np.nan)
@@ -108,7 +109,7 @@ def _film_pixels(
 def _noise_of_one_sample_e2(
     light: Light, scene: Scene, exposure_s: float, pixels: NDArray[np.int64], shape: tuple[int, int]
 ) -> Array:
-    """Return the variance, in e² of one sensor pixel, of one sample in some pixels of the film, shape (n,)."""
+    """Return the variance, in e² of one sensor pixel, of one sample in some pixels of the film, (n,)."""
     assert light.indirect is not None  # noqa: S101
     _, camera = scene.camera(light.camera)
     even = np.ones((camera.sensor.rows, camera.sensor.columns))

@@ -133,7 +133,7 @@ lamps:
 """
 
 DENSE_FOG = f"""{_HEAD}
-fog: {{extinction: "0.4 /m", albedo: 0.9995, phase: {{type: henyey_greenstein, g: 0.85}}}}
+fog: {{extinction: "0.3 /m", albedo: 0.9995, phase: {{type: henyey_greenstein, g: 0.85}}}}
 robots:
   r1: {_camera("[0.3, 0, 1.0]")}
   r2: {_source("[2.2, 0.7, 0.7]")}

@@ -52,8 +52,8 @@ SAMPLING = {
     "glossy corridor": Sampling(32, 32, 64),
     "mirror room": Sampling(128, 32, 256),
     "occluders": Sampling(128, 48, 128),
-    "thin fog": Sampling(64, 40, 128),
-    "dense fog": Sampling(64, 40, 128),
+    "thin fog": Sampling(64, 48, 128),
+    "dense fog": Sampling(64, 64, 128),
 }
 
 

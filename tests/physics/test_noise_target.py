@@ -113,7 +113,14 @@ def test_the_share_between_seeds_keeps_the_target_and_the_mean_is_right(case: Ca
 def test_a_scene_without_flares_has_no_aperture_to_care_for(tmp_path: Path) -> None:
     case = Case("diffuse room", "1 us", 20.0, 2)
     away = {"orientation": {"yaw": "180 deg"}, "rig": _scene(case, tmp_path, {}).raw["robots"]["r1"]["rig"]}
-    scene = _scene(case, tmp_path, {"render.noise": "20 % of temporal variance", "robots.r1": {**away, "position": "[0.4, -0.3, 1.1] m"}})
+    scene = _scene(
+        case,
+        tmp_path,
+        {
+            "render.noise": "20 % of temporal variance",
+            "robots.r1": {**away, "position": "[0.4, -0.3, 1.1] m"},
+        },
+    )
     light = render(scene, "r1.c")
     assert light.direct.group.size == 0
     assert expected(light, scene, 1e-6).aperture_noise_share == 0.0

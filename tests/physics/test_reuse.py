@@ -17,11 +17,15 @@ pytestmark = pytest.mark.mitsuba
 
 
 def _scene(folder: Path, settings: dict[str, Any]) -> Scene:
-    """The diffuse room, 40 × 30 pixels; r2 stands still for two seconds, then moves off and comes back."""
+    """The diffuse room, 40 × 30 pixels; r2 stands still until 2.1 s, then moves off and is back at 3.9 s."""
     document = plain("diffuse room")
-    document["robots"]["r1"]["rig"]["cameras"]["c"]["sensor"] |= {"columns": 40, "rows": 30, "pixel_pitch": "90 um"}
+    document["robots"]["r1"]["rig"]["cameras"]["c"]["sensor"] |= {
+        "columns": 40,
+        "rows": 30,
+        "pixel_pitch": "90 um",
+    }
     source = document["robots"]["r2"]
-    stops = [("0 s", 2.4), ("2 s", 2.4), ("3 s", 2.6), ("4 s", 2.4)]
+    stops = [("0 s", 2.4), ("2.1 s", 2.4), ("3 s", 2.6), ("3.9 s", 2.4)]
     document["robots"]["r2"] = {
         "rig": source["rig"],
         "motion": [{"time": time, "position": f"[{x}, 1.1, 0.5] m"} for time, x in stops],
@@ -33,7 +37,10 @@ def _scene(folder: Path, settings: dict[str, Any]) -> Scene:
 
 
 FIXED: dict[str, Any] = {"render.indirect.samples": 8}
-TARGET: dict[str, Any] = {"render.noise": "100 % of temporal variance", "robots.r1.rig.cameras.c.exposure": "1 us"}
+TARGET: dict[str, Any] = {
+    "render.noise": "100 % of temporal variance",
+    "robots.r1.rig.cameras.c.exposure": "1 us",
+}
 
 
 @pytest.fixture
@@ -90,7 +97,10 @@ def test_equal_geometry_gives_equal_bits_at_another_time(tmp_path: Path, rendere
     assert rest.time_s == 1.5
     assert _bits(away) != _bits(start)
     # Not by moving the same samples along: other geometry draws other random numbers.
-    assert (away.indirect.radiance_per_w == start.indirect.radiance_per_w).mean() < 0.05  # type: ignore[union-attr]
+    assert start.indirect is not None
+    assert away.indirect is not None
+    noisy = start.indirect.variance > 0.0
+    assert (away.indirect.radiance_per_w == start.indirect.radiance_per_w)[noisy].mean() < 0.01
 
 
 def test_another_seed_is_another_light(tmp_path: Path) -> None:
@@ -103,20 +113,13 @@ def test_another_seed_is_another_light(tmp_path: Path) -> None:
 def test_a_run_renders_as_often_as_geometry_changes(
     settings: dict[str, Any], tmp_path: Path, rendered: list[float]
 ) -> None:
-    """Nine frames, half a second apart: still until 2 s, at three other places on the way out and back, again
-    where it began at 4 s. Out and back pass the same two places: 0–2 s and 4 s are one geometry, 2.5 and 3.5 s
-    another, 3 s the third.
-    """
-    scene = _scene(tmp_path, settings | {"clock": {"frames": 9, "frame_rate": "2 Hz"}, "robots.r1.rig.cameras.c.exposure": "1 us"})
-    # Mid-exposure is half a microsecond later: the places on the way differ, those at rest do not.
+    """Nine frames, half a second apart: at rest until 2 s, under way at 2.5, 3 and 3.5 s, at rest again at 4 s."""
+    timing = {"clock": {"frames": 9, "frame_rate": "2 Hz"}, "robots.r1.rig.cameras.c.exposure": "1 us"}
     cache = LightCache()
-    shots = list(simulate(scene, cache=cache))
-    assert len(shots) == 9
-    moving = [1 for time_s in rendered if time_s > 2.1]
-    assert len(rendered) == 1 + len(moving)
-    assert len(moving) == 3 + 1  # 2.5, 3.0, 3.5 s, and 4 s is at rest again but for rounding
-    assert cache.missed == len(rendered)
-    assert cache.reused == 9 - len(rendered)
+    shots = list(simulate(_scene(tmp_path, settings | timing), cache=cache))
+    assert np.round(rendered, 3).tolist() == [0.0, 2.5, 3.0, 3.5]
+    assert (cache.missed, cache.reused) == (4, 5)
+    assert shots[8].light.indirect is shots[0].light.indirect
 
 
 def test_a_blinking_robot_costs_nothing(tmp_path: Path, rendered: list[float]) -> None:
@@ -128,7 +131,9 @@ def test_a_blinking_robot_costs_nothing(tmp_path: Path, rendered: list[float]) -
     assert len(rendered) == 1
 
 
-def test_variant_is_part_of_the_key(tmp_path: Path, rendered: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variant_is_part_of_the_key(
+    tmp_path: Path, rendered: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene, cache = _scene(tmp_path, FIXED), LightCache()
     render(scene, "r1.c", cache=cache)
     monkeypatch.setattr(transport, "versions", lambda variant: (variant, "other"))

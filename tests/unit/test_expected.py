@@ -70,6 +70,26 @@ def test_the_share_of_render_noise_in_the_frame(scene: Scene) -> None:
     assert share == pytest.approx(float(np.median(noise_e2 / (signal_e + 100.0))), rel=0.005)
 
 
+@pytest.mark.parametrize("scale", [1, 2, 4])
+def test_the_share_of_render_noise_in_a_flare(scene: Scene, scale: int) -> None:
+    """A flare on the axis: the sum over its 32 pixels, of which scale² have the same noise at a time."""
+    light = _light(1e-2, 1e-6, scale)
+    table = dataclasses.replace(
+        light.direct, group=np.array([1]), facet=np.array([-1]), seen=np.ones((1, 1024), dtype=bool), direction=np.array([[0.0, 0.0, 1.0]]),
+        distance_m=np.array([5.0]), angular_radius_rad=np.zeros(1), visible_fraction=np.ones(1), irradiance_per_w=np.array([[1e-3]]),
+    )  # fmt: skip
+    mean = expected(dataclasses.replace(light, direct=table), scene, 1e-3)
+    flare_e = mean.windows[0].values.sum()
+    assert flare_e > 1000.0
+    # Within 3 px of the middle, 2.1 px being 3 σ, lies all of it but exp(−9/2/0.7²).
+    temporal_e2 = flare_e * (1.0 - np.exp(-0.5 * 9.0 / 0.49)) + 32 * (
+        _electrons_on_axis(0.4 * 1e-2, 1e-3) + 100.0
+    )
+    noise_e2 = 32 * scale**2 * 2.0 * _electrons_on_axis(0.2 * 1e-3, 1e-3) ** 2
+    assert mean.aperture_noise_share == pytest.approx(noise_e2 / temporal_e2, rel=0.005)
+    assert expected(light, scene, 1e-3).aperture_noise_share == 0.0
+
+
 @pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan"), float("inf")])
 def test_impossible_exposures_are_refused(scene: Scene, exposure_s: float) -> None:
     with pytest.raises(InputError, match="wanted seconds greater than 0"):

@@ -14,6 +14,9 @@ from nir_render.transport.kernel.tables import Choice, Lights, Surfaces
 
 # Shadow rays end this share of their way before their goal: what float32 rounds, with room.
 SHORTER = 1e-4
+# To a light it is more: Mitsuba finds the surface of a far sphere only to D √(3e-7), D being the distance, where
+# a ray grazes it, and its own body must not hide it.
+GAP = 1e-3
 # A rectangle that fills less than this, in sr, is sampled by area: its solid angle loses digits, and far away
 # the two are nearly the same.
 _SMALL_SR = 0.02
@@ -83,11 +86,7 @@ def aim(lights: Lights, row: Any, place: Any, u: Any, v: Any, active: Any) -> Ai
             dr.select(kind == SUN, new, old)
             for new, old in zip(other, (direction, reach, density), strict=True)
         )
-    gap = reach * SHORTER
-    if lights.has_spheres:
-        radius = dr.gather(mi.Float, lights.radius, row, active)
-        gap = dr.select(radius > 0.0, reach * 1e-3 + radius, gap)
-    return Aim(direction, reach, gap, density, radiance)
+    return Aim(direction, reach, reach * GAP, density, radiance)
 
 
 def density_of(lights: Lights, row: Any, place: Any, direction: Any, active: Any) -> Any:

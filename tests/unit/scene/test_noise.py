@@ -15,14 +15,22 @@ def scene() -> Scene:
     return load_scene(SCENES / "one_source.yaml")
 
 
-@pytest.mark.parametrize(("text", "share"), [(f"5 {PERCENT}", 0.05), (f"0.1{PERCENT}", 0.001), (f" 100 {PERCENT} ", 1.0), (f".5 {PERCENT}", 0.005)])
+@pytest.mark.parametrize(
+    ("text", "share"),
+    [(f"5 {PERCENT}", 0.05), (f"0.1{PERCENT}", 0.001), (f" 100 {PERCENT} ", 1.0), (f".5 {PERCENT}", 0.005)],
+)
 def test_a_target_is_read_as_its_share(scene: Scene, text: str, share: float) -> None:
     assert scene.with_({"render.noise": text}).document.render.noise == pytest.approx(share, rel=1e-15)
 
 
-@pytest.mark.parametrize("wrong", ["5 %", 0.05, f"-5 {PERCENT}", "5 % of variance", f"5 1 {PERCENT}", f"0.05 {PERCENT}", f"101 {PERCENT}"])
+@pytest.mark.parametrize(
+    "wrong",
+    ["5 %", 0.05, f"-5 {PERCENT}", "5 % of variance", f"5 1 {PERCENT}", f"0.05 {PERCENT}", f"101 {PERCENT}"],
+)
 def test_what_is_no_target_is_refused_by_name(scene: Scene, wrong: object) -> None:
-    with pytest.raises(InputError, match=r"render\.noise: .*(such as '5 % of temporal variance'|lies outside 0.1 to 100 %)"):
+    with pytest.raises(
+        InputError, match=r"render\.noise: .*(such as '5 % of temporal variance'|lies outside 0.1 to 100 %)"
+    ):
         scene.with_({"render.noise": wrong})
 
 

@@ -155,7 +155,12 @@ def _site(scene: Scene, time_s: float = 0.0) -> Site:
 
 def _key(scene: Scene, time_s: float = 0.0, **changes: Any) -> str:
     site = _site(scene, time_s)
-    rest: dict[str, Any] = {"seed": 1, "power": np.ones(4), "samples": 16, "made_by": ("llvm_ad_mono", "mitsuba 3.9.1")}
+    rest: dict[str, Any] = {
+        "seed": 1,
+        "power": np.ones(4),
+        "samples": 16,
+        "made_by": ("llvm_ad_mono", "mitsuba 3.9.1"),
+    }
     return light_key(site, geometry_key(site), **(rest | changes))
 
 

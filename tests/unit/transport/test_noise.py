@@ -21,7 +21,9 @@ Array = NDArray[np.float64]
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     base = load_scene(Path(__file__).parents[3] / "scenes" / "one_source.yaml")
-    return base.with_({"robots.r1.rig.cameras.front.filter": None, "robots.r1.rig.cameras.front.exposure": "1 ms"})
+    return base.with_(
+        {"robots.r1.rig.cameras.front.filter": None, "robots.r1.rig.cameras.front.exposure": "1 ms"}
+    )
 
 
 def _table(directions: list[list[float]]) -> DirectTable:
@@ -34,12 +36,21 @@ def _table(directions: list[list[float]]) -> DirectTable:
 
 
 def _light(variance: Array, samples: int, directions: list[list[float]] | None = None) -> Light:
-    arrays = [np.stack([part, part])[:, None].astype(np.float32) for part in (np.full(variance.shape, RADIANCE), variance)]
+    arrays = [
+        np.stack([part, part])[:, None].astype(np.float32)
+        for part in (np.full(variance.shape, RADIANCE), variance)
+    ]
     indirect = Indirect(arrays[0], arrays[1], 8, samples)
     return Light("r1.front", 0.0, 1, ("r1.top", "r2.top"), (940e-9,), _table(directions or []), indirect)
 
 
-def _counts(scene: Scene, variance: Array, share: float, flares: Array | None = None, directions: list[list[float]] | None = None) -> NDArray[np.int64]:
+def _counts(
+    scene: Scene,
+    variance: Array,
+    share: float,
+    flares: Array | None = None,
+    directions: list[list[float]] | None = None,
+) -> NDArray[np.int64]:
     pilot = _light(variance, 16, directions)
     pixels = flare_pixels(pilot, scene.camera("r1.front")[1], FILM)
     of_flares = np.zeros((1, pixels.size)) if flares is None else np.broadcast_to(flares, (1, pixels.size))
@@ -84,8 +95,8 @@ def test_dim_corners_take_fewer(scene: Scene) -> None:
     ("rise", "count"),
     [
         (1.8, 32),  # its own need is 27
-        (12.0, 64),  # more than 4 times the frame's: 60; to bring it to a quarter 12 · 15 / 5 = 36 would do
-        (30.0, 128),  # brought to a quarter of the variance: 30 · 15 / 5 = 90
+        (4.5, 64),  # more than 4 times the frame's: 60; to bring the sum over 2 × 2 px to a quarter 54 would do
+        (8.0, 128),  # that sum brought to a quarter of the variance: 2² · 8 · 15 / 5 = 96
         (1e4, 256),  # 16 times the frame's: 240
     ],
 )
