@@ -13,6 +13,7 @@ import secrets
 import time
 import zipfile
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ _SUFFIX = ".light.npz"
 _ASIDE = ".partial-"
 _ABANDONED_AFTER_S = 3600.0
 _HEADER = "header"
+_PLANS = 64
 
 
 class LightCache:
@@ -55,6 +57,7 @@ class LightCache:
         self._folder = None if folder is None else Path(folder)
         self._limit_bytes, self._memory_limit_bytes = limit_bytes, memory_limit_bytes
         self._held: OrderedDict[str, Light] = OrderedDict()
+        self._plans: OrderedDict[str, NDArray[np.int64]] = OrderedDict()
         self.reused = self.missed = 0
         if self._folder is not None:
             try:
@@ -82,6 +85,15 @@ class LightCache:
         with contextlib.suppress(OSError):
             _write(self._folder / f"{key}{_SUFFIX}", light)
         self._shrink(self._folder)
+
+    def plan(self, key: str, made: Callable[[], NDArray[np.int64]]) -> NDArray[np.int64]:
+        """Return the samples of each pixel by their own key, made where they are not in memory."""
+        if key not in self._plans:
+            self._plans[key] = made()
+        self._plans.move_to_end(key)
+        while len(self._plans) > _PLANS:
+            self._plans.popitem(last=False)
+        return self._plans[key]
 
     def _hold(self, key: str, light: Light) -> None:
         self._held[key] = light

@@ -79,7 +79,8 @@ def guide(
     cumulative = (cumulative / cumulative[:, -1:]).astype(np.float32)
     cumulative[:, -1] = 1.0
     before = np.concatenate([np.zeros((len(cumulative), 1), dtype=np.float32), cumulative[:, :-1]], axis=1)
-    return Guide(low_m, step_m, counts, cumulative, np.subtract(cumulative, before, dtype=np.float32))
+    chance32 = np.asarray(cumulative - before, dtype=np.float32)
+    return Guide(low_m, step_m, counts, np.asarray(cumulative, dtype=np.float32), chance32)
 
 
 def _brought(

@@ -108,6 +108,24 @@ def light_key(
     )
 
 
+def plan_key(site: Site, geometry: str, seed: int, made_by: Sequence[str]) -> str:
+    """Return the hash of what the samples of a target for the noise follow from: 64 hexadecimal digits.
+
+    That is the pilot, and all that turns its light into electrons. The arguments are those of `light_key`.
+    """
+    settings = site.scene.document.render
+    return _digest(
+        {
+            "geometry": geometry,
+            "seed": seed,
+            "settings": settings,
+            "camera": site.camera,
+            "emitters": site.scene.emitters(),
+            "made_by": list(made_by),
+        }
+    )
+
+
 def versions(variant: str) -> tuple[str, ...]:
     """Return Mitsuba's variant, the versions of what computes light, the hash of this package's part."""
     return (variant, *_versions())

@@ -19,7 +19,7 @@ from nir_render.transport.backend import backend
 from nir_render.transport.cache import LightCache
 from nir_render.transport.direct import direct_table
 from nir_render.transport.facets import facets
-from nir_render.transport.key import Sampled, Site, geometry_key, light_key, versions
+from nir_render.transport.key import Sampled, Site, geometry_key, light_key, plan_key, versions
 from nir_render.transport.light import DirectTable, Indirect, Light
 from nir_render.transport.sharpen import sharpened
 
@@ -73,11 +73,8 @@ class _Work:
             return None
         if share is None or not backend().vectorised:
             return stock.samples_of(self.site.scene)
-        shape = groups.film_shape(self._rays, document.render.indirect.scale)
-        pilot = self._kept(_PILOT, self._pilot, counts=False)
-        pixels = noise.flare_pixels(pilot, self.site.camera, shape)
-        flares = self._kept((_PILOT, pixels), lambda: self._flares(pixels), counts=False)
-        return noise.samples_map(pilot, flares, self.site.scene, share, shape)
+        key = plan_key(self.site, self._geometry, self.seed, versions(backend().variant))
+        return self.cache.plan(key, lambda: self._planned(share))
 
     def light(self, samples: Samples | None) -> Light:
         """Return the light with so many samples in each pixel."""
@@ -91,6 +88,13 @@ class _Work:
             light = rendered()
             self.cache.put(key, light)
         return light
+
+    def _planned(self, noise_share: float) -> NDArray[np.int64]:
+        shape = groups.film_shape(self._rays, self.site.scene.document.render.indirect.scale)
+        pilot = self._kept(_PILOT, self._pilot, counts=False)
+        pixels = noise.flare_pixels(pilot, self.site.camera, shape)
+        flares = self._kept((_PILOT, pixels), lambda: self._flares(pixels), counts=False)
+        return noise.samples_map(pilot, flares, self.site.scene, noise_share, shape)
 
     def _pilot(self) -> Light:
         site = self.site

@@ -141,7 +141,7 @@ def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         stock_groups=alone.swapaxes(0, 1),
         ours=_weighted(np.stack(indirect).astype(np.float64)) + direct,
         direct=direct,
-        aside=~(direct > 0.0).any(axis=0),
+        aside=np.asarray(~(direct > 0.0).any(axis=0)),
     )
 
 

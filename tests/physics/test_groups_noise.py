@@ -87,7 +87,7 @@ def test_one_thread_and_two_give_the_same_bits(room: str, tmp_path: Path) -> Non
     """In processes of their own, as a worker would."""
     scene = tmp_path / "room.yaml"
     scene.write_text(yaml.safe_dump(plain(room), sort_keys=False))
-    arrays = []
+    arrays: list[np.ndarray] = []
     for threads in (1, 2, 2):
         out = tmp_path / f"{len(arrays)}.npz"
         case = {"threads": threads, "scene": str(scene), "out": str(out)}

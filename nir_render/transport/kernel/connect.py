@@ -14,8 +14,8 @@ from nir_render.transport.kernel.tables import Choice, Lights, Surfaces
 
 # Shadow rays end this share of their way before their goal: what float32 rounds, with room.
 SHORTER = 1e-4
-# To a light it is more: Mitsuba finds the surface of a far sphere only to D √(3e-7), D being the distance, where
-# a ray grazes it, and its own body must not hide it.
+# To a light it is more: where a ray grazes a far sphere, Mitsuba finds its surface only to √(3e-7) of the
+# distance, and a light's own body must not hide it.
 GAP = 1e-3
 # A rectangle that fills less than this, in sr, is sampled by area: its solid angle loses digits, and far away
 # the two are nearly the same.

@@ -10,7 +10,7 @@ import yaml
 
 from nir_render import Scene, load_scene
 from nir_render.scene.motion import camera_pose
-from nir_render.transport.key import Site, geometry_key, light_key, versions
+from nir_render.transport.key import Site, geometry_key, light_key, plan_key, versions
 
 CAMERA = "robots.r1.rig.cameras.c"
 SOURCE = "robots.r2.rig.sources.s"
@@ -224,6 +224,25 @@ def test_the_key_follows_who_moves_and_comes_back(scene: Scene) -> None:
     assert keys[0.0] == keys[0.5] == keys[4.0] == keys[5.0]
     assert keys[2.25] == keys[2.75]
     assert len({keys[0.0], keys[1.5], keys[2.25]}) == 3
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {f"{SOURCE}.flux": "0.5 W"},
+        {f"{CAMERA}.exposure": "2 ms"},
+        {f"{CAMERA}.sensor.read_noise": "2 e"},
+        {f"{CAMERA}.filter.centre": "935 nm"},
+        {"lamps.one.luminous_flux": "300 lm"},
+        {"render.noise": "1 % of temporal variance"},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_plan_of_samples_follows_what_makes_electrons(scene: Scene, change: dict[str, Any]) -> None:
+    changed = scene.with_(change)
+    keys = [plan_key(_site(one), geometry_key(_site(one)), 1, ("llvm_ad_mono",)) for one in (scene, changed)]
+    assert keys[0] != keys[1]
+    assert keys[0] == plan_key(_site(scene), geometry_key(_site(scene)), 1, ("llvm_ad_mono",))
 
 
 def test_the_versions_name_the_variant_the_packages_and_this_code() -> None:

@@ -95,7 +95,10 @@ def test_dim_corners_take_fewer(scene: Scene) -> None:
     ("rise", "count"),
     [
         (1.8, 32),  # its own need is 27
-        (4.5, 64),  # more than 4 times the frame's: 60; to bring the sum over 2 × 2 px to a quarter 54 would do
+        (
+            4.5,
+            64,
+        ),  # more than 4 times the frame's: 60; to bring the sum over 2 × 2 px to a quarter 54 would do
         (8.0, 128),  # that sum brought to a quarter of the variance: 2² · 8 · 15 / 5 = 96
         (1e4, 256),  # 16 times the frame's: 240
     ],
