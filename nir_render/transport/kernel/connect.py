@@ -14,9 +14,9 @@ from nir_render.transport.kernel.tables import Choice, Lights, Surfaces
 
 # Shadow rays end this share of their way before their goal: what float32 rounds, with room.
 SHORTER = 1e-4
-# To a light it is more: where a ray grazes a far sphere, Mitsuba finds its surface only to √(3e-7) of the
-# distance, and a light's own body must not hide it.
-GAP = 1e-3
+# To a small far sphere it is more, up to this: float32 finds its surface to some 1e-7 D²/r, at its rim to
+# √1e-7 D, D being the distance, and a light's own body must not hide it.
+_GAP = 1e-3
 # A rectangle that fills less than this, in sr, is sampled by area: its solid angle loses digits, and far away
 # the two are nearly the same.
 _SMALL_SR = 0.02
@@ -86,7 +86,12 @@ def aim(lights: Lights, row: Any, place: Any, u: Any, v: Any, active: Any) -> Ai
             dr.select(kind == SUN, new, old)
             for new, old in zip(other, (direction, reach, density), strict=True)
         )
-    return Aim(direction, reach, reach * GAP, density, radiance)
+    gap = reach * SHORTER
+    if lights.has_spheres:
+        radius = dr.gather(mi.Float, lights.radius, row, active)
+        blur = 3e-6 * reach * reach / dr.maximum(radius, 1e-6)
+        gap = dr.select(radius > 0.0, dr.minimum(gap + blur, reach * _GAP), gap)
+    return Aim(direction, reach, gap, density, radiance)
 
 
 def density_of(lights: Lights, row: Any, place: Any, direction: Any, active: Any) -> Any:
