@@ -144,7 +144,8 @@ def test_a_source_lights_a_wall_by_the_inverse_square_law(make: Any) -> None:
         np.testing.assert_allclose(radiance[beside], expected[beside], rtol=curvature)
         distance_m = np.linalg.norm(source_m - points_m, axis=-1)[beside]
         logs.append((np.log(distance_m), np.log(radiance[beside] / (away_m / distance_m))))
-    slope, _ = np.polyfit(*(np.concatenate(column) for column in zip(*logs, strict=True)), 1)
+    distances, radiances = (np.concatenate(column) for column in zip(*logs, strict=True))
+    slope, _ = np.polyfit(distances, radiances, 1)
     assert slope == pytest.approx(-2.0, abs=0.001)
 
 
@@ -357,7 +358,7 @@ def _length_inside_m(start_m: Array, end_m: Array, low_m: Array, high_m: Array) 
         at_low, at_high = (low_m - start_m) / way_m, (high_m - start_m) / way_m
     enter = np.clip(np.nanmax(np.minimum(at_low, at_high), axis=-1), 0.0, 1.0)
     leave = np.clip(np.nanmin(np.maximum(at_low, at_high), axis=-1), 0.0, 1.0)
-    return np.maximum(leave - enter, 0.0) * np.linalg.norm(way_m, axis=-1)
+    return np.asarray(np.maximum(leave - enter, 0.0) * np.linalg.norm(way_m, axis=-1))
 
 
 @pytest.mark.parametrize("name", REGIONS)
