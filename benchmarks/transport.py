@@ -30,6 +30,7 @@ from nir_render.scene.motion import camera_pose
 from nir_render.transport import groups, world
 from nir_render.transport.backend import backend
 from nir_render.transport.stock import mitsuba_camera
+from nir_render.upsampling import upsampling_error
 
 Array = NDArray[np.float64]
 
@@ -251,6 +252,30 @@ def scaling(repeats: int, seeds: int) -> dict[str, float]:
     return {**cost, "scaling_exponent": float(exponent)}
 
 
+def smooth(repeats: int) -> dict[str, float]:
+    """Return what it gains to render the indirect part in blocks of 4 × 4 pixels, at 1280 × 960, and its error.
+
+    Edges, pixels rendered one by one and straight light are part of both times.
+    """
+    full = build(4, ROOM, 1280)
+    coarse = full.with_({"render.indirect.scale": 4})
+    full_s, coarse_s = seconds(
+        *(lambda scene=scene: nr.render(scene, "eye.c") for scene in (full, coarse)), repeats=repeats
+    )
+    light = nr.render(coarse, "eye.c")
+    exposure_s = coarse.camera("eye.c")[1].exposure_s
+    mean_e = float(nr.expected_electrons(light, coarse, exposure_s).mean())
+    error = upsampling_error(light, coarse, exposure_s, mean_e, pixels=4096, samples=512)
+    assert error is not None  # noqa: S101 (it was rendered in blocks)
+    return {
+        "smooth_gain": full_s / coarse_s,
+        "smooth_error_over_shot_variance": error.share,
+        "smooth_error_standard_error": error.standard_error,
+        "smooth_mean_e": mean_e,
+        "smooth_seconds": coarse_s,
+    }
+
+
 def memory() -> dict[str, float]:
     """Return the largest resident memory of a process that renders 512 groups at 1280 × 960."""
     code = (
@@ -274,7 +299,7 @@ def main() -> None:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="two repeats and six seeds")
-    parser.add_argument("--only", default="groups,many,scaling,fog,memory")
+    parser.add_argument("--only", default="groups,many,scaling,fog,smooth,memory")
     options = parser.parse_args()
     repeats, seeds = (2, 6) if options.quick else (5, 16)
     wanted = set(options.only.split(","))
@@ -306,6 +331,8 @@ def main() -> None:
                 f"fog_gain_{name}": fog["gain_in_flares"],
                 f"details_fog_{name}": fog,
             }
+    if "smooth" in wanted:
+        result |= smooth(repeats)
     if "scaling" in wanted:
         result |= scaling(min(repeats, 3), seeds)
     if "memory" in wanted:

@@ -36,6 +36,7 @@ PILOT_SAMPLES, FLARE_PILOT_SAMPLES = 16, 64
 _PILOT_STEP = 4
 _PILOT_PIXELS = 1200
 _VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
+_NOTHING = 1e-28  # 1/(m² sr)²
 _MAPPED_FROM_BYTES = 2**30  # larger arrays lie in a file that the system may page out
 
 
@@ -210,7 +211,8 @@ def estimate(
     ]
     mean = sum(estimates[1:], estimates[0]) / batches
     square = sum((dr.square(one - mean) for one in estimates), mi.Float(0))
-    variance = square / max(batches * (batches - 1), 1)
+    # Squares of rounding errors are nothing either (see `paths`).
+    variance = dr.select(square > _NOTHING, square, 0.0) / max(batches * (batches - 1), 1)
     dr.eval(mean, variance)
     return np.array(mean).reshape(groups, pixels), np.array(variance).reshape(groups, pixels)
 

@@ -42,9 +42,6 @@ def _tile_sums(stack: Array) -> Array:
 
 
 @pytest.mark.verify
-@pytest.mark.xfail(
-    strict=False, reason="open: fog has pixels off by more than 10 σ; not every room is measured yet"
-)
 @pytest.mark.parametrize("room", ROOMS)
 def test_the_reported_variance_is_the_true_one_and_no_pixel_is_a_firefly(room: str, tmp_path: Path) -> None:
     """64 seeds: the variance between them over the reported one, tile by tile and group by group.

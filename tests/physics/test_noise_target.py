@@ -78,9 +78,12 @@ def test_the_share_between_seeds_keeps_the_target_and_the_mean_is_right(case: Ca
     """16 seeds leave a variance 15 degrees of freedom: the median of many is 0.956 of the true one.
 
     Where the count is more than its least, at most five of six samples may be wasted: up to half by powers of
-    two, a tenth by caution, half by needs in neighbouring pixels and by strata of larger batches.
+    two, a tenth by caution, half by needs in neighbouring pixels and by strata of larger batches. At half
+    resolution pixels are interpolated between those of the film with weights ¾ and ¼ along each axis, which
+    leaves (10/16)² of the variance; needs are made without counting on it.
     """
     target = case.percent / 100.0
+    left_by_interpolation = {1: 1.0, 2: (10.0 / 16.0) ** 2}[case.scale]
     scene = _scene(case, tmp_path, {"render.noise": f"{case.percent} % of temporal variance"})
     camera = scene.camera("r1.c")[1]
     lights = [render(scene, "r1.c", seed=seed) for seed in range(SEEDS)]
@@ -90,7 +93,7 @@ def test_the_share_between_seeds_keeps_the_target_and_the_mean_is_right(case: Ca
     share = np.median(images.var(axis=0, ddof=1) / temporal_e2)
     share /= stats.chi2.median(SEEDS - 1) / (SEEDS - 1)
     assert share <= target
-    assert share >= target / 6.0
+    assert share >= left_by_interpolation * target / 6.0
     apertures = flare_apertures(lights[0], camera)
     assert len(apertures) >= 2
     shares = []

@@ -25,7 +25,9 @@ def arriving(
     if lights.has_images:
         facet = dr.gather(mi.Int32, lights.facet, row, active)
         shown = active & (facet >= 0)
-        second = connect.reflected(world.surfaces, mi.UInt32(facet), origin, aim.direction, aim.reach, shown)
+        second = connect.reflected(
+            world.surfaces, mi.UInt32(facet), origin, aim.direction, aim.reach, aim.gap, shown
+        )
         active = active & (~shown | second.valid)
         factor = dr.select(shown, second.reflectance, factor)
         stretches = dr.select(shown, stretches + 1, stretches)
@@ -37,21 +39,20 @@ def arriving(
     if world.fog is not None:
         factor = factor * (foggy.transmittance(world.fog, origin, aim.direction, reach))
     if second is not None:
-        rest = aim.reach - second.distance
         if world.surfaces.pane_count:
             left, count = connect.through_panes(
-                world.surfaces, second.place, second.direction, rest, facet, shown
+                world.surfaces, second.place, second.direction, second.rest, facet, shown
             )
             factor, stretches = (
                 dr.select(shown, factor * left, factor),
                 dr.select(shown, stretches + count, stretches),
             )
         if world.fog is not None:
-            further = foggy.transmittance(world.fog, second.place, second.direction, rest)
+            further = foggy.transmittance(world.fog, second.place, second.direction, second.rest)
             factor = dr.select(shown, factor * further, factor)
         active = active & ((stretches < max_depth) & (factor > 0.0))
         active = active & (
-            ~(shown & _hidden(world, second.place, second.direction, rest - aim.gap, active & shown))
+            ~(shown & _hidden(world, second.place, second.direction, second.rest - aim.gap, active & shown))
         )
     else:
         active = active & ((stretches < max_depth) & (factor > 0.0))

@@ -184,17 +184,21 @@ def through_panes(
 
 @dataclass(frozen=True, eq=False)
 class Reflection:
-    """A ray towards an image: where it meets the facet, how it goes on, and the share that is reflected."""
+    """A ray towards an image: where it meets the facet, how it goes on, and the share that is reflected.
+
+    `place` stands a little off the facet; from there `direction` leads to the light over the length `rest`.
+    """
 
     valid: Any
     distance: Any
     place: Any
     direction: Any
+    rest: Any
     reflectance: Any
 
 
 def reflected(
-    surfaces: Surfaces, facet: Any, origin: Any, direction: Any, reach: Any, active: Any
+    surfaces: Surfaces, facet: Any, origin: Any, direction: Any, reach: Any, gap: Any, active: Any
 ) -> Reflection:
     """Return how a ray towards a light's image is mirrored by the facet that shows it."""
     mi, dr = backend().mi, backend().dr
@@ -205,12 +209,16 @@ def reflected(
     valid = active & at.inside & facing & (at.distance > 0.0) & (at.distance < reach)
     place = origin + direction * at.distance
     # A step off the facet, on the side from which the light comes; as far as Mitsuba's own rays take.
-    step = 1e-4 * (1.0 + dr.max(dr.abs(place)))
+    step = dr.sign(slope) * 1e-4 * (1.0 + dr.max(dr.abs(place))) * normal
+    # From there to the same point, as far before the light as shadow rays end.
+    to = (direction - 2.0 * slope * normal) * (reach - at.distance - gap) + step
+    rest = dr.norm(to)
     return Reflection(
         valid=valid,
         distance=at.distance,
-        place=place - dr.sign(slope) * step * normal,
-        direction=direction - 2.0 * slope * normal,
+        place=place - step,
+        direction=to / rest,
+        rest=rest + gap,
         reflectance=reflectance(surfaces, facet, dr.abs(slope), valid),
     )
 

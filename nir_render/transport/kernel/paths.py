@@ -29,6 +29,8 @@ _FAR = 1e15
 # Paths dimmer than this go on by chance, and with this weight. Brighter ones would stand out of the noise;
 # without any roulette a render takes twice the time.
 _DIM = 0.1
+# Less than this, in 1/(m² sr), is nothing: near 1e-38 some threads round to zero and others do not.
+_NOTHING = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +95,9 @@ def walk(
     def add(value: Any, row: Any, active: Any) -> None:
         group = dr.gather(mi.UInt32, world.lights.group, row, active)
         dr.scatter_reduce(
-            dr.ReduceOp.Add, out, value, group * stride + lane, active, dr.ReduceMode.NoConflicts
-        )
+            dr.ReduceOp.Add, out, value, group * stride + lane, active & (value > _NOTHING),
+            dr.ReduceMode.NoConflicts,
+        )  # fmt: skip
 
     def begun(sample: Any) -> Any:
         return _camera_direction(film, pixel, draw, sample)
