@@ -156,6 +156,9 @@ class SceneDocument(Document):
 
     def has_indirect_light(self) -> bool:
         """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""
+        sources = any(robot.rig.sources for robot in self.robots.values())
+        if not (sources or self.lamps or self.sun is not None):
+            return False
         used = [self.materials[name] for name in {shape.material for shape in self.shapes.values()}]
         absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in used)
         scattering = self.fog is not None and self.fog.albedo * self.fog.extinction_per_m > 0.0

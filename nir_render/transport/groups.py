@@ -223,6 +223,7 @@ def film_on_device(rays: Rays, scale: int, pixels: NDArray[np.int64]) -> Film:
     return Film(
         origin=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in rays.origin_m)),
         corners=mi.Float(rays.corners.astype(np.float32).ravel()),
+        rows=dr.opaque(mi.UInt32, rays.corners.shape[0] - 1),
         columns=dr.opaque(mi.UInt32, rays.corners.shape[1] - 1),
         scale=dr.opaque(mi.UInt32, scale),
         index=mi.UInt32(pixels.astype(np.uint32)),
@@ -246,11 +247,12 @@ def world_on_device(scene: Scene, time_s: float, power: NDArray[np.float64]) -> 
         patterns.append(pattern_of(sources[name][1]) if name in sources else None)
         axes.append(turns.get(name, np.eye(3)))
     fog = medium(scene)
+    opaque = world.build(scene, time_s, panes=False) if panes else bodies
     return World(
         bodies=bodies,
-        opaque=world.build(scene, time_s, panes=False) if panes else bodies,
+        opaque=opaque,
         lights=upload_lights(shining, power, patterns, np.array(axes)),
-        surfaces=upload_surfaces(flat, _shape_columns(scene, bodies, flat)),
+        surfaces=upload_surfaces(flat, _shape_columns(scene, (bodies, opaque), flat)),
         choice=upload_guide(
             guide(shining, flat, power, low_m, high_m, 0.0 if fog is None else fog.extinction_per_m)
         ),
@@ -258,30 +260,34 @@ def world_on_device(scene: Scene, time_s: float, power: NDArray[np.float64]) -> 
     )
 
 
-def _shape_columns(scene: Scene, bodies: object, flat: Facets) -> dict[str, NDArray[np.int64]]:
+def _shape_columns(scene: Scene, worlds: tuple[object, ...], flat: Facets) -> dict[str, NDArray[np.int64]]:
     """Return what each of Mitsuba's shapes is, by its number in Mitsuba."""
     mi, dr = backend().mi, backend().dr
-    numbers = {
-        shape.id(): int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0])
+    numbers = [
+        (shape.id(), int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]))
+        for bodies in worlds
         for shape in bodies.shapes()  # type: ignore[attr-defined]
-    }
-    size = max(numbers.values(), default=0) + 1
+    ]
+    size = max((number for _, number in numbers), default=0) + 1
     columns = {name: np.full(size, -1, dtype=np.int64) for name in ("light", "facet")}
     columns |= {name: np.zeros(size, dtype=np.int64) for name in ("box", "glass", "pane")}
-    for group, name in enumerate(world.groups(scene)):
-        body = f"lamp_{name.removeprefix('lamps.')}" if name.startswith("lamps.") else f"source_{group}"
-        if body in numbers:  # the sun has none
-            columns["light"][numbers[body]] = group
+    light_of_body = {
+        f"lamp_{name.removeprefix('lamps.')}" if name.startswith("lamps.") else f"source_{group}": group
+        for group, name in enumerate(world.groups(scene))
+    }
     first_facet = {name: index for index, name in reversed(list(enumerate(flat.name)))}
-    for name, shape in scene.document.shapes.items():
+    for body, number in numbers:
+        columns["light"][number] = light_of_body.get(body, -1)
+        name = body.removeprefix("shape_").rpartition("_")[0]
+        if not body.startswith("shape_") or name not in scene.document.shapes:
+            continue
+        shape = scene.document.shapes[name]
         material = scene.document.materials[shape.material]
         box = isinstance(shape, Box)
-        for body in (key for key in numbers if key.rpartition("_")[0] == f"shape_{name}"):
-            number = numbers[body]
-            columns["facet"][number] = first_facet.get(f"shapes.{name}.0" if box else f"shapes.{name}", -1)
-            columns["box"][number] = box
-            columns["glass"][number] = isinstance(material, Dielectric)
-            columns["pane"][number] = isinstance(material, Pane)
+        columns["facet"][number] = first_facet.get(f"shapes.{name}.0" if box else f"shapes.{name}", -1)
+        columns["box"][number] = box
+        columns["glass"][number] = isinstance(material, Dielectric)
+        columns["pane"][number] = isinstance(material, Pane)
     return columns
 
 

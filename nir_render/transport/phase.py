@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.errors import InputError
+
 Array = NDArray[np.float64]
 
 CELLS = 1024
@@ -53,11 +55,18 @@ def phase_table(phase_function: Callable[[Array], Array]) -> PhaseTable:
     ----------
     phase_function
         Relative scattered intensity against the angle of turning in rad, shape (n,) → (n,), not negative.
+
+    Raises
+    ------
+    InputError
+        The function is so narrow that it falls between the table's angles.
     """
     angle_rad = np.pi * (np.arange(CELLS + 1) / CELLS) ** 2
     versine = 2.0 * np.sin(0.5 * angle_rad) ** 2
     density = np.asarray(phase_function(angle_rad), dtype=np.float64)
     shares = np.pi * (density[1:] + density[:-1]) * np.diff(versine)  # 2π ∫ p d(1 − cos θ), trapezoids
+    if not shares.sum() > 0.0:
+        raise InputError("a phase function is 0 but in a range too narrow to scatter; widen it to 1 deg")
     density = density / shares.sum()
     shares = shares / shares.sum()
     arc = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(angle_rad))])

@@ -25,9 +25,7 @@ def arriving(
     if lights.has_images:
         facet = dr.gather(mi.Int32, lights.facet, row, active)
         shown = active & (facet >= 0)
-        second = connect.reflected(
-            world.surfaces, mi.UInt32(facet), origin, aim.direction, aim.reach, aim.gap, shown
-        )
+        second = connect.reflected(world.surfaces, mi.UInt32(facet), origin, aim.direction, aim.reach, shown)
         active = active & (~shown | second.valid)
         factor = dr.select(shown, second.reflectance, factor)
         stretches = dr.select(shown, stretches + 1, stretches)
@@ -50,18 +48,39 @@ def arriving(
         if world.fog is not None:
             further = foggy.transmittance(world.fog, second.place, second.direction, second.rest)
             factor = dr.select(shown, factor * further, factor)
-        active = active & ((stretches < max_depth) & (factor > 0.0))
-        active = active & (
-            ~(shown & _hidden(world, second.place, second.direction, second.rest - aim.gap, active & shown))
-        )
+    active = active & (stretches < max_depth) & (factor > 0.0)
+    light = dr.gather(mi.UInt32, lights.group, row, active)
+    if second is None:
+        active = active & _reaches(world, row, light, origin, aim.direction, aim.reach, active)
     else:
-        active = active & ((stretches < max_depth) & (factor > 0.0))
-    end = dr.select(shown, reach * (1.0 - connect.SHORTER), reach - aim.gap)
-    active = active & ~_hidden(world, origin, aim.direction, end, active)
-    factor = factor * (
-        connect.emission(lights, dr.gather(mi.UInt32, lights.group, row, active), leaving, active)
-    )
+        mirror = reach * (1.0 - connect.SHORTER)
+        active = active & ~(shown & _hidden(world, origin, aim.direction, mirror, active & shown))
+        place, onward, rest = (
+            dr.select(shown, leg, straight)
+            for leg, straight in (
+                (second.place, origin), (second.direction, aim.direction), (second.rest, aim.reach),
+            )
+        )  # fmt: skip
+        active = active & _reaches(world, row, light, place, onward, rest, active)
+    factor = factor * connect.emission(lights, light, leaving, active)
     return dr.select(active, factor, 0.0)
+
+
+def _reaches(world: World, row: Any, light: Any, origin: Any, direction: Any, reach: Any, active: Any) -> Any:
+    """Tell whether a ray reaches the light that it aims at.
+
+    The first body that it meets, as far as the light's other side, is the light's own, or there is none:
+    float32 places the surface of a small far sphere too badly to end before it. Nothing behind a lamp counts,
+    which may lie in a ceiling.
+    """
+    mi, dr = backend().mi, backend().dr
+    radius = dr.gather(mi.Float, world.lights.radius, row, active)
+    ray = mi.Ray3f(origin, direction)
+    ray.maxt = dr.select(radius > 0.0, reach + 2.0 * radius, reach * (1.0 - connect.SHORTER))
+    met = world.opaque.ray_intersect_preliminary(ray, coherent=False, active=active)
+    shape = dr.reinterpret_array(mi.UInt32, met.shape)
+    own = dr.gather(mi.Int32, world.surfaces.light_of_shape, shape, active & met.is_valid())
+    return ~met.is_valid() | (own == mi.Int32(light))
 
 
 def _hidden(world: World, origin: Any, direction: Any, reach: Any, active: Any) -> Any:

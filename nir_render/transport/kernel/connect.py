@@ -12,11 +12,8 @@ from nir_render.transport.emitters import RECTANGLE, SUN
 from nir_render.transport.facets import MIRROR, PANE
 from nir_render.transport.kernel.tables import Choice, Lights, Surfaces
 
-# Shadow rays end this share of their way before their goal: what float32 rounds, with room.
+# Shadow rays to facets and lamps end this share of their way before it: what float32 rounds, with room.
 SHORTER = 1e-4
-# To a small far sphere it is more, up to this: float32 finds its surface to some 1e-7 D²/r, at its rim to
-# √1e-7 D, D being the distance, and a light's own body must not hide it.
-_GAP = 1e-3
 # A rectangle that fills less than this, in sr, is sampled by area: its solid angle loses digits, and far away
 # the two are nearly the same.
 _SMALL_SR = 0.02
@@ -24,14 +21,10 @@ _SMALL_SR = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """A ray towards a light: unit direction, length, density per sr of having been drawn, and the radiance.
-
-    Shadow rays stop short of its end by `gap`: float32 places the surface of a small far sphere no better.
-    """
+    """A ray towards a light: unit direction, length, density per sr of being drawn, and the radiance."""
 
     direction: Any
     reach: Any
-    gap: Any
     density: Any
     radiance: Any
 
@@ -86,12 +79,7 @@ def aim(lights: Lights, row: Any, place: Any, u: Any, v: Any, active: Any) -> Ai
             dr.select(kind == SUN, new, old)
             for new, old in zip(other, (direction, reach, density), strict=True)
         )
-    gap = reach * SHORTER
-    if lights.has_spheres:
-        radius = dr.gather(mi.Float, lights.radius, row, active)
-        blur = 3e-6 * reach * reach / dr.maximum(radius, 1e-6)
-        gap = dr.select(radius > 0.0, dr.minimum(gap + blur, reach * _GAP), gap)
-    return Aim(direction, reach, gap, density, radiance)
+    return Aim(direction, reach, density, radiance)
 
 
 def density_of(lights: Lights, row: Any, place: Any, direction: Any, active: Any) -> Any:
@@ -198,7 +186,7 @@ class Reflection:
 
 
 def reflected(
-    surfaces: Surfaces, facet: Any, origin: Any, direction: Any, reach: Any, gap: Any, active: Any
+    surfaces: Surfaces, facet: Any, origin: Any, direction: Any, reach: Any, active: Any
 ) -> Reflection:
     """Return how a ray towards a light's image is mirrored by the facet that shows it."""
     mi, dr = backend().mi, backend().dr
@@ -210,15 +198,15 @@ def reflected(
     place = origin + direction * at.distance
     # A step off the facet, on the side from which the light comes; as far as Mitsuba's own rays take.
     step = dr.sign(slope) * 1e-4 * (1.0 + dr.max(dr.abs(place))) * normal
-    # From there to the same point, as far before the light as shadow rays end.
-    to = (direction - 2.0 * slope * normal) * (reach - at.distance - gap) + step
+    # From there to the same point.
+    to = (direction - 2.0 * slope * normal) * (reach - at.distance) + step
     rest = dr.norm(to)
     return Reflection(
         valid=valid,
         distance=at.distance,
         place=place - step,
         direction=to / rest,
-        rest=rest + gap,
+        rest=rest,
         reflectance=reflectance(surfaces, facet, dr.abs(slope), valid),
     )
 

@@ -5,6 +5,7 @@ threads. The numbers of a path's first vertex are stratified over the samples of
 hypercube): the choice of a light and the place in the pixel then vary less between batches.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +14,10 @@ from nir_render.transport.backend import backend
 # What a number is for. A vertex has STEP of them; those of the camera come first.
 PIXEL_U, PIXEL_V, CAMERA_DIMENSIONS = 0, 1, 2
 LIGHT, LIGHT_U, LIGHT_V, LOBE, LOBE_U, LOBE_V, SURVIVAL = range(7)
-FOG_LIGHT, FOG_PLACE, FOG_U, FOG_V, FLIGHT, TURN_U, TURN_V = range(7, 14)
-STEP = 14
+FOG_LIGHT, FOG_PLACE, FOG_U, FOG_V, FLIGHT, TURN_LIGHT, TURN_U, TURN_V = range(7, 15)
+HALO, HALO_LIGHT, HALO_U, HALO_V = range(15, 19)
+FOG_CANDIDATES = 19  # two for each
+STEP = 27
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +37,12 @@ class Draws:
         bits = self._bits(sample, mi.UInt32(dimension))
         return self._even(sample, mi.UInt32(dimension), _unit(bits))
 
-    def vertex(self, sample: Any, depth: Any, use: int) -> Any:
-        """Return a number in [0, 1) for a vertex of a path, stratified for its first one."""
+    def vertex(self, sample: Any, depth: Any, use: Any) -> Any:
+        """Return a number in [0, 1) for a vertex of a path, stratified for its first one; `use` < STEP."""
         dr = backend().dr
         dimension = CAMERA_DIMENSIONS + depth * STEP + use
         bits = self._bits(sample, dimension)
         plain = _unit(bits)
-        if use == SURVIVAL:
-            return plain
         return dr.select(depth == 0, self._even(sample, dimension, plain), plain)
 
     def _even(self, sample: Any, dimension: Any, plain: Any) -> Any:
@@ -63,6 +64,42 @@ def draws(pixel: Any, batch: Any, seed: int, samples: Any) -> Draws:
     low, high = (dr.opaque(mi.UInt32, (seed >> shift) & 0xFFFFFFFF) for shift in (0, 32))
     key, key_too = mi.sample_tea_32(one ^ low, other ^ high)
     return Draws(key, key_too, samples)
+
+
+def drawn_by_weight(count: Any, weigh: Callable[[Any], tuple[Any, Any]], u: Any) -> tuple[Any, Any, Any]:
+    """Return one of some candidates, drawn by weight, its weight, and the sum of all weights.
+
+    Parameters
+    ----------
+    count
+        How many candidates there are.
+    weigh
+        Returns the candidate of a number, and its weight, above 0 at least for one.
+    u
+        One number in [0, 1): it serves all the way, as what is left of it is even again after each choice.
+    """
+    mi, dr = backend().mi, backend().dr
+
+    def more(k: Any, *_rest: Any) -> Any:
+        return k < count
+
+    def step(k: Any, chosen: Any, mine: Any, total: Any, rest: Any) -> tuple[Any, ...]:
+        candidate, weight = weigh(k)
+        total = total + weight
+        share = weight / dr.maximum(total, 1e-30)
+        taken = rest < share
+        rest = dr.select(
+            taken, rest / dr.maximum(share, 1e-30), (rest - share) / dr.maximum(1.0 - share, 1e-9)
+        )
+        return (
+            k + 1, dr.select(taken, candidate, chosen), dr.select(taken, weight, mine), total,
+            dr.clip(rest, 0.0, 1.0),
+        )  # fmt: skip
+
+    zero, nothing = dr.zeros(mi.UInt32, dr.width(u)), dr.zeros(mi.Float, dr.width(u))
+    start = (zero, mi.UInt32(zero), nothing, mi.Float(nothing), mi.Float(u))
+    _, chosen, mine, total, _ = dr.while_loop(start, more, step)
+    return chosen, mine, total
 
 
 _BELOW_ONE = 1.0 - 2.0**-24

@@ -19,16 +19,20 @@ from nir_render.transport.kernel import connect
 from nir_render.transport.kernel import draws as use
 from nir_render.transport.kernel import fog as foggy
 from nir_render.transport.kernel.arrive import arriving
-from nir_render.transport.kernel.scatter import scatter_on_the_way, turned
+from nir_render.transport.kernel.halos import Halos, turn_in_fog
+from nir_render.transport.kernel.scatter import scatter_on_the_way
 from nir_render.transport.kernel.tables import Surfaces, World
 
 # How a path came here since its last vertex that scatters evenly: straight on (through panes at most), by one
 # facet (its number), or by smooth surfaces that no image stands for.
 _STRAIGHT, _OTHERWISE = -1, -2
 _FAR = 1e15
-# Paths dimmer than this go on by chance, and with this weight. Brighter ones would stand out of the noise;
-# without any roulette a render takes twice the time.
+# Paths of which surfaces and fog have left less than this go on by chance, as if this were left. How a path
+# was drawn does not count: what goes towards a light weighs little, and brings as much as any.
 _DIM = 0.1
+# In fog: the share of directions from surfaces that go into halos, and how much more than light paths turn.
+_HALO_SHARE = 0.25
+_TURNS = 3.0
 # Less than this, in 1/(m² sr), is nothing: near 1e-38 some threads round to zero and others do not.
 _NOTHING = 1e-15
 
@@ -37,13 +41,14 @@ _NOTHING = 1e-15
 class Film:
     """The rays of a camera and the part of its film to fill.
 
-    `corners` holds directions at the corners of the sensor's pixels, `columns` + 1 to a row; a pixel of the
-    film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels` and
-    `pixel_count` how many.
+    `corners` holds directions at the corners of the sensor's pixels, `rows` + 1 times `columns` + 1; a pixel
+    of the film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels`
+    and `pixel_count` how many.
     """
 
     origin: Any
     corners: Any
+    rows: Any
     columns: Any
     scale: Any
     index: Any
@@ -60,6 +65,7 @@ class _State:
     origin: Any
     direction: Any
     weight: Any
+    left: Any  # what surfaces and fog have left of a path's light
     place: Any  # the last vertex that scatters evenly
     cell: Any
     density: Any  # with which its direction was drawn; 0 after fog, where lights have been asked for already
@@ -112,6 +118,7 @@ def walk(
         origin=film.origin + dr.zeros(mi.Point3f, lanes),
         direction=begun(zero),
         weight=dr.ones(mi.Float, lanes),
+        left=dr.ones(mi.Float, lanes),
         place=dr.zeros(mi.Point3f, lanes),
         cell=mi.UInt32(zero),
         density=dr.zeros(mi.Float, lanes),
@@ -131,7 +138,8 @@ def _camera_direction(film: Film, pixel: Any, draw: use.Draws, sample: Any) -> A
     row = pixel // width
     u = (mi.Float(pixel - row * width) + draw.pixel(sample, use.PIXEL_U)) * mi.Float(film.scale)
     v = (mi.Float(row) + draw.pixel(sample, use.PIXEL_V)) * mi.Float(film.scale)
-    column, line = mi.UInt32(u), mi.UInt32(v)
+    # In float32 the sum can round up to the next whole number.
+    column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
     corner = line * (film.columns + 1) + column
     above, above_right, below, below_right = (
         dr.gather(mi.Vector3f, film.corners, corner + offset)
@@ -160,30 +168,16 @@ def _step(
     met = state.active & si.is_valid()
     further = state.depth + 1 < max_depth
 
-    # Fog: what it scatters on this stretch, how much it leaves of the light beyond, and whether the path
-    # itself turns in it. What lies at the end of the stretch is asked for whether it turns or not, so that
-    # this choice brings no noise into it.
-    turns, passing, turned_weight = mi.Bool(False), state.weight, mi.Float(0)
-    turned_at, turned_to = mi.Point3f(0), mi.Vector3f(0, 0, 1)
+    # Fog: what it scatters on this stretch, and how much it leaves of the light beyond. What lies at the end
+    # is asked for whether the path turns in fog or not, so that this choice brings no noise into it.
+    lost, in_fog, scattered = mi.Float(0), mi.Bool(False), None
     if world.fog is not None:
-        reach = dr.select(met, si.t, _FAR)
-        begin, end = foggy.interval(world.fog, state.origin, state.direction, reach)
+        begin, end = foggy.interval(world.fog, state.origin, state.direction, dr.select(met, si.t, _FAR))
         in_fog = state.active & ~state.inside & (end > begin)
-        row, distance, density = scatter_on_the_way(
-            world, state, begin, end, in_fog & further, max_depth, number, add
-        )
-        lost = foggy.absorbed(world.fog.extinction * (end - begin))
-        passing = dr.select(in_fog, state.weight * (1.0 - lost), state.weight)
-        # The path turns as often as light would on this stretch, but where the light was asked for: near
-        # lights.
-        turns = in_fog & further & (number(use.FLIGHT) < lost)
-        flown = world.fog.extinction * dr.exp(-world.fog.extinction * (distance - begin))
-        turned_weight = world.fog.albedo * flown / (density * lost)
-        turned_at = state.origin + state.direction * distance
-        turned_to, share = turned(
-            world, row, turned_at, state.direction, number(use.TURN_U), number(use.TURN_V), in_fog
-        )
-        turned_weight = turned_weight * share
+        lost = dr.select(in_fog, foggy.absorbed(world.fog.extinction * (end - begin)), 0.0)
+        in_fog = in_fog & further
+        scattered = scatter_on_the_way(world, state, begin, end, in_fog, max_depth, number, add)
+    passing = state.weight * (1.0 - lost)
 
     # Light that the path meets.
     shape = dr.reinterpret_array(mi.UInt32, si.shape)
@@ -206,21 +200,39 @@ def _step(
         ctx, si, si.to_local(aim.direction), number(use.LOBE),
         mi.Point2f(number(use.LOBE_U), number(use.LOBE_V)), surface,
     )  # fmt: skip
+    smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    lobe = _Lobe(mi.Vector3f(sample.wo), mi.Float(sample.pdf), sampled_weight[0], sampled_weight[0], smooth)
+    if world.fog is not None:
+        rough = surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        halos = Halos(world, si.p, None, number(use.HALO_LIGHT), rough)
+        lobe = _some_into_halos(si, bsdf, lobe, halos, rough, number)
+        density = dr.select(rough, dr.lerp(density, halos.density(aim.direction), _HALO_SHARE), density)
     asked = aim.density * chance
     brought = passing * value[0] * aim.radiance / asked * _power(asked, density)
     seen = surface & (brought > 0.0) & dr.isfinite(brought)
     shadow = si.spawn_ray(aim.direction)
     # Mitsuba lifts a ray's origin off the surface, up to 1e-4 of the coordinates; it aims at the same point.
-    to = aim.direction * (aim.reach - aim.gap) - (shadow.o - si.p)
+    to = aim.direction * aim.reach - (shadow.o - si.p)
     reach = dr.norm(to)
-    lifted = replace(aim, direction=to / reach, reach=reach + aim.gap)
+    lifted = replace(aim, direction=to / reach, reach=reach)
     share = arriving(world, row, shadow.o, lifted, state.depth, max_depth, seen)
     add(brought * share, row, seen & (share > 0.0))
 
-    # On to the next vertex.
-    smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    # On to the next vertex: in fog, or on the surface. Light that turns in fog varies more than what comes
+    # from surfaces, so paths turn more often than light would.
+    surface = surface & (lobe.weight > 0.0)
+    turns, turned_weight, onward_weight = mi.Bool(False), mi.Float(0), lobe.weight
+    turned_at, turned_to = mi.Point3f(0), mi.Vector3f(0, 0, 1)
+    if world.fog is not None:
+        often = dr.select(surface, _TURNS * lost / (1.0 + (_TURNS - 1.0) * lost), 1.0)
+        often = dr.select(in_fog, often, 0.0)
+        turns = number(use.FLIGHT) < often
+        turned_at, turned_to, turned_weight = turn_in_fog(world, scattered, state, number, in_fog)
+        turned_weight = turned_weight / often
+        onward_weight = lobe.weight * (1.0 - lost) / (1.0 - often)
+    smooth = lobe.smooth
     passes = dr.gather(mi.Bool, world.surfaces.pane_of_shape, shape, surface) & mi.has_flag(
-        sample.sampled_type, mi.BSDFFlags.DeltaTransmission
+        sample.sampled_type, mi.BSDFFlags.Null
     )
     facet = _facet(world.surfaces, si, shape, surface)
     mirrored = (
@@ -229,13 +241,15 @@ def _step(
     )  # fmt: skip
     way = dr.select(passes, state.way, dr.select(mirrored, facet, _OTHERWISE))
     glass = dr.gather(mi.Bool, world.surfaces.glass_of_shape, shape, surface)
-    onward = si.spawn_ray(si.to_world(sample.wo))
-    surface = surface & (~turns)
+    onward = si.spawn_ray(si.to_world(lobe.direction))
+    surface = surface & ~turns
     evenly = (surface & ~smooth) | turns
-    weight = state.weight * dr.select(turns, turned_weight, sampled_weight[0])
+    weight = state.weight * dr.select(turns, turned_weight, onward_weight)
+    left = state.left if world.fog is None else state.left * dr.select(turns, world.fog.albedo, 1.0)
+    left = left * dr.select(turns, 1.0, lobe.reflected)
     depth = state.depth + 1
-    survival = dr.minimum(weight / _DIM, 1.0)
-    goes_on = ((surface & (sampled_weight[0] > 0.0)) | turns) & (number(use.SURVIVAL) < survival)
+    survival = dr.minimum(left / _DIM, 1.0)
+    goes_on = (surface | turns) & (number(use.SURVIVAL) < survival)
     sample_next = state.sample + dr.select(goes_on, mi.UInt32(0), mi.UInt32(1))
     return _State(
         sample=sample_next,
@@ -243,14 +257,57 @@ def _step(
         origin=dr.select(goes_on, dr.select(turns, turned_at, onward.o), camera),
         direction=dr.select(goes_on, dr.select(turns, turned_to, onward.d), begun(sample_next)),
         weight=dr.select(goes_on, weight / survival, 1.0),
+        left=dr.select(goes_on, left / survival, 1.0),
         place=dr.select(evenly, dr.select(turns, turned_at, si.p), state.place),
         cell=dr.select(evenly, cell, state.cell),
-        # A facet or pane on the way is drawn with its own chance, which belongs to the chance of the way.
-        density=dr.select(turns, 0.0, dr.select(smooth, state.density * sample.pdf, sample.pdf)),
+        # Smooth surfaces on the way leave it: asking for light weighs with the same density.
+        density=dr.select(turns, 0.0, dr.select(smooth, state.density, lobe.density)),
         scattered=goes_on & (state.scattered | evenly),
         way=dr.select(goes_on & ~evenly, way, _STRAIGHT),
-        inside=goes_on & dr.select(surface & glass, sample.wo.z < 0.0, state.inside),
+        inside=goes_on & dr.select(surface & glass, lobe.direction.z < 0.0, state.inside),
         active=state.active & (sample_next < draw.samples),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Lobe:
+    """How a path leaves a surface.
+
+    Its direction in the surface's frame, the density per sr of having been drawn, its weight, the share of
+    light that the surface reflects, and whether a smooth part of it does.
+    """
+
+    direction: Any
+    density: Any
+    weight: Any
+    reflected: Any
+    smooth: Any
+
+
+def _some_into_halos(si: Any, bsdf: Any, lobe: _Lobe, halos: Halos, rough: Any, number: Any) -> _Lobe:
+    """Return how a path leaves a surface in fog: some of the draws go into the halo of a light.
+
+    Directions of both kinds weigh by the density of their mixture; a smooth part is drawn by the surface
+    alone.
+    """
+    mi, dr = backend().mi, backend().dr
+    by_halo = rough & (number(use.HALO) < _HALO_SHARE)
+    into = si.to_local(halos.direction(number(use.HALO_U), number(use.HALO_V)))
+    value, own_density = bsdf.eval_pdf(mi.BSDFContext(), si, into, by_halo)
+    direction = dr.select(by_halo, into, lobe.direction)
+    mixed = dr.lerp(
+        dr.select(by_halo, own_density, lobe.density), halos.density(si.to_world(direction)), _HALO_SHARE
+    )
+    weight = dr.select(by_halo, value[0], lobe.weight * lobe.density) / dr.maximum(mixed, 1e-30)
+    smooth = lobe.smooth & ~by_halo
+    weight = dr.select(smooth, lobe.weight / (1.0 - _HALO_SHARE), weight)
+    there = dr.select(own_density > 0.0, value[0] / dr.maximum(own_density, 1e-30), 0.0)
+    return _Lobe(
+        direction=direction,
+        density=dr.select(rough & ~smooth, mixed, lobe.density),
+        weight=dr.select(rough, weight, lobe.weight),
+        reflected=dr.select(by_halo, there, lobe.reflected),
+        smooth=smooth,
     )
 
 

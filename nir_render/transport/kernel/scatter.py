@@ -16,8 +16,8 @@ from nir_render.transport.kernel.arrive import arriving
 from nir_render.transport.kernel.tables import World
 
 # Up to so many lights fog weighs each of them for each stretch; with more, the guide proposes so many.
-_WEIGHED_LIGHTS = 8
-_CANDIDATES = 4
+_WEIGHED_LIGHTS = 16
+_CANDIDATES = 4  # for each of which `draws` has two numbers
 
 
 def scatter_on_the_way(
@@ -27,13 +27,13 @@ def scatter_on_the_way(
 
     Returns
     -------
-    The light, the distance at which its light was scattered, and the density per metre with which that was
-    drawn.
+    Where the stretch begins, the distance at which light was scattered, and the density per metre with which
+    that was drawn.
     """
     dr = backend().dr
     fog = world.fog
     assert fog is not None  # noqa: S101 (only called in fog)
-    row, chance = _light_for_stretch(world, state, begin, end, active, number(use.FOG_LIGHT))
+    row, chance = _light_for_stretch(world, state, begin, end, active, number)
     distance, density = _place_on_stretch(world, row, state, begin, end, number(use.FOG_PLACE), active)
     place = state.origin + state.direction * distance
     aim = connect.aim(world.lights, row, place, number(use.FOG_U), number(use.FOG_V), active)
@@ -45,11 +45,11 @@ def scatter_on_the_way(
     seen = active & (brought > 0.0) & dr.isfinite(brought)
     share = arriving(world, row, place, aim, state.depth, max_depth, seen)
     add(brought * share, row, seen & (share > 0.0))
-    return row, distance, density
+    return begin, distance, density
 
 
 def _light_for_stretch(
-    world: World, state: Any, begin: Any, end: Any, active: Any, u: Any
+    world: World, state: Any, begin: Any, end: Any, active: Any, number: Any
 ) -> tuple[Any, Any]:
     """Return a light drawn by what it brings to the fog on a stretch, and the chance of it.
 
@@ -58,42 +58,29 @@ def _light_for_stretch(
     places along the stretch, and one of these is taken by its weight (resampling, Talbot et al. 2005); the
     chance returned is then the one that makes the estimate right on average.
     """
-    mi, dr = backend().mi, backend().dr
-    lights = world.lights
-    few = lights.rows <= _WEIGHED_LIGHTS
+    few = weighs_all(world)
 
-    def more(k: Any, *_rest: Any) -> Any:
-        return k < (lights.count if few else _CANDIDATES)
+    def weigh(k: Any) -> tuple[Any, Any]:
+        row, chance = (k, 1.0) if few else _candidate(world, state, begin, end, k, number)
+        return row, _brought_to_stretch(world, row, state, begin, end, active) / chance
 
-    def weigh(k: Any, row: Any, mine: Any, total: Any, rest: Any) -> tuple[Any, ...]:
-        candidate, chance = (k, 1.0) if few else _candidate(world, state, begin, end, k, u)
-        weight = _brought_to_stretch(world, candidate, state, begin, end, active)
-        total = total + weight / chance
-        share = weight / (chance * total)
-        taken = rest < share
-        # The same number serves all the way: what is left of it is even again after each choice.
-        rest = dr.select(taken, rest / share, (rest - share) / dr.maximum(1.0 - share, 1e-9))
-        return (
-            k + 1, dr.select(taken, candidate, row), dr.select(taken, weight, mine), total,
-            dr.clip(rest, 0.0, 1.0),
-        )  # fmt: skip
-
-    zero = dr.zeros(mi.UInt32, dr.width(u))
-    nothing = dr.zeros(mi.Float, dr.width(u))
-    _, row, mine, total, _ = dr.while_loop(
-        (zero, mi.UInt32(zero), nothing, mi.Float(nothing), mi.Float(u)), more, weigh
-    )
-    return row, mine / total if few else _CANDIDATES * mine / total
+    count = world.lights.count if few else _CANDIDATES
+    row, weight, total = use.drawn_by_weight(count, weigh, number(use.FOG_LIGHT))
+    if few:
+        return row, weight / total
+    return row, _CANDIDATES * _brought_to_stretch(world, row, state, begin, end, active) / total
 
 
-def _candidate(world: World, state: Any, begin: Any, end: Any, number: Any, u: Any) -> tuple[Any, Any]:
+def weighs_all(world: World) -> bool:
+    """Tell whether lights are so few that fog weighs each of them for each stretch."""
+    return world.lights.rows <= _WEIGHED_LIGHTS
+
+
+def _candidate(world: World, state: Any, begin: Any, end: Any, k: Any, number: Any) -> tuple[Any, Any]:
     """Return a light that the guide draws at one of some places on a stretch, and its chance."""
-    mi, dr = backend().mi, backend().dr
-    # Fractions of the one number, scaled up, stand for numbers of their own.
-    along = u * 1021.0 - dr.floor(u * 1021.0)
-    pick = u * 16381.0 + mi.Float(number) * 0.6180339887
-    pick = dr.minimum(pick - dr.floor(pick), 1.0 - 2.0**-24)
-    distance = _flight_within(world, begin, end, (mi.Float(number) + along) / _CANDIDATES)
+    mi = backend().mi
+    along, pick = (number(use.FOG_CANDIDATES + 2 * k + which) for which in range(2))
+    distance = _flight_within(world, begin, end, (mi.Float(k) + along) / _CANDIDATES)
     cell = connect.cell_of(world.choice, state.origin + state.direction * distance)
     return connect.choose(world.choice, world.lights, cell, pick)
 
@@ -169,47 +156,3 @@ def _flight_within(world: World, begin: Any, end: Any, u: Any) -> Any:
     assert world.fog is not None  # noqa: S101 (only called in fog)
     whole = foggy.absorbed(world.fog.extinction * (end - begin))
     return dr.minimum(begin - dr.log(1.0 - u * whole) / world.fog.extinction, end)
-
-
-def turned(
-    world: World, row: Any, place: Any, direction: Any, u: Any, v: Any, active: Any
-) -> tuple[Any, Any]:
-    """Return the direction of a path that turns in fog, and its weight.
-
-    Half of the draws go by the phase function, half into the halo of a light.
-    """
-    dr = backend().dr
-    halo = Halo(world, row, place, active)
-    by_phase = u < 0.5
-    u = dr.select(by_phase, 2.0 * u, 2.0 * u - 1.0)
-    onward = dr.select(by_phase, foggy.turned(halo.fog, direction, u, v), halo.direction(u, v))
-    phase = foggy.phase(halo.fog, 0.5 * dr.squared_norm(onward - direction))
-    return onward, phase / (0.5 * (phase + halo.density(onward)))
-
-
-class Halo:
-    """The shining fog around a light, as seen from a place: directions drawn by how it shines, roughly."""
-
-    def __init__(self, world: World, row: Any, place: Any, active: Any) -> None:
-        mi, dr = backend().mi, backend().dr
-        assert world.fog is not None  # noqa: S101 (only in fog)
-        self.fog = world.fog
-        axis = dr.normalize(dr.gather(mi.Point3f, world.lights.center, row, active) - place)
-        if world.lights.sun >= 0:
-            sun = dr.gather(mi.UInt32, world.lights.kind, row, active) == SUN
-            axis = dr.select(sun, dr.gather(mi.Vector3f, world.lights.normal, row, active), axis)
-        self.axis = axis
-
-    def direction(self, u: Any, v: Any) -> Any:
-        """Return a unit direction, drawn."""
-        mi, dr = backend().mi, backend().dr
-        sine, cosine = dr.sincos(foggy.drawn_angle(self.fog, self.fog.halo, u))
-        sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * v)
-        return mi.Frame3f(self.axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, cosine))
-
-    def density(self, direction: Any) -> Any:
-        """Return the density per sr: that of the angle θ off the light over 2π sin θ."""
-        dr = backend().dr
-        across = dr.norm(dr.cross(direction, self.axis))
-        angle = dr.atan2(across, dr.dot(direction, self.axis))
-        return foggy.slope(self.fog, self.fog.halo, angle) / (2.0 * dr.pi * dr.maximum(across, 1e-7))
