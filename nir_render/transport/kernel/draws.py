@@ -14,10 +14,9 @@ from nir_render.transport.backend import backend
 # What a number is for. A vertex has STEP of them; those of the camera come first.
 PIXEL_U, PIXEL_V, CAMERA_DIMENSIONS = 0, 1, 2
 LIGHT, LIGHT_U, LIGHT_V, LOBE, LOBE_U, LOBE_V, SURVIVAL = range(7)
-FOG_LIGHT, FOG_PLACE, FOG_U, FOG_V, FLIGHT, TURN_LIGHT, TURN_U, TURN_V = range(7, 15)
-HALO, HALO_LIGHT, HALO_U, HALO_V = range(15, 19)
-FOG_CANDIDATES = 19  # two for each
-STEP = 27
+FOG_LIGHT, FOG_PLACE, FOG_U, FOG_V, FLIGHT, HALO, HALO_LIGHT, HALO_U, HALO_V = range(7, 16)
+FOG_CANDIDATES = 16  # two for each
+STEP = 24
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,33 +17,6 @@ from nir_render.transport.kernel.tables import World
 _BRIGHTEST_PER_SR = 10.0  # how bright a halo counts, at most, in front of a path that turns
 
 
-def turn_in_fog(world: World, scattered: Any, state: Any, number: Any, active: Any) -> tuple[Any, Any, Any]:
-    """Return where a path turns in fog, its direction from there, and its weight.
-
-    It turns where light was scattered into it: near lights. Half of the directions go by the phase function,
-    half into the halo of a light.
-
-    Parameters
-    ----------
-    scattered
-        What `scatter_on_the_way` returned for the stretch.
-    """
-    mi, dr = backend().mi, backend().dr
-    fog = world.fog
-    assert fog is not None  # noqa: S101 (only called in fog)
-    begin, distance, density = scattered
-    place = state.origin + state.direction * distance
-    u, v = number(use.TURN_U), number(use.TURN_V)
-    halos = Halos(world, place, state.direction, number(use.TURN_LIGHT), active)
-    by_phase = u < 0.5
-    u = dr.select(by_phase, 2.0 * u, 2.0 * u - 1.0)
-    onward = dr.select(by_phase, foggy.turned(fog, state.direction, u, v), halos.direction(u, v))
-    phase = foggy.phase(fog, 0.5 * dr.squared_norm(onward - state.direction))
-    flown = fog.extinction * dr.exp(-fog.extinction * (distance - begin))
-    weight = fog.albedo * flown / density * phase / (0.5 * (phase + halos.density(onward)))
-    return mi.Point3f(place), onward, weight
-
-
 class Halos:
     """The shining fog around lights, as seen from a place.
 
@@ -51,11 +24,11 @@ class Halos:
     many, drawn by the guide, that one alone: an estimate weighted so is as right on average for each light.
     """
 
-    def __init__(self, world: World, place: Any, heading: Any, u: Any, active: Any) -> None:
-        """Draw a light with the number `u`; `heading` is where a path comes along, None at a surface."""
+    def __init__(self, world: World, place: Any, heading: Any, turned: Any, u: Any, active: Any) -> None:
+        """Draw a light with the number `u`; a path that turns in fog prefers those ahead of its `heading`."""
         assert world.fog is not None  # noqa: S101 (only in fog)
         self.fog, self.lights = world.fog, world.lights
-        self.place, self.heading, self.active = place, heading, active
+        self.place, self.heading, self.turned, self.active = place, heading, turned, active
         self.total = None
         if weighs_all(world):
             self.row, _, self.total = use.drawn_by_weight(self.lights.count, self._weighed, u)
@@ -94,11 +67,9 @@ class Halos:
         spread = dr.gather(mi.Float, self.lights.spread, row, self.active)
         weight = dr.gather(mi.Float, self.lights.power, row, self.active)
         weight = weight * dr.exp(-self.fog.extinction * distance) / dr.maximum(distance, spread)
-        if self.heading is not None:
-            turn = 0.5 * dr.squared_norm(axis - self.heading)
-            ahead = dr.minimum(self._density(axis, self.heading), _BRIGHTEST_PER_SR)
-            weight = weight * (foggy.phase(self.fog, turn) + ahead)
-        return row, dr.maximum(weight, 1e-12)
+        turn = 0.5 * dr.squared_norm(axis - self.heading)
+        ahead = foggy.phase(self.fog, turn) + dr.minimum(self._density(axis, self.heading), _BRIGHTEST_PER_SR)
+        return row, dr.maximum(dr.select(self.turned, weight * ahead, weight), 1e-12)
 
     def _axis(self, row: Any) -> tuple[Any, Any]:
         """Return the direction of a light, and its distance; the sun counts as a metre away."""

@@ -19,7 +19,7 @@ from nir_render.transport.kernel import connect
 from nir_render.transport.kernel import draws as use
 from nir_render.transport.kernel import fog as foggy
 from nir_render.transport.kernel.arrive import arriving
-from nir_render.transport.kernel.halos import Halos, turn_in_fog
+from nir_render.transport.kernel.leaving import in_fog, off_surface
 from nir_render.transport.kernel.scatter import scatter_on_the_way
 from nir_render.transport.kernel.tables import Surfaces, World
 
@@ -30,9 +30,6 @@ _FAR = 1e15
 # Paths of which surfaces and fog have left less than this go on by chance, as if this were left. How a path
 # was drawn does not count: what goes towards a light weighs little, and brings as much as any.
 _DIM = 0.1
-# In fog: the share of directions from surfaces that go into halos, and how much more than light paths turn.
-_HALO_SHARE = 0.25
-_TURNS = 3.0
 # Less than this, in 1/(m² sr), is nothing: near 1e-38 some threads round to zero and others do not.
 _NOTHING = 1e-15
 
@@ -170,14 +167,12 @@ def _step(
 
     # Fog: what it scatters on this stretch, and how much it leaves of the light beyond. What lies at the end
     # is asked for whether the path turns in fog or not, so that this choice brings no noise into it.
-    lost, in_fog, scattered = mi.Float(0), mi.Bool(False), None
+    passing, scattered = state.weight, None
     if world.fog is not None:
         begin, end = foggy.interval(world.fog, state.origin, state.direction, dr.select(met, si.t, _FAR))
-        in_fog = state.active & ~state.inside & (end > begin)
-        lost = dr.select(in_fog, foggy.absorbed(world.fog.extinction * (end - begin)), 0.0)
-        in_fog = in_fog & further
-        scattered = scatter_on_the_way(world, state, begin, end, in_fog, max_depth, number, add)
-    passing = state.weight * (1.0 - lost)
+        in_it = state.active & ~state.inside & (end > begin)
+        scattered = scatter_on_the_way(world, state, begin, end, in_it, max_depth, number, add)
+        passing = state.weight * (1.0 - scattered.lost)
 
     # Light that the path meets.
     shape = dr.reinterpret_array(mi.UInt32, si.shape)
@@ -200,13 +195,6 @@ def _step(
         ctx, si, si.to_local(aim.direction), number(use.LOBE),
         mi.Point2f(number(use.LOBE_U), number(use.LOBE_V)), surface,
     )  # fmt: skip
-    smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    lobe = _Lobe(mi.Vector3f(sample.wo), mi.Float(sample.pdf), sampled_weight[0], sampled_weight[0], smooth)
-    if world.fog is not None:
-        rough = surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        halos = Halos(world, si.p, None, number(use.HALO_LIGHT), rough)
-        lobe = _some_into_halos(si, bsdf, lobe, halos, rough, number)
-        density = dr.select(rough, dr.lerp(density, halos.density(aim.direction), _HALO_SHARE), density)
     asked = aim.density * chance
     brought = passing * value[0] * aim.radiance / asked * _power(asked, density)
     seen = surface & (brought > 0.0) & dr.isfinite(brought)
@@ -218,19 +206,12 @@ def _step(
     share = arriving(world, row, shadow.o, lifted, state.depth, max_depth, seen)
     add(brought * share, row, seen & (share > 0.0))
 
-    # On to the next vertex: in fog, or on the surface. Light that turns in fog varies more than what comes
-    # from surfaces, so paths turn more often than light would.
-    surface = surface & (lobe.weight > 0.0)
-    turns, turned_weight, onward_weight = mi.Bool(False), mi.Float(0), lobe.weight
-    turned_at, turned_to = mi.Point3f(0), mi.Vector3f(0, 0, 1)
-    if world.fog is not None:
-        often = dr.select(surface, _TURNS * lost / (1.0 + (_TURNS - 1.0) * lost), 1.0)
-        often = dr.select(in_fog, often, 0.0)
-        turns = number(use.FLIGHT) < often
-        turned_at, turned_to, turned_weight = turn_in_fog(world, scattered, state, number, in_fog)
-        turned_weight = turned_weight / often
-        onward_weight = lobe.weight * (1.0 - lost) / (1.0 - often)
-    smooth = lobe.smooth
+    # On to the next vertex.
+    leaving = off_surface(si, sample, sampled_weight[0])
+    surface = surface & (leaving.weight > 0.0)
+    if scattered is not None:
+        leaving = in_fog(world, state, si, bsdf, leaving, surface, scattered, number)
+    turned, smooth = leaving.turned, leaving.smooth
     passes = dr.gather(mi.Bool, world.surfaces.pane_of_shape, shape, surface) & mi.has_flag(
         sample.sampled_type, mi.BSDFFlags.Null
     )
@@ -241,73 +222,29 @@ def _step(
     )  # fmt: skip
     way = dr.select(passes, state.way, dr.select(mirrored, facet, _OTHERWISE))
     glass = dr.gather(mi.Bool, world.surfaces.glass_of_shape, shape, surface)
-    onward = si.spawn_ray(si.to_world(lobe.direction))
-    surface = surface & ~turns
-    evenly = (surface & ~smooth) | turns
-    weight = state.weight * dr.select(turns, turned_weight, onward_weight)
-    left = state.left if world.fog is None else state.left * dr.select(turns, world.fog.albedo, 1.0)
-    left = left * dr.select(turns, 1.0, lobe.reflected)
+    onward = si.spawn_ray(leaving.direction)
+    surface = surface & ~turned & (leaving.weight > 0.0)
+    evenly = (surface & ~smooth) | turned
+    left = state.left * leaving.left
     depth = state.depth + 1
     survival = dr.minimum(left / _DIM, 1.0)
-    goes_on = (surface | turns) & (number(use.SURVIVAL) < survival)
+    goes_on = (surface | turned) & (number(use.SURVIVAL) < survival)
     sample_next = state.sample + dr.select(goes_on, mi.UInt32(0), mi.UInt32(1))
     return _State(
         sample=sample_next,
         depth=dr.select(goes_on, depth, 0),
-        origin=dr.select(goes_on, dr.select(turns, turned_at, onward.o), camera),
-        direction=dr.select(goes_on, dr.select(turns, turned_to, onward.d), begun(sample_next)),
-        weight=dr.select(goes_on, weight / survival, 1.0),
+        origin=dr.select(goes_on, dr.select(turned, leaving.place, onward.o), camera),
+        direction=dr.select(goes_on, leaving.direction, begun(sample_next)),
+        weight=dr.select(goes_on, state.weight * leaving.weight / survival, 1.0),
         left=dr.select(goes_on, left / survival, 1.0),
-        place=dr.select(evenly, dr.select(turns, turned_at, si.p), state.place),
+        place=dr.select(evenly, leaving.place, state.place),
         cell=dr.select(evenly, cell, state.cell),
         # Smooth surfaces on the way leave it: asking for light weighs with the same density.
-        density=dr.select(turns, 0.0, dr.select(smooth, state.density, lobe.density)),
+        density=dr.select(smooth, state.density, leaving.density),
         scattered=goes_on & (state.scattered | evenly),
         way=dr.select(goes_on & ~evenly, way, _STRAIGHT),
-        inside=goes_on & dr.select(surface & glass, lobe.direction.z < 0.0, state.inside),
+        inside=goes_on & dr.select(surface & glass, dr.dot(leaving.direction, si.n) < 0.0, state.inside),
         active=state.active & (sample_next < draw.samples),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Lobe:
-    """How a path leaves a surface.
-
-    Its direction in the surface's frame, the density per sr of having been drawn, its weight, the share of
-    light that the surface reflects, and whether a smooth part of it does.
-    """
-
-    direction: Any
-    density: Any
-    weight: Any
-    reflected: Any
-    smooth: Any
-
-
-def _some_into_halos(si: Any, bsdf: Any, lobe: _Lobe, halos: Halos, rough: Any, number: Any) -> _Lobe:
-    """Return how a path leaves a surface in fog: some of the draws go into the halo of a light.
-
-    Directions of both kinds weigh by the density of their mixture; a smooth part is drawn by the surface
-    alone.
-    """
-    mi, dr = backend().mi, backend().dr
-    by_halo = rough & (number(use.HALO) < _HALO_SHARE)
-    into = si.to_local(halos.direction(number(use.HALO_U), number(use.HALO_V)))
-    value, own_density = bsdf.eval_pdf(mi.BSDFContext(), si, into, by_halo)
-    direction = dr.select(by_halo, into, lobe.direction)
-    mixed = dr.lerp(
-        dr.select(by_halo, own_density, lobe.density), halos.density(si.to_world(direction)), _HALO_SHARE
-    )
-    weight = dr.select(by_halo, value[0], lobe.weight * lobe.density) / dr.maximum(mixed, 1e-30)
-    smooth = lobe.smooth & ~by_halo
-    weight = dr.select(smooth, lobe.weight / (1.0 - _HALO_SHARE), weight)
-    there = dr.select(own_density > 0.0, value[0] / dr.maximum(own_density, 1e-30), 0.0)
-    return _Lobe(
-        direction=direction,
-        density=dr.select(rough & ~smooth, mixed, lobe.density),
-        weight=dr.select(rough, weight, lobe.weight),
-        reflected=dr.select(by_halo, there, lobe.reflected),
-        smooth=smooth,
     )
 
 

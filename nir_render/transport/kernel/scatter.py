@@ -5,6 +5,7 @@ inverse square cancel where the place is drawn evenly in ∫ p dβ, β being the
 off the ray (equiangular sampling, Kulla & Fajardo 2012, with the phase function in it).
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 from nir_render.transport.backend import backend
@@ -20,32 +21,42 @@ _WEIGHED_LIGHTS = 16
 _CANDIDATES = 4  # for each of which `draws` has two numbers
 
 
+@dataclass(frozen=True, eq=False)
+class Scattered:
+    """What fog does on a stretch.
+
+    The share of light lost on it; a place where a path may turn, the weight of turning there, the new
+    direction apart, and whether it may.
+    """
+
+    lost: Any
+    place: Any
+    weight: Any
+    turns: Any
+
+
 def scatter_on_the_way(
     world: World, state: Any, begin: Any, end: Any, active: Any, max_depth: Any, number: Any, add: Any
-) -> tuple[Any, Any, Any]:
-    """Add the light of one light that fog on a stretch scatters into the path.
-
-    Returns
-    -------
-    Where the stretch begins, the distance at which light was scattered, and the density per metre with which
-    that was drawn.
-    """
+) -> Scattered:
+    """Add the light of one light that fog on a stretch scatters into the path."""
     dr = backend().dr
     fog = world.fog
     assert fog is not None  # noqa: S101 (only called in fog)
+    lost = dr.select(active, foggy.absorbed(fog.extinction * (end - begin)), 0.0)
+    # The last stretch but one may scatter, and the last may not: all its light has been asked for before.
+    turns = active & (state.depth + 2 < max_depth)
+    active = active & (state.depth + 1 < max_depth)
     row, chance = _light_for_stretch(world, state, begin, end, active, number)
     distance, density = _place_on_stretch(world, row, state, begin, end, number(use.FOG_PLACE), active)
     place = state.origin + state.direction * distance
     aim = connect.aim(world.lights, row, place, number(use.FOG_U), number(use.FOG_V), active)
     turn = 0.5 * dr.squared_norm(aim.direction - state.direction)
-    brought = (
-        state.weight * fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin))
-        * foggy.phase(fog, turn) * aim.radiance / (chance * density * aim.density)
-    )  # fmt: skip
+    weight = fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin)) / density
+    brought = state.weight * weight * foggy.phase(fog, turn) * aim.radiance / (chance * aim.density)
     seen = active & (brought > 0.0) & dr.isfinite(brought)
     share = arriving(world, row, place, aim, state.depth, max_depth, seen)
     add(brought * share, row, seen & (share > 0.0))
-    return begin, distance, density
+    return Scattered(lost, place, weight, turns)
 
 
 def _light_for_stretch(
