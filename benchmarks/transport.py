@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 import nir_render as nr
 from nir_render.camera.lens import intrinsics_of
+from nir_render.expected import expected
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import camera_pose
 from nir_render.transport import groups, world
@@ -37,6 +39,7 @@ Array = NDArray[np.float64]
 SAMPLES, DEPTH, RADIUS_M = 64, 6, 0.01
 ROOM, HALL = (8.0, 6.0, 3.0), (40.0, 40.0, 4.0)
 GREY = {"type": "diffuse", "reflectance": 0.3}
+BLACK = {"type": "diffuse", "reflectance": 0.0}
 MATERIALS: dict[str, dict[str, Any]] = {
     "white": {"type": "diffuse", "reflectance": 0.8},
     "grey": GREY,
@@ -51,8 +54,13 @@ def build(
     columns: int,
     extinction_per_m: float = 0.0,
     boxes: int = 3,
+    *,
+    black: bool = False,
 ) -> Scene:
-    """Return a room without ceiling: four walls, a floor, boxes, robots of one source each, one camera."""
+    """Return a room without ceiling: four walls, a floor, boxes, robots of one source each, one camera.
+
+    All surfaces are black if so wished: then only fog scatters.
+    """
     random = np.random.default_rng(0)
     length_m, width_m, height_m = extent_m
 
@@ -85,7 +93,7 @@ def build(
         "format": 1,
         "observe": ["eye.c"],
         "render": {"indirect": {"scale": 1, "samples": SAMPLES, "max_depth": DEPTH}},
-        "materials": MATERIALS,
+        "materials": {name: BLACK if black else material for name, material in MATERIALS.items()},
         "shapes": shapes,
         "robots": {
             "eye": {
@@ -112,6 +120,11 @@ def build(
         path = Path(folder) / "bench.yaml"
         path.write_text(yaml.safe_dump(document))
         return nr.load_scene(path)
+
+
+def fog_room(extinction_per_m: float, black: bool, columns: int) -> Scene:
+    """Return the room with four robots in fog; of black surfaces, nothing is seen but what fog scatters."""
+    return build(4, ROOM, columns, extinction_per_m, black=black)
 
 
 def _camera(columns: int) -> dict[str, Any]:
@@ -253,7 +266,7 @@ def scaling(repeats: int, seeds: int) -> dict[str, float]:
 
 
 def smooth(repeats: int) -> dict[str, float]:
-    """Return what it gains to render the indirect part in blocks of 4 × 4 pixels, at 1280 × 960, and its error.
+    """Return what blocks of 4 × 4 pixels for the indirect part gain, at 1280 × 960, and their error.
 
     Edges, pixels rendered one by one and straight light are part of both times.
     """
@@ -264,13 +277,15 @@ def smooth(repeats: int) -> dict[str, float]:
     )
     light = nr.render(coarse, "eye.c")
     exposure_s = coarse.camera("eye.c")[1].exposure_s
-    mean_e = float(nr.expected_electrons(light, coarse, exposure_s).mean())
-    error = upsampling_error(light, coarse, exposure_s, mean_e, pixels=4096, samples=512)
-    assert error is not None  # noqa: S101 (it was rendered in blocks)
+    mean = expected(light, coarse, exposure_s)
+    error = upsampling_error(mean, coarse, pixels=4096, samples=512)
+    assert not isinstance(error, str)  # noqa: S101 (it was rendered in blocks)
+    mean_e = float(mean.electrons.mean())
+    temporal_e2 = mean_e + coarse.camera("eye.c")[1].sensor.read_noise_e ** 2
     return {
         "smooth_gain": full_s / coarse_s,
-        "smooth_error_over_shot_variance": error.share,
-        "smooth_error_standard_error": error.standard_error,
+        "smooth_error_over_shot_variance": error.share * temporal_e2 / mean_e,
+        "smooth_error_standard_error": error.standard_error * temporal_e2 / mean_e,
         "smooth_mean_e": mean_e,
         "smooth_seconds": coarse_s,
     }
@@ -320,17 +335,15 @@ def main() -> None:
         hall = compare(lambda columns: build(128, HALL, columns, boxes=20), repeats, seeds)
         result |= {"many_gain_128": hall["gain"], "details_128": hall}
     if "fog" in wanted:
-        for name, extinction_per_m in (("0.05", 0.05), ("0.2", 0.2)):
-            fog = compare(
-                lambda columns, extinction_per_m=extinction_per_m: build(4, ROOM, columns, extinction_per_m),
-                repeats,
-                seeds,
-            )
-            result |= {
-                f"fog_gain_scattered_{name}": fog["gain"],
-                f"fog_gain_{name}": fog["gain_in_flares"],
-                f"details_fog_{name}": fog,
-            }
+        for extinction_per_m in (0.05, 0.2):
+            for black in (True, False):
+                fog = compare(partial(fog_room, extinction_per_m, black), repeats, seeds)
+                kind = "scattered" if black else "room"
+                result |= {
+                    f"fog_gain_{kind}_{extinction_per_m}": fog["gain"],
+                    f"fog_gain_{kind}_in_flares_{extinction_per_m}": fog["gain_in_flares"],
+                    f"details_fog_{kind}_{extinction_per_m}": fog,
+                }
     if "smooth" in wanted:
         result |= smooth(repeats)
     if "scaling" in wanted:

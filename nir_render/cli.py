@@ -5,6 +5,7 @@ Exit status: 0 done, 1 the work failed or a check did not hold, 2 the input was 
 
 import dataclasses
 import json
+import math
 import shlex
 import signal
 import sys
@@ -75,7 +76,6 @@ LightLimit = Annotated[
     float,
     typer.Option(
         "--light-cache-gib",
-        min=0.0,
         help="How large that folder may grow; the least recently used goes first.",
     ),
 ]
@@ -137,15 +137,16 @@ def render(
     light_cache: LightFolder = None,
     light_cache_gib: LightLimit = 4.0,
     only_estimate: Annotated[
-        bool, typer.Option("--estimate", help="Only say how long it will take, from small trials.")
+        bool,
+        typer.Option("--estimate", help="Only say how long it takes without a cache, from small trials."),
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Render the frames of a scene, with truth and calibration."""
-    if only_estimate:
-        _show_estimate(_load(scene, settings, seed), as_json)
-        return
     cache = _light_cache(light_cache, light_cache_gib)
+    if only_estimate:
+        _show_estimate(_load(scene, settings, seed), output, overwrite, threads, as_json)
+        return
     folder = _render(scene, output, settings, overwrite, seed, threads, keep_light, cache)
     frames = len((folder / "frames.jsonl").read_text(encoding="utf-8").splitlines())
     if as_json:
@@ -305,9 +306,17 @@ def _say_what_is_lowered(scene: "Scene") -> None:
         )
 
 
-def _show_estimate(scene: "Scene", as_json: bool) -> None:
+def _show_estimate(
+    scene: "Scene", output: Path | None, overwrite: bool, threads: int | None, as_json: bool
+) -> None:
     from nir_render.estimate import estimate
+    from nir_render.run_folder import check_free
+    from nir_render.transport.backend import set_threads
 
+    if output is not None:
+        check_free(output, overwrite)
+    if threads is not None:
+        set_threads(threads)
     guess = estimate(scene)
     if as_json:
         _print_json({**dataclasses.asdict(guess), "seconds": guess.seconds})
@@ -339,14 +348,24 @@ def _render(
     if threads is not None:
         set_threads(threads)
     with _progress("render") as progress:
-        render_run(scene, folder, overwrite=overwrite, progress=progress, keep_light=keep_light, cache=cache)
+        warnings = render_run(
+            scene, folder, overwrite=overwrite, progress=progress, keep_light=keep_light, cache=cache
+        )
+    for text in warnings:
+        _warn(text)
     return folder
 
 
 def _light_cache(folder: Path | None, limit_gib: float) -> "LightCache":
     from nir_render.transport.cache import LightCache
 
-    return LightCache(folder, limit_bytes=int(limit_gib * 2**30))
+    if not (math.isfinite(limit_gib) and limit_gib > 0.0):
+        raise InputError(f"--light-cache-gib {limit_gib:g}: wanted a size above 0, in GiB, such as 4")
+    return LightCache(folder, limit_bytes=int(limit_gib * 2**30), say=_warn)
+
+
+def _warn(text: str) -> None:
+    _errors.print(f"[bold yellow]warning:[/] {_escape(text)}", soft_wrap=True)
 
 
 def _setting(text: str) -> tuple[str, Any]:

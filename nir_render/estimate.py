@@ -31,7 +31,7 @@ def estimate(scene: Scene) -> Estimate:
 
     The time of a light is a fixed part and one that grows with the samples: two trials tell both. Where the
     noise has a target, a pilot tells the samples. Other cameras are taken to be like the first; writing files
-    is not counted.
+    is not counted, nor what a light cache would save.
     """
     from nir_render.transport.render import geometry_of, mean_samples
     from nir_render.transport.stock import samples_of

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.apertures import Aperture, flare_aperture
 from nir_render.camera.emission import Emitter, emission_units
-from nir_render.camera.enlarge import enlarge, enlarge_deviation
+from nir_render.camera.enlarge import enlarge
 from nir_render.camera.exposure import Beam, beam_window, blur, diffuse_electrons
 from nir_render.camera.psf import Window
 from nir_render.camera.response import response
@@ -19,8 +19,6 @@ from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
 from nir_render.scene.world import Lamp, Sun
 from nir_render.transport.light import Indirect, Light
-
-_TINY_E2 = 1e-12  # a noiseless sensor in the dark has no noise to compare with
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,18 +31,12 @@ class Expected:
         Mean photoelectrons per pixel, shape (rows, columns).
     windows
         The part of it that each row of the light's direct table brings.
-    render_noise_share
-        Variance of the Monte Carlo render over the sensor's own temporal variance, median over the frame.
-    aperture_noise_share
-        The same of the sum over a flare's aperture, the largest of all flares; 0 where none is seen.
     """
 
     light: Light
     exposure_s: float
     electrons: NDArray[np.float64]
     windows: tuple[Window, ...]
-    render_noise_share: float
-    aperture_noise_share: float = 0.0
 
 
 def expected_electrons(light: Light, scene: Scene, exposure_s: float | None = None) -> NDArray[np.float64]:
@@ -63,20 +55,12 @@ def expected(light: Light, scene: Scene, exposure_s: float) -> Expected:
     _, camera = scene.camera(light.camera)
     electrons = np.zeros((camera.sensor.rows, camera.sensor.columns))
     flux = fluxes(light, scene)
-    share = aperture_share = 0.0
     if light.indirect is not None:
         electrons += blur(camera, diffuse_image(light, light.indirect, scene, flux, exposure_s))
     windows = tuple(_windows(light, scene, camera, exposure_s))
     for window in windows:
         window.add_to(electrons)
-    electrons = np.maximum(electrons, 0.0)
-    if light.indirect is not None:
-        noise_e2 = _render_variance(light, light.indirect, scene, flux, exposure_s)
-        temporal_e2 = electrons + camera.sensor.read_noise_e**2 + _TINY_E2
-        share = float(np.median(noise_e2 / temporal_e2))
-        shares = aperture_shares(flare_apertures(light, camera), noise_e2, temporal_e2, light.indirect.scale)
-        aperture_share = float(shares.max(initial=0.0))
-    return Expected(light, exposure_s, electrons, windows, share, aperture_share)
+    return Expected(light, exposure_s, np.maximum(electrons, 0.0), windows)
 
 
 def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
@@ -87,26 +71,6 @@ def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
         for row in np.flatnonzero(table.irradiance_per_w[:, 0] > 0.0)
     )
     return [aperture for aperture in shown if aperture is not None]
-
-
-def aperture_shares(
-    apertures: list[Aperture], noise_e2: NDArray[np.float64], temporal_e2: NDArray[np.float64], scale: int
-) -> NDArray[np.float64]:
-    """Return the share of render noise in the sum over each aperture, shape (apertures,).
-
-    A sum over pixels has the sum of their temporal variances. The blur moves render noise to neighbours and
-    keeps its sum; and scale × scale pixels come from one of the film's, so their noise is the same: the sum
-    over many of these has scale² times the sum of the variances. Both arrays have shape (rows, columns).
-    """
-    return np.array([scale**2 * one.sum(noise_e2) / one.sum(temporal_e2) for one in apertures])
-
-
-def render_variance_e2(light: Light, scene: Scene, exposure_s: float) -> NDArray[np.float64]:
-    """Return the variance per pixel that rendering adds, the blur's averaging left out, (rows, columns)."""
-    _, camera = scene.camera(light.camera)
-    if light.indirect is None:
-        return np.zeros((camera.sensor.rows, camera.sensor.columns))
-    return _render_variance(light, light.indirect, scene, fluxes(light, scene), exposure_s)
 
 
 def group_electrons(mean: Expected, scene: Scene, group: int) -> NDArray[np.float64]:
@@ -151,27 +115,6 @@ def diffuse_image(
         whole = enlarge(radiance, rows, columns, how, patch)
         image += diffuse_electrons(camera, whole, emitter, exposure_s)
     return image
-
-
-def _render_variance(
-    light: Light, indirect: Indirect, scene: Scene, flux_w: NDArray[np.float64], exposure_s: float
-) -> NDArray[np.float64]:
-    """Return the variance per pixel that rendering adds, in e², the blur's averaging left out.
-
-    Groups are rendered apart, so their variances add up. Electrons are linear in the radiance; the standard
-    deviation of each spectrum's light goes the way of its radiance.
-    """
-    _, camera = scene.camera(light.camera)
-    rows, columns = camera.sensor.rows, camera.sensor.columns
-    total = np.zeros((rows, columns))
-    edges = indirect.edges
-    how = None if edges is None else edges.enlargement
-    parts = by_spectrum(light, scene, indirect.variance, flux_w**2)
-    patches = [] if edges is None else by_spectrum(light, scene, edges.variance, flux_w**2)
-    for (emitter, variance), patch in zip_longest(parts, (patch for _, patch in patches)):
-        deviation = enlarge_deviation(variance, rows, columns, how, patch)
-        total += diffuse_electrons(camera, deviation, emitter, exposure_s) ** 2
-    return total
 
 
 def by_spectrum(

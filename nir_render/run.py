@@ -15,12 +15,12 @@ from nir_render.errors import InputError
 from nir_render.evaluate.lamps import lamp_outlines_px
 from nir_render.evaluate.metrics import Evaluation, FrameKey, evaluate
 from nir_render.evaluate.truth import SourceTruth, parse_truth
+from nir_render.noise_facts import enlarging_facts, noise_facts, noise_warning, sample_facts
 from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene, load_scene
-from nir_render.simulate import Shot, simulate
+from nir_render.simulate import simulate
 from nir_render.transport.cache import LightCache
-from nir_render.transport.light import Indirect, Light
-from nir_render.transport.noise import MOST_SAMPLES
+from nir_render.transport.light import Light
 from perception import (
     ESTIMATORS,
     Calibration,
@@ -55,11 +55,11 @@ def render_run(
     progress: Progress,
     keep_light: bool = False,
     cache: LightCache | None = None,
-) -> None:
+) -> list[str]:
     """Render the frames of a scene with their truth and calibration into a new run folder.
 
     `keep_light` adds the light of each frame, as spectral EXR and direct table. `cache` keeps light from run
-    to run, which saves rendering it and changes nothing else.
+    to run, which saves rendering it and changes nothing else. Returns what the user should be warned of.
 
     Raises
     ------
@@ -74,9 +74,9 @@ def render_run(
     total = scene.document.clock.frames * len(cameras)
     calibrations = {name: scene.calibration(name) for name in cameras}
     with run_folder.new_run_folder(folder, overwrite) as aside:
-        records, truth, noise_shares, aperture_shares = [], [], [], []
+        records, truth, noises = [], [], []
         sampled: dict[str, dict[str, Any]] = {}
-        enlarged: dict[str, dict[str, float]] = {}
+        enlarged: dict[str, dict[str, Any]] = {}
         cache = LightCache() if cache is None else cache
         missed, reused = cache.missed, cache.reused
         kept: dict[str, tuple[str, Light]] = {}
@@ -85,11 +85,11 @@ def render_run(
             run_folder.write_file(aside / file, encode_png16(shot.frame.data_dn))
             records.append(frame_record(shot.frame, file))
             truth += [row.record() for row in shot.truth]
-            noise_shares.append(shot.render_noise_share)
-            aperture_shares.append(shot.aperture_noise_share)
-            if shot.frame.camera not in sampled and shot.light.indirect is not None:
-                sampled[shot.frame.camera] = _sample_facts(shot.light.indirect)
-                enlarged |= _enlarging_facts(scene, shot)
+            noises.append(shot.noise)
+            if shot.frame.camera not in enlarged:
+                enlarged[shot.frame.camera] = enlarging_facts(scene, shot)
+                if shot.light.indirect is not None:
+                    sampled[shot.frame.camera] = sample_facts(shot.light)
             if keep_light:
                 folder_of_light = aside / "light" / shot.frame.camera
                 kept[shot.frame.camera] = _write_light(
@@ -101,6 +101,8 @@ def render_run(
         run_folder.write_json(aside / "calibration.json", calibration_document(calibrations.values()))
         run_folder.write_file(aside / "scene.yaml", scene.resolved_yaml().encode())
         seconds = time.perf_counter() - started
+        noise = noise_facts(scene.document.render.noise, noises)
+        warning = noise_warning(noise, len(noises))
         facts = {
             "scene": scene.document.name,
             "seed": scene.document.seed,
@@ -109,19 +111,15 @@ def render_run(
             "variant_reason": backend().reason,
             "seconds": {"render": round(seconds, 3)},
             "indirect": _indirect_facts(scene)
-            | {"samples_by_camera": sampled, "upsampling_error_share_of_shot_variance": enlarged},
-            # Variance of the Monte Carlo part over shot and read noise: the median over each frame, and the
-            # largest of the sums over flares' apertures; the direct part is closed form and carries none.
-            "render_noise": {
-                "target_share": scene.document.render.noise,
-                "share_of_temporal_variance": round(float(np.median(noise_shares)), 6),
-                "largest_share": round(max(noise_shares), 6),
-                "share_in_apertures": round(float(np.median(aperture_shares)), 6),
-                "largest_share_in_apertures": round(max(aperture_shares), 6),
-            },
+            | {"samples_by_camera": sampled, "upsampling_error_share_of_temporal_variance": enlarged},
+            # Variance of the Monte Carlo part over shot and read noise: the median over the pixels of each
+            # frame that it reaches, and the largest of the sums over flares' apertures; the direct part is
+            # closed form and carries none.
+            "render_noise": noise,
             "lights": {"rendered": cache.missed - missed, "reused": cache.reused - reused},
         }
         run_folder.write_manifest(aside, facts)
+    return [] if warning is None else [warning]
 
 
 def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tuple[str, Light]:
@@ -140,20 +138,6 @@ def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tu
     return file, light
 
 
-def _enlarging_facts(scene: Scene, shot: Shot) -> dict[str, dict[str, float]]:
-    """Return how far a frame's enlarged light is off the full render, by camera; none at full resolution."""
-    from nir_render.upsampling import upsampling_error
-
-    frame = shot.frame
-    sensor = scene.camera(frame.camera)[1].sensor
-    mean_e = float(frame.data_dn.mean() - frame.black_level_dn) / sensor.system_gain_dn_per_e
-    error = upsampling_error(shot.light, scene, frame.exposure_s, mean_e)
-    if error is None:
-        return {}
-    facts = {"mean": round(error.share, 6), "standard_error": round(error.standard_error, 6)}
-    return {frame.camera: facts | {"pixels": error.pixels}}
-
-
 def _indirect_facts(scene: Scene) -> dict[str, Any]:
     """Return how the indirect light of a run was asked for; `samples` is null where a target ruled."""
     from nir_render.transport import stock
@@ -166,19 +150,6 @@ def _indirect_facts(scene: Scene) -> dict[str, Any]:
     note = "" if used == asked else f"{wanted} asked for; no usable LLVM"
     rendered = scene.document.has_indirect_light()
     return {"rendered": rendered, "scale": settings.indirect.scale, "samples": used, "note": note}
-
-
-def _sample_facts(indirect: Indirect) -> dict[str, Any]:
-    """Return the samples per pixel of a light; some of the `pixels_at_cap` may have needed more."""
-    counts = np.array([indirect.samples]) if indirect.counts is None else indirect.counts
-    at_cap = 0 if indirect.counts is None else int((counts == MOST_SAMPLES).sum())
-    return {
-        "least": int(counts.min()),
-        "median": float(np.median(counts)),
-        "mean": round(float(counts.mean()), 3),
-        "most": int(counts.max()),
-        "pixels_at_cap": at_cap,
-    }
 
 
 def chosen_estimators(names: Sequence[str]) -> dict[str, Estimator]:

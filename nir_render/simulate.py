@@ -14,6 +14,7 @@ from nir_render.errors import InputError
 from nir_render.evaluate.truth import SourceTruth, truth_of
 from nir_render.expected import Expected, expected
 from nir_render.randomness import generator
+from nir_render.render_noise import RenderNoise, render_noise
 from nir_render.scene.devices import AutoExposure, Camera
 from nir_render.scene.load import Scene
 from nir_render.transport.cache import LightCache
@@ -25,16 +26,13 @@ _SETTLING_FRAMES = 8  # steps of at most 4: enough for a factor of 65 000
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame, the light it is made of, the truth about its sources, and the render's share of its noise.
-
-    The two shares are those of `Expected`.
-    """
+    """A frame, its light, the truth about its sources, its mean without noise, the render's noise in it."""
 
     frame: RawFrame
     light: Light
     truth: tuple[SourceTruth, ...]
-    render_noise_share: float
-    aperture_noise_share: float
+    mean: Expected
+    noise: RenderNoise
 
 
 def render(
@@ -93,7 +91,7 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
             mean = expected(light, scene, exposure_s)
             frame = _frame(mean, scene, run_seed, index)
             truth = tuple(truth_of(scene, mean, frame))
-            yield Shot(frame, light, truth, mean.render_noise_share, mean.aperture_noise_share)
+            yield Shot(frame, light, truth, mean, render_noise(mean, scene))
             if control is not None:
                 exposures_s[name] = next_exposure_s(control, camera.sensor, frame.data_dn, exposure_s)
 

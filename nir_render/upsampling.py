@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from nir_render.camera.enlarge import Enlargement, weights_of
 from nir_render.camera.exposure import diffuse_electrons
-from nir_render.expected import by_spectrum, fluxes
+from nir_render.expected import Expected, by_spectrum, fluxes
 from nir_render.randomness import generator
+from nir_render.render_noise import temporal_variance_e2
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import camera_pose
 from nir_render.transport.light import Light
@@ -18,8 +20,8 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _PIXELS_PER_BLOCK = 0.003
-_LEAST_PIXELS, _MOST_PIXELS = 128, 512
-_SAMPLES_FACTOR, _MOST_SAMPLES = 8, 1024
+_LEAST_PIXELS, _MOST_PIXELS = 256, 1024
+_SAMPLES_FACTOR, _LEAST_SAMPLES, _MOST_SAMPLES = 8, 256, 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,80 +32,127 @@ class UpsamplingError:
     ----------
     share
         Mean square of the error that enlarging brings into a pixel, before the lens blurs it (which only
-        lowers it), over the mean shot variance of the frame. Without bias by render noise: so a share near
-        nothing can come out slightly negative.
+        lowers it), over the mean temporal variance, shot plus read noise, of the frame. Without bias by
+        render noise: so a share near nothing can come out slightly negative.
     standard_error
         Of the share.
+    largest
+        The largest square of an error in one of these pixels, over the temporal variance of that pixel; the
+        noise of measuring it is in it.
     pixels
         In how many pixels it was measured.
     """
 
     share: float
     standard_error: float
+    largest: float
     pixels: int
 
 
 def upsampling_error(
-    light: Light,
-    scene: Scene,
-    exposure_s: float,
-    mean_e: float,
-    pixels: int | None = None,
-    samples: int | None = None,
-) -> UpsamplingError | None:
-    """Render some pixels of a light, and the blocks that these are made of, and compare.
+    mean: Expected, scene: Scene, pixels: int | None = None, samples: int | None = None
+) -> UpsamplingError | str:
+    """Render some pixels of a frame's light, and the blocks that these are made of, and compare.
 
-    Half of the pixels are drawn from those beside edges, half from the others, each half spread evenly over
-    the frame. Pixels that the light holds one by one are right. All is rendered twice, and the square of an
-    error is the product of two differences that are independent of each other: noise has the expectation 0.
+    Pixels are drawn by how much error is to be expected of them: a third evenly over the frame, the others
+    where the electrons of the blocks that a pixel is made of differ, and where they change other than
+    linearly (Hansen and Hurwitz: each square counts by one over its pixel's probability). Pixels that the
+    light holds one by one are right. All is rendered twice, and the square of an error is the product of two
+    differences that are independent of each other: noise has the expectation 0.
 
     Parameters
     ----------
-    mean_e
-        Mean electrons of the frame, which is its mean shot variance.
     pixels
-        How many; without, 0.3 % of the blocks, at least 128 and at most 512.
+        How many; without, 0.3 % of the blocks, at least 256 and at most 1024.
     samples
-        In each, a power of two; without, 8 times those of the light, at most 1024.
+        In each, a power of two; without, 8 times those of the light, 256 at least and 1024 at most.
 
     Returns
     -------
-    None where nothing was enlarged, the edges are not known, or the frame is dark.
+    The reason where there is nothing to measure.
     """
+    light = mean.light
     indirect = light.indirect
-    if indirect is None or indirect.edges is None or mean_e <= 0.0:
-        return None
+    _, camera = scene.camera(light.camera)
+    sensor_e2 = temporal_variance_e2(mean, camera).ravel()
+    if indirect is None:
+        return "no indirect light"
+    if indirect.scale == 1:
+        return "rendered at full resolution"
+    if indirect.edges is None:
+        return "edges are not known without LLVM"
+    if camera.sensor.read_noise_e == 0.0 and not mean.electrons.any():
+        return "a dark frame of a sensor without noise"
     blocks = indirect.radiance_per_w[0, 0].size
     if pixels is None:
         pixels = int(np.clip(_PIXELS_PER_BLOCK * blocks, _LEAST_PIXELS, _MOST_PIXELS))
     if samples is None:
-        samples = min(2 ** int(np.ceil(np.log2(_SAMPLES_FACTOR * indirect.samples))), _MOST_SAMPLES)
+        samples = 2 ** int(np.ceil(np.log2(_SAMPLES_FACTOR * indirect.samples)))
+        samples = int(np.clip(samples, _LEAST_SAMPLES, _MOST_SAMPLES))
     how = indirect.edges.enlargement
-    strata = _strata(how, blocks * indirect.scale**2)
-    random = generator(light.seed, "upsampling", light.camera, 0)
-    chosen = [_spread(stratum, pixels // len(strata), random) for stratum in strata]
-    square_e2 = _squares(light, indirect.scale, how, scene, exposure_s, np.concatenate(chosen), samples)
-    total = variance = 0.0
-    for stratum, part in zip(
-        strata, np.split(square_e2, np.cumsum(list(map(len, chosen)))[:-1]), strict=True
-    ):
-        share = len(stratum) / (blocks * indirect.scale**2)
-        total += share * float(part.mean())
-        variance += share**2 * float(part.var()) / len(part)
-    return UpsamplingError(total / mean_e, variance**0.5 / mean_e, len(square_e2))
+    chance = _chances(mean, scene, how)
+    drawn = _drawn(chance, pixels, generator(light.seed, "upsampling", light.camera, 0))
+    chosen, times = np.unique(drawn, return_counts=True)
+    square_e2 = _squares(light, indirect.scale, how, scene, mean.exposure_s, chosen, samples)
+    each = np.repeat(square_e2 / (chance[chosen] * len(chance)), times) / float(sensor_e2.mean())
+    return UpsamplingError(
+        share=float(each.mean()),
+        # One from each part: neighbours differ by more than the scatter within a part (Wolter 2007, 8.2).
+        standard_error=float(np.mean(np.diff(each) ** 2) / (2.0 * len(each))) ** 0.5,
+        largest=float((square_e2 / sensor_e2[chosen]).max()),
+        pixels=len(chosen),
+    )
 
 
-def _strata(how: Enlargement, count: int) -> list[Numbers]:
-    """Return the numbers of pixels beside edges, and of the others; patches belong to neither."""
-    others = np.ones(count, dtype=bool)
-    others[how.pixels] = others[how.patch] = False
-    return [part for part in (how.pixels.astype(np.int64), np.flatnonzero(others)) if len(part)]
+def _chances(mean: Expected, scene: Scene, how: Enlargement) -> Array:
+    """Return the probability with which each pixel is drawn, those of the patch never, shape (n,)."""
+    light = mean.light
+    assert light.indirect is not None  # noqa: S101
+    _, camera = scene.camera(light.camera)
+    blocks_e = np.zeros(light.indirect.radiance_per_w.shape[2:])
+    even = np.ones((how.rows, how.columns))
+    for emitter, radiance in by_spectrum(light, scene, light.indirect.radiance_per_w, fluxes(light, scene)):
+        per_radiance = diffuse_electrons(camera, even, emitter, mean.exposure_s)
+        size = blocks_e.shape[::-1]
+        blocks_e += radiance * cv2.resize(per_radiance, size, interpolation=cv2.INTER_AREA)
+    # By size and by its square: that errors go with these is a guess.
+    change, bend = _change(blocks_e, how), _bend(blocks_e, how)
+    chance = np.zeros(even.size)
+    for part, weight in ((even.ravel(), 2.0), (change, 1.0), (change**2, 1.0), (bend, 1.0), (bend**2, 1.0)):
+        part[how.patch] = 0.0
+        if part.sum() > 0.0:
+            chance += weight * part / part.sum()
+    return np.asarray(chance / max(float(chance.sum()), 1e-300))
 
 
-def _spread(stratum: Numbers, count: int, random: np.random.Generator) -> Numbers:
-    """Return so many of a list, one from each of as many equal parts."""
-    count = max(min(count, len(stratum)), 1)
-    return stratum[((np.arange(count) + random.random(count)) * (len(stratum) / count)).astype(np.int64)]
+def _change(image: Array, how: Enlargement) -> Array:
+    """Return by how much the blocks differ that each pixel is made of, of its own surface alone, (n,)."""
+    size = (how.columns, how.rows)
+    mean, square = (cv2.resize(one, size, interpolation=cv2.INTER_LINEAR) for one in (image, image**2))
+    variance = (square - mean**2).ravel()
+    weights = how.matrix(image.size)
+    middle, share = weights @ image.ravel(), abs(weights)
+    variance[how.pixels] = share @ image.ravel() ** 2 - 2.0 * middle * (share @ image.ravel())
+    variance[how.pixels] += middle**2 * share.sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _bend(image: Array, how: Enlargement) -> Array:
+    """Return the largest second difference, along an axis, of each pixel's block and its neighbours, (n,)."""
+    padded = np.pad(image, 1, mode="edge")
+    middle = 2.0 * image
+    down = np.abs(padded[:-2, 1:-1] + padded[2:, 1:-1] - middle)
+    across = np.abs(padded[1:-1, :-2] + padded[1:-1, 2:] - middle)
+    bend = cv2.dilate(np.maximum(down, across), np.ones((3, 3)))
+    size = (how.columns, how.rows)
+    return np.asarray(cv2.resize(bend, size, interpolation=cv2.INTER_NEAREST), dtype=np.float64).ravel()
+
+
+def _drawn(chance: Array, count: int, random: np.random.Generator) -> Numbers:
+    """Return pixels by their probability, one from each of as many parts of equal probability."""
+    places = (np.arange(count) + random.random(count)) / count
+    total = np.cumsum(chance)
+    return np.asarray(np.searchsorted(total, places * total[-1], side="right"), dtype=np.int64)
 
 
 def _squares(

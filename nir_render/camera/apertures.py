@@ -1,11 +1,14 @@
 """Where a flare lies in the image: the pixels over which its flux is measured."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
 
+from nir_render.camera.enlarge import Enlargement, weights_of
 from nir_render.camera.lens import intrinsics_of
 from nir_render.scene.devices import Camera
 
@@ -61,3 +64,36 @@ def flare_aperture(
     down, across = np.arange(rows.start, rows.stop) - v_px, np.arange(columns.start, columns.stop) - u_px
     inside = down[:, None] ** 2 + across**2 <= radius_px**2
     return Aperture(rows, columns, inside) if inside.any() else None
+
+
+def aperture_weights(
+    apertures: Sequence[Aperture], per_pixel: NDArray[np.float64], scale: int, how: Enlargement
+) -> tuple[csr_array, csr_array]:
+    """Return what blocks, and the pixels of the patch, count in sums over apertures.
+
+    The sum a'x of a weighted image over pixels x = W b, where b are blocks and W enlarges them, is (a'W) b:
+    so its variance is (a'W)² times those of the blocks, which are independent of each other.
+
+    Parameters
+    ----------
+    per_pixel
+        The weights a of all pixels, shape (rows, columns).
+    scale
+        Sensor pixels per block, along each axis.
+
+    Returns
+    -------
+    Shape (apertures, blocks) and (apertures, patch).
+    """
+    places = [row * how.columns + column for row, column in (one.pixels() for one in apertures)]
+    pixel = np.concatenate([np.empty(0, dtype=np.int64), *places])
+    number = np.repeat(np.arange(len(places)), [len(place) for place in places])
+    weight = per_pixel.ravel()[pixel]
+    at = np.minimum(np.searchsorted(how.patch, pixel), max(len(how.patch) - 1, 0))
+    alone = how.patch[at] == pixel if len(how.patch) else np.zeros(len(pixel), dtype=bool)
+    shape = (len(places), int((~alone).sum()))
+    taken = coo_array((weight[~alone], (number[~alone], np.arange(shape[1]))), shape=shape)
+    of_blocks = csr_array(taken.tocsr() @ weights_of(pixel[~alone], scale, how))
+    shape = (len(places), len(how.patch))
+    of_patch = coo_array((weight[alone], (number[alone], at[alone])), shape=shape).tocsr()
+    return of_blocks, of_patch

@@ -6,7 +6,7 @@ surface alone: blocks that an edge cuts hold averages over several surfaces and 
 edge cuts has its share of each surface. All of it is linear in the light, with weights of geometry alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ _KERNEL_BLOCKS = 1.4  # σ of the Gaussian weights of that fit
 _RIDGE = 0.03  # σ² in squared blocks that stands against a slope: what few blocks say of it counts less
 _MOST_NOISE = 2.0  # variance that a fitted pixel may have, in variances of a block
 _FAR_OFF = 0.15  # how much nearer or farther a pixel may be than the blocks that tell of it
+_GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 _PATCH_SHARE = 0.05  # of all pixels, at most, are rendered one by one
 
 
@@ -65,6 +66,8 @@ class Enlargement:
     patch
         Numbers of the pixels that no block tells of well enough, or that the edge of a lamp cuts, shape (p,):
         they are rendered one by one.
+    left_out
+        How many more of these there are than may be rendered one by one: they are interpolated.
     """
 
     rows: int
@@ -74,6 +77,7 @@ class Enlargement:
     block: NDArray[np.int32]
     weight: NDArray[np.float32]
     patch: NDArray[np.int32]
+    left_out: int = 0
 
     def matrix(self, blocks: int) -> csr_array:
         """Return the weights as a sparse matrix, shape (n, blocks)."""
@@ -106,37 +110,58 @@ def enlarge(
     return image
 
 
-def enlarge_deviation(
+def enlarge_variance(
     variance: Array, rows: int, columns: int, how: Enlargement | None = None, patch: Array | None = None
 ) -> Array:
-    """Return the standard deviation of each pixel of an enlarged image of independent blocks.
-
-    Between blocks that of the blocks themselves is interpolated: an upper bound, as interpolating averages.
+    """Return the variance of each pixel of an enlarged image of independent blocks.
 
     Parameters
     ----------
     variance, patch
         Of the blocks and of the patch's pixels.
     """
-    deviation = enlarge(np.sqrt(variance), rows, columns)
-    if how is not None and variance.shape != (rows, columns):
+    if variance.shape == (rows, columns):
+        return variance
+    sides = zip((rows, columns), variance.shape, strict=True)
+    down, across = (_linear(np.arange(count), count, blocks) for count, blocks in sides)
+    taller = down.multiply(down) @ variance
+    image: Array = np.ascontiguousarray((across.multiply(across) @ taller.T).T)
+    if how is not None:
         weights = how.matrix(variance.size)
-        deviation.ravel()[how.pixels] = np.sqrt(weights.multiply(weights) @ variance.ravel())
+        image.ravel()[how.pixels] = weights.multiply(weights) @ variance.ravel()
         if patch is not None:
-            deviation.ravel()[how.patch] = np.sqrt(patch)
-    return deviation
+            image.ravel()[how.patch] = patch
+    return image
+
+
+def without_edges(rows: int, columns: int) -> Enlargement:
+    """Return the enlargement that is linear between the centres of blocks everywhere."""
+    none, whole = np.empty(0, dtype=np.int32), np.zeros(1, dtype=np.int32)
+    return Enlargement(rows, columns, none, whole, none, np.empty(0, dtype=np.float32), none)
+
+
+def part_of(how: Enlargement, pixels: NDArray[np.int64]) -> Enlargement:
+    """Return what an enlargement says of some pixels; all others are as if no edge were near."""
+    kept = np.isin(how.pixels, pixels)
+    count = np.diff(how.first)
+    entries = np.repeat(kept, count)
+    return replace(
+        how,
+        pixels=how.pixels[kept],
+        first=np.append(0, np.cumsum(count[kept])).astype(np.int32),
+        block=how.block[entries],
+        weight=how.weight[entries],
+        patch=how.patch[np.isin(how.patch, pixels)],
+    )
 
 
 def weights_of(pixels: NDArray[np.int64], scale: int, how: Enlargement) -> csr_array:
     """Return what each block weighs in some pixels that no patch holds, shape (pixels, blocks)."""
     blocks = (how.rows // scale, how.columns // scale)
-    sides = []
-    for at, count in zip(np.divmod(pixels, how.columns), blocks, strict=True):
-        place = np.clip((at + 0.5) / scale - 0.5, 0.0, count - 1.0)
-        low = np.minimum(place.astype(np.int64), max(count - 2, 0))
-        sides.append(((low, 1.0 - (place - low)), (np.minimum(low + 1, count - 1), place - low)))
-    block = np.stack([row * blocks[1] + column for row, _ in sides[0] for column, _ in sides[1]], axis=1)
-    weight = np.stack([down * across for _, down in sides[0] for _, across in sides[1]], axis=1)
+    row, column = np.divmod(pixels, how.columns)
+    down, across = _linear(row, how.rows, blocks[0]), _linear(column, how.columns, blocks[1])
+    block = down.indices.reshape(-1, 2, 1) * blocks[1] + across.indices.reshape(-1, 1, 2)
+    weight = down.data.reshape(-1, 2, 1) * across.data.reshape(-1, 1, 2)
     first = 4 * np.arange(len(pixels) + 1)
     found = csr_array((weight.ravel(), block.ravel(), first), shape=(len(pixels), blocks[0] * blocks[1]))
     if not len(how.pixels):
@@ -145,6 +170,15 @@ def weights_of(pixels: NDArray[np.int64], scale: int, how: Enlargement) -> csr_a
     fitted = how.pixels[place] == pixels
     take = csr_array((fitted * 1.0, place, np.arange(len(pixels) + 1)), shape=(len(pixels), len(how.pixels)))
     return csr_array(diags_array((~fitted) * 1.0) @ found + take @ how.matrix(found.shape[1]))
+
+
+def _linear(at: NDArray[np.int64], count: int, blocks: int) -> csr_array:
+    """Return what blocks along an axis of so many pixels weigh in some of these, two each, (n, blocks)."""
+    place = np.clip((at + 0.5) * (blocks / count) - 0.5, 0.0, blocks - 1.0)
+    low = np.minimum(place.astype(np.int64), max(blocks - 2, 0))
+    block = np.stack([low, np.minimum(low + 1, blocks - 1)], axis=1)
+    weight = np.stack([1.0 - (place - low), place - low], axis=1)
+    return csr_array((weight.ravel(), block.ravel(), 2 * np.arange(len(at) + 1)), shape=(len(at), blocks))
 
 
 def enlargement(labels: Labels, scale: int) -> Enlargement:
@@ -157,7 +191,7 @@ def enlargement(labels: Labels, scale: int) -> Enlargement:
     found &= (weight**2).sum(axis=1) < _MOST_NOISE
     found &= ~_foreshortened(labels, scale, block, weight)
     cut, lone = _chosen(pixel, labels.shining[label], ~found, rows * columns)
-    patch = np.concatenate([cut, lone])[: int(_PATCH_SHARE * rows * columns)]
+    patch = np.concatenate(_rendered(cut, lone, int(_PATCH_SHARE * rows * columns)))
     kept = ~np.isin(pixel, np.concatenate([patch, lone]))
     part, place = np.nonzero((weight != 0.0) & kept[:, None])
     pixels, first = np.unique(pixel[part], return_index=True)
@@ -169,7 +203,25 @@ def enlargement(labels: Labels, scale: int) -> Enlargement:
         block=block[part, place].astype(np.int32),
         weight=(weight[part, place] * share[part]).astype(np.float32),
         patch=np.sort(patch).astype(np.int32),
+        left_out=len(cut) + len(lone) - len(patch),
     )
+
+
+def _rendered(
+    cut: NDArray[np.int64], lone: NDArray[np.int64], most: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which of the pixels that lamps' edges cut, first, and of the others are rendered one by one.
+
+    Where not all can be they are taken evenly from the list, and so from all parts of the frame.
+    """
+    cut = _evenly(cut, most)
+    return cut, _evenly(lone, most - len(cut))
+
+
+def _evenly(pixels: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return at most so many of a list; multiples of the golden section are even and fit no pattern."""
+    order = np.argsort(np.arange(len(pixels)) * _GOLDEN % 1.0, kind="stable")
+    return pixels[np.sort(order[:most])]
 
 
 def _pure(labels: Labels, scale: int) -> NDArray[np.int32]:

@@ -3,7 +3,11 @@
 The layout is that of A. Fichet, R. Pacanowski, A. Wilkie, "An OpenEXR Layout for Spectral Images", JCGT
 10(3), 2021; a channel is called S0.940,000000nm. One part per light group, and one more, `GROUP.variance`,
 with the variance of each mean. Values are per watt of the group (`perWattOf`): times its flux they have the
-declared unit. The direct part has no pixels; it goes beside the image as a table.
+declared unit. Where the samples differ from pixel to pixel, a part `samples` counts them. The direct part has
+no pixels; it goes beside the image as a table.
+
+The pixels are those that were rendered: `scale` × `scale` of the camera's. What keeps edges sharp when a
+frame is made of them (`Indirect.edges`) is left out, as the attribute `edges` says; a light cache keeps it.
 """
 
 from pathlib import Path
@@ -13,6 +17,8 @@ import numpy as np
 import OpenEXR
 
 from nir_render.transport.light import Light
+
+_LEFT_OUT = "left out: frames made of this file are blurred where surfaces meet"
 
 
 def write_light(path: Path, light: Light) -> None:
@@ -26,6 +32,11 @@ def write_light(path: Path, light: Light) -> None:
         f"S0.{wavelength_m * 1e9:.6f}nm".replace(".", ",").replace("S0,", "S0.")
         for wavelength_m in light.wavelengths_m
     ]
+    common: dict[str, Any] = {
+        "scale": light.indirect.scale,
+        "samples": light.indirect.samples,
+        "edges": "none" if light.indirect.edges is None else _LEFT_OUT,
+    }
     parts = []
     for group, name in enumerate(light.groups):
         for part, arrays in (
@@ -38,12 +49,16 @@ def write_light(path: Path, light: Light) -> None:
                 "spectralLayoutVersion": "1.0",
                 "emissiveUnits": "W.m^-2.sr^-1",
                 "perWattOf": name,
-                "scale": light.indirect.scale,
+                **common,
             }
             layers = {
                 channel: np.ascontiguousarray(arrays[group, node]) for node, channel in enumerate(channels)
             }
             parts.append(OpenEXR.Part(header, layers, part))
+    if light.indirect.counts is not None:
+        counts = {"samples": np.ascontiguousarray(light.indirect.counts, dtype=np.uint32)}
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **common}
+        parts.append(OpenEXR.Part(header, counts, "samples"))
     OpenEXR.File(parts).write(str(path))
 
 

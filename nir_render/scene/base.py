@@ -4,10 +4,10 @@ import difflib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationInfo, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo, model_validator
 
 _UNIT_SUFFIXES = (
     "_dn_per_e",
@@ -41,7 +41,14 @@ def document_key(field: str) -> str:
 
 
 class Document(BaseModel):
-    """A part of a scene file. Unknown keys are refused with the nearest known one."""
+    """A part of a scene file. Unknown keys are refused with the nearest known one.
+
+    `example` shows how one is written; `read_keys` are keys of the document that become others
+    when it is read.
+    """
+
+    example: ClassVar[str] = ""
+    read_keys: ClassVar[tuple[str, ...]] = ()
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, alias_generator=document_key, allow_inf_nan=False, strict=False
@@ -50,12 +57,23 @@ class Document(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_keys(cls, data: Any) -> Any:
+        if not isinstance(data, Document):
+            cls.check_keys(data)
+        return data
+
+    @classmethod
+    def check_keys(cls, data: Any) -> None:
+        """Raise ValueError where data are no mapping, or have a key that is unknown here or a truth value."""
+        known = [*(document_key(name) for name in cls.model_fields), *cls.read_keys]
         if not isinstance(data, Mapping):
-            return data
-        known = [document_key(name) for name in cls.model_fields]
+            like = f"such as {cls.example}" if cls.example else f"known keys: {', '.join(sorted(known))}"
+            raise ValueError(f"{data!r} stands where keys with values are wanted, {like}")
         for key, value in data.items():
             if isinstance(value, bool):  # Python counts true as 1
-                raise ValueError(f"{key!r} is {str(value).lower()}; nothing here is true or false")
+                raise ValueError(
+                    f"{key!r} is {str(value).lower()}; nothing here is true or false; to do without it, "
+                    "leave the key out or write null"
+                )
             if key in known:
                 continue
             if str(key).lower() in _COLOUR_KEYS:
@@ -63,7 +81,28 @@ class Document(BaseModel):
             near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
             hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(sorted(known))}"
             raise ValueError(f"unknown key {key!r}; {hint}")
+
+
+def typed(example: str, *models: type[Document]) -> BeforeValidator:
+    """Return what refuses data for one of some models where their key `type` tells none of them."""
+    kinds = [str(get_args(model.model_fields["type"].annotation)[0]) for model in models]
+    known = f"known: {', '.join(kinds)}; write it such as {example}"
+
+    def check(data: Any) -> Any:
+        if isinstance(data, Document):
+            return data
+        if not isinstance(data, Mapping):
+            raise ValueError(f"{data!r} stands where keys with values are wanted, 'type' among them; {known}")
+        if data.get("type") is None:
+            raise ValueError(f"the key 'type' is missing; {known}")
+        if data["type"] not in kinds:
+            near = difflib.get_close_matches(str(data["type"]), kinds, n=1, cutoff=0.5)
+            raise ValueError(
+                f"there is no type {data['type']!r}; " + (f"did you mean {near[0]!r}?" if near else known)
+            )
         return data
+
+    return BeforeValidator(check)
 
 
 class PresetDocument(Document):

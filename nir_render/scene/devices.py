@@ -34,6 +34,8 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 class Orientation(Document):
     """A rotation by yaw about z (to the left), then pitch about the new y (nose down), then roll about x."""
 
+    example: ClassVar[str] = "{yaw: 90 deg}"
+
     yaw_rad: Angle = 0.0
     pitch_rad: Angle = 0.0
     roll_rad: Angle = 0.0
@@ -51,6 +53,8 @@ class CurveDocument(Document):
 
     The CSV file has the header `wavelength_nm,value`; it becomes points when the scene is loaded.
     """
+
+    read_keys: ClassVar[tuple[str, ...]] = ("file",)
 
     constant: Annotated[Fraction, NotNegative] | None = None
     gaussian: Gaussian | None = None

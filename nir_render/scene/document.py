@@ -1,8 +1,9 @@
 """The model of a whole scene file."""
 
 import itertools
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
@@ -60,6 +61,8 @@ class IndirectSettings(Document):
     Without `samples` the render settings' `noise` says how many each pixel gets.
     """
 
+    example: ClassVar[str] = "{samples: 64}"
+
     scale: Annotated[int, Field(ge=1, le=16)] = 2
     samples: Annotated[int, Field(ge=4, le=65536)] | None = None
     max_depth: Annotated[int, Field(ge=2, le=64)] = 8
@@ -68,8 +71,10 @@ class IndirectSettings(Document):
     @classmethod
     def _power_of_two(cls, samples: int | None) -> int | None:
         if samples is not None and samples & (samples - 1):
+            lower = 1 << (samples.bit_length() - 1)
             raise ValueError(
-                f"{samples} is no power of two: only these render to the same bits on any machine"
+                f"{samples} is no power of two: only these render to the same bits on any machine; "
+                f"take {lower} or {2 * lower}"
             )
         return samples
 
@@ -81,9 +86,21 @@ class RenderSettings(Document):
     `indirect.samples` fixes a count, then None.
     """
 
+    example: ClassVar[str] = '{noise: "5 % of temporal variance"}'
+
     noise: NoiseTarget | None = None
     indirect: IndirectSettings = IndirectSettings()
     visibility_rays: Annotated[int, Field(ge=16, le=65536)] = 1024
+
+    @model_validator(mode="before")
+    @classmethod
+    def _noise_is_no_switch(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and isinstance(data.get("noise"), bool):  # YAML's off and on
+            raise ValueError(
+                "'noise' is a target, no switch: write it such as '5 % of temporal variance', or leave it "
+                "out and fix the samples in its place, such as indirect: {samples: 64}"
+            )
+        return data
 
     @model_validator(mode="after")
     def _target_or_count(self) -> Self:

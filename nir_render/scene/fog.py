@@ -1,18 +1,18 @@
 """Models of fog: how much it takes from light on its way, how it scatters, and where it lies."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_serializer, field_validator, model_validator
 
-from nir_render.scene.base import Document, resolve_file
+from nir_render.scene.base import Document, resolve_file, typed
 from nir_render.scene.points import Points, one_form, parse_half_turn, read_csv, write_points
 from nir_render.scene.units import (
     ANGLE,
     EXTINCTION,
-    LENGTH,
+    VISIBILITY,
     Extinction,
     Fraction,
     Length,
@@ -43,6 +43,8 @@ class TabulatedPhase(Document):
     go from exactly 0 to exactly 180 deg, in steps of any size.
     """
 
+    read_keys: ClassVar[tuple[str, ...]] = ("file",)
+
     type: Literal["table"]
     points: Points
 
@@ -51,6 +53,7 @@ class TabulatedPhase(Document):
     def _read(cls, data: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, Mapping):
             return data
+        cls.check_keys(data)
         one_form(data, ("points", "file"))
         if data.get("file") is None:
             return data
@@ -68,7 +71,11 @@ class TabulatedPhase(Document):
         return write_points(points, ANGLE)
 
 
-PhaseDocument = Annotated[HenyeyGreenstein | TabulatedPhase, Field(discriminator="type")]
+PhaseDocument = Annotated[
+    HenyeyGreenstein | TabulatedPhase,
+    Field(discriminator="type"),
+    typed("{type: henyey_greenstein, g: 0.85}", HenyeyGreenstein, TabulatedPhase),
+]
 
 
 class Fog(Document):
@@ -78,6 +85,9 @@ class Fog(Document):
     the scene is loaded; 0 /m is clear air. `albedo` is the share of what is lost that is scattered, and not
     absorbed.
     """
+
+    example: ClassVar[str] = "{visibility: 50 m}"
+    read_keys: ClassVar[tuple[str, ...]] = ("visibility",)
 
     extinction_per_m: Annotated[Extinction, Field(ge=0)]
     albedo: Annotated[Fraction, Field(ge=0, le=1)] = 0.9995
@@ -91,12 +101,13 @@ class Fog(Document):
     def _read_visibility(cls, data: Any) -> Any:
         if not isinstance(data, Mapping):
             return data
+        cls.check_keys(data)
         one_form(data, ("extinction", "visibility"))
         others = {key: value for key, value in data.items() if key != "visibility"}
         if data.get("visibility") is None:
             return others
         try:
-            visibility_m = parse_quantity(data["visibility"], LENGTH)
+            visibility_m = parse_quantity(data["visibility"], VISIBILITY)
         except ValueError as error:
             raise ValueError(f"visibility: {error}") from None
         if visibility_m <= 0.0:

@@ -1,7 +1,7 @@
 """From a scene file to a Scene: read, include, override, validate, check."""
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,19 @@ from nir_render.scene.base import merge, read_yaml, without_alternatives
 from nir_render.scene.checks import check
 from nir_render.scene.devices import Camera, Source
 from nir_render.scene.document import Robot, SceneDocument
+from nir_render.scene.units import format_in_unit_of
 from nir_render.scene.world import Lamp, Sun
 
 # Two ways to say how finely to sample; a change that writes one takes the other away.
 _RIVALS = ("render.noise", "render.indirect.samples")
+
+
+_BOUNDS = {
+    "greater_than": "greater than",
+    "greater_than_equal": "greater than or equal to",
+    "less_than": "less than",
+    "less_than_equal": "less than or equal to",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +44,7 @@ class Scene:
 
     def with_(self, overrides: Mapping[str, Any]) -> "Scene":
         """Return a copy changed at dotted paths, such as {"robots.r2.position": "[3, 0, 0.2] m"}."""
-        return _build(apply_overrides(self.raw, overrides), self.folder, self.path)
+        return _build(apply_overrides(self.raw, overrides), self.folder, self.path, overrides)
 
     def cameras(self) -> list[str]:
         """Return the names, `robot.camera`, of the cameras that take frames."""
@@ -105,7 +114,7 @@ def load_scene(path: str | Path, overrides: Mapping[str, Any] | None = None) -> 
     if not file.is_file():
         raise InputError(f"{file}: there is no such scene file")
     raw = _read_with_includes(file, ())
-    return _build(apply_overrides(raw, overrides or {}), file.parent, str(file))
+    return _build(apply_overrides(raw, overrides or {}), file.parent, str(file), overrides or {})
 
 
 def apply_overrides(raw: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,11 +193,11 @@ def _read_with_includes(file: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
     return merged
 
 
-def _build(raw: dict[str, Any], folder: Path, path: str) -> Scene:
+def _build(raw: dict[str, Any], folder: Path, path: str, overrides: Iterable[str]) -> Scene:
     try:
         document = SceneDocument.model_validate(raw, context={"folder": folder})
     except ValidationError as error:
-        raise InputError(*_explain(error, raw, path)) from None
+        raise InputError(*_explain(error, raw, path, overrides)) from None
     scene = Scene(document, raw, folder, path)
     problems = check(document)
     if problems:
@@ -196,8 +205,8 @@ def _build(raw: dict[str, Any], folder: Path, path: str) -> Scene:
     return scene
 
 
-def _explain(error: ValidationError, raw: Any, path: str) -> Iterable[str]:
-    """Yield one line per problem: file, line, field, and what is wrong."""
+def _explain(error: ValidationError, raw: Any, path: str, overrides: Iterable[str]) -> Iterable[str]:
+    """Yield one line per problem: file, line or override, field, and what is wrong."""
     lines = _line_numbers(path)
     for problem in error.errors():
         keys = _document_keys(problem["loc"], raw)
@@ -205,12 +214,25 @@ def _explain(error: ValidationError, raw: Any, path: str) -> Iterable[str]:
             (lines[tuple(keys[:n])] for n in range(len(keys), 0, -1) if tuple(keys[:n]) in lines), None
         )
         where = f"{path}:{line}" if line else path
+        if keys and any(_meet(one.split("."), keys) for one in overrides):
+            where = f"{path} with --set"  # the file's line may hold another value
         message = problem["msg"].removeprefix("Value error, ")
         if problem["type"] == "missing":
             message = "this key is missing"
-        elif problem["type"] in {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}:
-            message = f"{message[0].lower()}{message[1:]}, in SI units; not {problem['input']!r}"
+        elif problem["type"] in _BOUNDS:
+            message = _beyond(_BOUNDS[problem["type"]], problem["ctx"], problem["input"])
         yield f"{where}: {'.'.join(keys)}: {message}" if keys else f"{where}: {message}"
+
+
+def _meet(way: Sequence[str], keys: Sequence[str]) -> bool:
+    """Tell whether one of two places in a document lies within the other."""
+    return all(one == other for one, other in zip(way, keys, strict=False))
+
+
+def _beyond(bound: str, context: Mapping[str, Any], written: Any) -> str:
+    """Say which bound a value is beyond, in the unit that it was written in."""
+    (limit,) = (context[key] for key in ("gt", "ge", "lt", "le") if key in context)
+    return f"input should be {bound} {format_in_unit_of(written, float(limit))}, not {written!r}"
 
 
 def _document_keys(location: tuple[int | str, ...], raw: Any) -> list[str]:

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import ValidationInfo, field_serializer, field_validator, model_validator
 
@@ -94,6 +94,8 @@ class PatternDocument(Document):
     scale does not matter: the source's flux is its own.
     """
 
+    read_keys: ClassVar[tuple[str, ...]] = ("file",)
+
     points: Points | None = None
     grid: PatternGrid | None = None
 
@@ -101,7 +103,11 @@ class PatternDocument(Document):
     @classmethod
     def _read(cls, data: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, Mapping):
-            raise ValueError("wanted 'points', 'grid' or 'file'")
+            raise ValueError(
+                f"{data!r} stands where 'points', 'grid' or 'file' is wanted, such as "
+                "{points: [[0 deg, 1], [90 deg, 0.5], [180 deg, 0]]}"
+            )
+        cls.check_keys(data)
         one_form(data, _FORMS)
         if data.get("file") is None:
             return data

@@ -31,13 +31,19 @@ def parse_points(points: Any, quantity: Quantity, place: str, example: str) -> P
         Fewer than two points, places that do not increase, a value that is negative or not finite.
     """
     try:
-        pairs = [(parse_quantity(where, quantity), float(value)) for where, value in points]
+        pairs = [(parse_quantity(where, quantity), float(value)) for where, value in map(_pair, points)]
     except (TypeError, ValueError) as error:
         raise ValueError(f"wanted a list of [{place}, value], such as {example}: {error}") from None
     if len(pairs) < 2 or any(b <= a for (a, _), (b, _) in itertools.pairwise(pairs)):
         raise ValueError(f"wanted at least two points of increasing {place}")
     not_negative([value for _, value in pairs])
     return tuple(pairs)
+
+
+def _pair(point: Any) -> Sequence[Any]:
+    if isinstance(point, str) or not isinstance(point, Sequence) or len(point) != 2:
+        raise ValueError(f"{point!r} is no such pair")
+    return point
 
 
 def not_negative(values: Sequence[float]) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 from nir_render.scene import devices, world
 from nir_render.scene.base import PresetDocument, preset_names
 from nir_render.scene.document import SceneDocument
-from nir_render.scene.units import LENGTH
+from nir_render.scene.units import VISIBILITY
 
 _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     devices.Source,
@@ -27,7 +27,7 @@ def scene_schema() -> dict[str, Any]:
             definitions[model.__name__] = _or_preset(definitions[model.__name__], model.preset_folder)
     _describe_curves(definitions)
     fog = definitions["Fog"]
-    fog["properties"]["visibility"] = {**fog["properties"]["extinction"], "examples": [LENGTH.example]}
+    fog["properties"]["visibility"] = {**fog["properties"]["extinction"], "examples": [VISIBILITY.example]}
     fog["properties"]["visibility"]["description"] = "3.912 / extinction, in place of it"
     del fog["required"]
     fog["oneOf"] = [{"required": ["extinction"]}, {"required": ["visibility"]}]

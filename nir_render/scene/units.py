@@ -5,6 +5,7 @@ A scene file writes "940 nm", "0.2 W" or "[1, 2, 0.3] m"; everything behind this
 Only the annotated types at the end are used by the models of a scene file.
 """
 
+import contextlib
 import math
 import re
 from dataclasses import dataclass
@@ -74,6 +75,7 @@ BITS = Quantity("number of bits", "bit", "12 bit")
 FRACTION = Quantity("fraction", "", "0.8")
 EXTINCTION = Quantity("extinction coefficient", "1/m", "0.05 /m")
 SPECTRAL_IRRADIANCE = Quantity("spectral irradiance", "W/m**3", "0.305 W/m^2/nm")
+VISIBILITY = Quantity("length", "m", "50 m")
 _OTHERS = (
     Quantity("mass", "kg", ""),
     Quantity("illuminance", "lx", ""),
@@ -196,6 +198,19 @@ def parse_vector(text: object, quantity: Quantity, size: int | None) -> tuple[fl
 def format_quantity(value: float, quantity: Quantity) -> str:
     """Write a value so that `parse_quantity` reads the same bits."""
     return f"{value!r} {quantity.unit}".rstrip()
+
+
+def format_in_unit_of(text: object, value: float) -> str:
+    """Write a value, in the unit that the program computes in, in the unit of a text such as "100 deg".
+
+    Without a unit where the text has none.
+    """
+    match = _NUMBER.fullmatch(str(text))
+    unit = "" if match is None else match[2]
+    for known in _KNOWN:
+        with contextlib.suppress(ValueError):
+            return f"{value / _factor(unit, known):.6g} {unit}".rstrip()
+    return f"{value:g}"
 
 
 def format_vector(values: tuple[float, ...], quantity: Quantity) -> str:

@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
 
-from nir_render.scene.base import RGB_REFUSED, Document, PresetDocument, resolve_file
+from nir_render.scene.base import RGB_REFUSED, Document, PresetDocument, resolve_file, typed
 from nir_render.scene.devices import NotNegative, Orientation, Positive
 from nir_render.scene.units import (
     Angle,
@@ -99,7 +99,9 @@ class Pane(Document):
 
 
 MaterialDocument = Annotated[
-    Diffuse | RoughConductor | Mirror | Dielectric | Plastic | Pane, Field(discriminator="type")
+    Diffuse | RoughConductor | Mirror | Dielectric | Plastic | Pane,
+    Field(discriminator="type"),
+    typed("{type: diffuse, reflectance: 0.5}", Diffuse, RoughConductor, Mirror, Dielectric, Plastic, Pane),
 ]
 
 
@@ -180,7 +182,14 @@ class Mesh(_Shape):
         return str(resolve_file(name, info))
 
 
-ShapeDocument = Annotated[Rectangle | Box | Sphere | Cylinder | Mesh, Field(discriminator="type")]
+ShapeDocument = Annotated[
+    Rectangle | Box | Sphere | Cylinder | Mesh,
+    Field(discriminator="type"),
+    typed(
+        '{type: sphere, center: "[1, 0, 0] m", radius: 0.1 m, material: black}',
+        Rectangle, Box, Sphere, Cylinder, Mesh,
+    ),
+]  # fmt: skip
 
 
 class Lamp(PresetDocument):
@@ -206,6 +215,8 @@ class Sun(Document):
     """
 
     angular_radius_rad: ClassVar[float] = math.radians(0.2666)
+
+    example: ClassVar[str] = "{azimuth: 30 deg, elevation: 40 deg, irradiance: 0.305 W/m^2/nm}"
 
     azimuth_rad: Angle
     elevation_rad: Annotated[Angle, Field(gt=0, le=math.pi / 2)]

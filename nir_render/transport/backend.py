@@ -34,6 +34,13 @@ class Backend:
         """Whether rays travel as arrays rather than one by one."""
         return not self.variant.startswith("scalar")
 
+    @property
+    def compiler(self) -> str:
+        """What compiles rendering for this machine, such as "LLVM 19.1.7"; empty where nothing does."""
+        if not self.variant.startswith("llvm"):
+            return ""
+        return f"LLVM {'.'.join(map(str, self.dr.detail.llvm_version()))}"
+
 
 @cache
 def backend() -> Backend:

@@ -2,7 +2,8 @@
 
 A file is an uncompressed NumPy archive (.npz), named by its key: one array for each array of the light, and
 a JSON header with the rest. It is written aside, synced and renamed, so several processes may share a folder;
-the archive's checksums are tested on reading, and a file that is damaged counts as none.
+the archive's checksums are tested on reading, and a file that is damaged counts as none. What goes wrong with
+the folder never stops a run: it is said once, and lights stay in memory.
 """
 
 import contextlib
@@ -10,8 +11,9 @@ import dataclasses
 import json
 import os
 import secrets
+import tempfile
 import time
-import zipfile
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
@@ -44,8 +46,12 @@ class LightCache:
         folder: str | Path | None = None,
         limit_bytes: int = 4 * 2**30,
         memory_limit_bytes: int = 2**30,
+        say: Callable[[str], None] | None = None,
     ) -> None:
         """Open a cache; without a folder it lives in memory alone.
+
+        `say` is told, once each, where the folder cannot be written and where a light is larger than its
+        limit; without it they are Python's warnings. A folder that can only be read is read.
 
         Raises
         ------
@@ -56,6 +62,7 @@ class LightCache:
             raise InputError("the light cache's limit is negative; wanted bytes, 0 or more")
         self._folder = None if folder is None else Path(folder)
         self._limit_bytes, self._memory_limit_bytes = limit_bytes, memory_limit_bytes
+        self._say, self._said = say or _warn, set[str]()
         self._held: OrderedDict[str, Light] = OrderedDict()
         self._plans: OrderedDict[str, NDArray[np.int64]] = OrderedDict()
         self.reused = self.missed = 0
@@ -66,6 +73,10 @@ class LightCache:
                 raise InputError(
                     f"{folder}: cannot be a light cache ({error.strerror or error}); give another folder"
                 ) from None
+            try:
+                tempfile.TemporaryFile(dir=self._folder).close()
+            except OSError as error:
+                self._say_unwritable(error)
 
     def get(self, key: str, *, counts: bool = True) -> Light | None:
         """Return the light of a key, None where it is not there or its file is damaged."""
@@ -80,10 +91,20 @@ class LightCache:
     def put(self, key: str, light: Light) -> None:
         """Keep a light. A disk that is full, or a light above the limit, leaves the folder as it was."""
         self._hold(key, light)
-        if self._folder is None or bytes_of(light) > self._limit_bytes:
+        if self._folder is None:
             return
-        with contextlib.suppress(OSError):
+        size_bytes = bytes_of(light)
+        if size_bytes > self._limit_bytes:
+            self._say_once(
+                "limit",
+                f"light cache {self._folder}: a light of {_gib(size_bytes)} is larger than the limit of "
+                f"{_gib(self._limit_bytes)} and is not kept there; raise the limit (--light-cache-gib)",
+            )
+            return
+        try:
             _write(self._folder / f"{key}{_SUFFIX}", light)
+        except OSError as error:
+            self._say_unwritable(error)
         self._shrink(self._folder)
 
     def plan(self, key: str, made: Callable[[], NDArray[np.int64]]) -> NDArray[np.int64]:
@@ -94,6 +115,18 @@ class LightCache:
         while len(self._plans) > _PLANS:
             self._plans.popitem(last=False)
         return self._plans[key]
+
+    def _say_unwritable(self, error: OSError) -> None:
+        self._say_once(
+            "unwritable",
+            f"light cache {self._folder}: cannot be written ({error.strerror or error}); what it holds is "
+            "used, new lights are not kept there",
+        )
+
+    def _say_once(self, about: str, text: str) -> None:
+        if about not in self._said:
+            self._said.add(about)
+            self._say(text)
 
     def _hold(self, key: str, light: Light) -> None:
         self._held[key] = light
@@ -113,15 +146,19 @@ class LightCache:
         path = self._folder / f"{key}{_SUFFIX}"
         try:
             light = _load(path)
-            os.utime(path)  # used now
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+        except Exception:  # a damaged archive raises a dozen types, from NumPy, zipfile, zlib, struct, ...
             return None
+        with contextlib.suppress(OSError):  # it may be another user's, who alone may set its time
+            os.utime(path)  # used now
         return light
 
     def _shrink(self, folder: Path) -> None:
         """Remove the least recently used files beyond the limit, and what killed writers have left."""
-        files = []
-        for path in folder.iterdir():
+        files: list[tuple[int, Path, int]] = []
+        paths: list[Path] = []
+        with contextlib.suppress(OSError):  # the folder may be gone
+            paths = list(folder.iterdir())
+        for path in paths:
             with contextlib.suppress(OSError):  # another process may have removed it
                 state = path.stat()
                 if _ASIDE in path.name and time.time() - state.st_mtime > _ABANDONED_AFTER_S:
@@ -135,6 +172,14 @@ class LightCache:
             with contextlib.suppress(OSError):
                 path.unlink()
             excess_bytes -= size
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, stacklevel=5)  # above this, `_say_once`, who calls it, and `put`
+
+
+def _gib(size_bytes: int) -> str:
+    return f"{size_bytes / 2**30:.3g} GiB"
 
 
 def _film(light: Light) -> tuple[str, tuple[int, ...]]:
@@ -175,6 +220,8 @@ def _taken_apart(value: Any, name: str = "light") -> tuple[Any, dict[str, NDArra
     """Return a dataclass as plain data, and its arrays by the names of the fields that lead to them."""
     if isinstance(value, np.ndarray):
         return {"array": name}, {name: value}
+    if isinstance(value, np.generic):  # a seed out of an array is none that JSON knows
+        return value.item(), {}
     if not dataclasses.is_dataclass(value):
         return value, {}
     fields: dict[str, Any] = {}

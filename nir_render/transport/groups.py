@@ -32,7 +32,7 @@ from nir_render.transport.pattern import pattern_of
 
 BATCHES = 8
 _DEFAULT_SAMPLES = 16
-PILOT_SAMPLES, FLARE_PILOT_SAMPLES = 16, 64
+PILOT_SAMPLES = 16
 _PILOT_STEP = 4
 _PILOT_PIXELS = 1200
 _VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
@@ -122,25 +122,6 @@ def pilot(scene: Scene, rays: Rays, time_s: float, seed: int, power: NDArray[np.
     radiance, variance = _pixels(scene, rays, time_s, seed, power, chosen, counts, _VALUES_AT_ONCE)
     shape = (len(radiance), 1, row.size, column.size)
     return Indirect(radiance.reshape(shape), variance.reshape(shape), scale * step, PILOT_SAMPLES)
-
-
-def some_pixels(
-    scene: Scene,
-    rays: Rays,
-    time_s: float,
-    seed: int,
-    power: NDArray[np.float64],
-    chosen: NDArray[np.int64],
-) -> Indirect:
-    """Return a pilot in chosen pixels of the film, numbered row by row, as an image of one row.
-
-    The other arguments are those of `indirect`.
-    """
-    counts = np.full(chosen.size, FLARE_PILOT_SAMPLES)
-    radiance, variance = _pixels(scene, rays, time_s, seed, power, chosen, counts, _VALUES_AT_ONCE)
-    shape = (len(radiance), 1, 1, chosen.size)
-    scale = scene.document.render.indirect.scale
-    return Indirect(radiance.reshape(shape), variance.reshape(shape), scale, FLARE_PILOT_SAMPLES)
 
 
 def film_shape(rays: Rays, scale: int) -> tuple[int, int]:

@@ -1,8 +1,13 @@
 """What determines light, as a hash: two lights of one key are the same bits.
 
 In it: bodies and their materials, where and how large what shines is and how it spreads its light, fog, the
-camera's rays, how finely is sampled, the seed, and the versions of what computes. Not in it: what is
-arithmetic afterwards, such as flux, spectra, filter, exposure, gain and noise.
+camera's rays, how finely is sampled, the seed, and what computes: versions, compiler and processor. Not in
+it: what is arithmetic afterwards, such as flux, spectra, filter, exposure, gain and noise.
+
+Two things follow from that arithmetic all the same, and are in it: `power`, in coarse steps, by which lights
+are chosen (`render.group_power`), and with a target for the noise the samples of each pixel. So a change of
+flux, spectrum or filter leaves the key as it is where the samples are fixed and no group's step changes; one
+of exposure, gain or noise, where the samples are fixed.
 
 Everything goes into SHA-256 in one way: each value behind a tag of its type and its length, floats by their
 bytes.
@@ -27,6 +32,7 @@ from nir_render.scene.load import Scene
 from nir_render.scene.motion import Pose
 from nir_render.scene.world import Mesh, ShapeDocument
 from nir_render.transport import world
+from nir_render.transport.llvm.choice import cpu_name
 
 _PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
 # Files of this package that decide the bits of light: a change of one is another version.
@@ -126,9 +132,13 @@ def plan_key(site: Site, geometry: str, seed: int, made_by: Sequence[str]) -> st
     )
 
 
-def versions(variant: str) -> tuple[str, ...]:
-    """Return Mitsuba's variant, the versions of what computes light, the hash of this package's part."""
-    return (variant, *_versions())
+def versions(variant: str, compiler: str) -> tuple[str, ...]:
+    """Return what the bits of light follow from, besides the scene.
+
+    That is Mitsuba's variant, what compiles its code (`Backend.compiler`), the versions of what computes
+    light, the processor with its instruction sets, the hash of this package's part.
+    """
+    return (variant, compiler, *_versions())
 
 
 def _shape(shape: ShapeDocument) -> tuple[str, dict[str, Any]]:
@@ -157,7 +167,7 @@ def _versions() -> tuple[str, ...]:
     own = hashlib.sha256()
     for file in sorted(file for pattern in _CODE for file in root.glob(pattern)):
         own.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return (*(f"{name} {_version(name)}" for name in _PACKAGES), own.hexdigest())
+    return (*(f"{name} {_version(name)}" for name in _PACKAGES), cpu_name(), own.hexdigest())
 
 
 def _version(package: str) -> str:

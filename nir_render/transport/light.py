@@ -103,6 +103,8 @@ class Light:
     `groups` are the names of what can be switched apart: `robot.source`, `lamps.name`, `sun`;
     `wavelengths_m` the nodes. `indirect` is None where nothing reflects or scatters and no lamp shines.
     `mirrors` names the flat smooth surfaces that the rows of `direct` speak of, as `shapes.mirror`.
+    `short_pixels` is in how many pixels of the film a bound cut the samples below what a target for the noise
+    asks for.
     """
 
     camera: str
@@ -113,6 +115,7 @@ class Light:
     direct: DirectTable
     indirect: Indirect | None
     mirrors: tuple[str, ...] = ()
+    short_pixels: int = 0
 
     def _repr_html_(self) -> str:
         """Show the direct table in a notebook."""

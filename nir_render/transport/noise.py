@@ -8,12 +8,17 @@ The need of a pixel is the count that brings its render variance to a share of s
 pilot's variance, from 8 batches, is itself noisy, and where rare paths carry the light most of its values are
 too small; its mean is right. So needs are means over 5 × 5 pixels of the pilot, and taken a tenth larger.
 
-- The frame's count is the median of the needs, at least 8. Each pixel gets its own need, up to 4 times the
-  frame's count: more than half of all pixels then keep the target, and most of the rest too.
-- No pixel of the film may look like a flare by render noise: each gets what brings the σ of the sum over it,
-  scale × scale sensor pixels of the same noise, to half of the sensor's, up to 16 times the frame's count.
-- Every flare's aperture gets what brings the sum over it to the target; there the pilot has all pixels, as
-  light is often brightest beside a flare.
+- The frame's count is the median of the needs of the pixels that light reaches, at least 8. Each pixel gets
+  its own need, up to 4 times the frame's count: more than half of all pixels then keep the target, and most
+  of the rest too.
+- No pixel of the film should look like a flare by render noise: each gets what brings, as far as a pilot can
+  tell, the σ of the sum over it, scale × scale sensor pixels of the same noise, to half of the sensor's. All
+  together may bring the samples of the frame to 4 times what they are without; where that is not enough the
+  neediest pixels are cut, but none below 16 times the frame's count.
+- Every flare's aperture gets what brings the sum over it to the target, two standard errors of the pilot on
+  top: there the pilot has all blocks that the sum is made of, as light is often brightest beside a
+  flare, and the pixels that are rendered one by one. What each counts in the sum is known from how blocks
+  are enlarged.
 
 Counts are powers of two from 8 to 4096.
 """
@@ -21,37 +26,43 @@ Counts are powers of two from 8 to 4096.
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from nir_render.camera.apertures import Aperture
+from nir_render.camera.apertures import aperture_weights
+from nir_render.camera.enlarge import Enlargement
 from nir_render.camera.exposure import diffuse_electrons
 from nir_render.camera.sensor import saturation_dn
-from nir_render.expected import by_spectrum, expected, flare_apertures, fluxes, render_variance_e2
+from nir_render.expected import by_spectrum, expected, flare_apertures, fluxes
+from nir_render.render_noise import temporal_variance_e2
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
 from nir_render.transport.light import Light
 
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
-_CAUTION = 1.1
+_CAUTION, _CAUTIOUS_ERRORS = 1.1, 2.0
 _NEIGHBOURS = 5
 _FLARE_LIKE_SHARE = 0.25  # of temporal variance: half of its σ
 _RISE, _FLARE_LIKE_RISE = 4, 16  # times the frame's count
-_PIXELS_OF_A_FLARE = 400
-_TINY_E2 = 1e-12
+_BUDGET = 4  # times the samples of a frame without care for pixels that look like flares
+_BLOCKS_OF_A_FLARE = 400
+_MOST_WANTED = 2.0**40
+_SLIGHT = 1e-3  # what counts less in a sum than this, the largest being 1, is not cared for
 
 
 def samples_map(
     pilot: Light, flares: Light, scene: Scene, noise_share: float, shape: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """Return the samples for each pixel of the film.
+    """Return the samples for each pixel of the film, and those wanted without bounds, (2, rows, columns).
 
     Parameters
     ----------
     pilot
         The camera's light with `groups.pilot` as its indirect part.
     flares
-        The same with `flare_pixels` as its indirect part, shape (group, node, 1, pixel).
+        The same with `sharpen.flare_pilot` as its indirect part.
     noise_share
         Render variance over temporal variance to reach.
     shape
@@ -61,64 +72,143 @@ def samples_map(
     _, camera = scene.camera(pilot.camera)
     at_one_second = expected(pilot, scene, 1.0)
     exposure_s = settled_exposure_s(camera, float(at_one_second.electrons.max()))
-    temporal_e2 = at_one_second.electrons * exposure_s + camera.sensor.read_noise_e**2 + _TINY_E2
-    noise_e2 = render_variance_e2(pilot, scene, exposure_s) * (pilot.indirect.samples * _CAUTION)
-    parts = pilot.indirect.variance.shape[-1:-3:-1]
-    ratio = cv2.resize(noise_e2 / temporal_e2, parts, interpolation=cv2.INTER_AREA)
-    ratio = cv2.blur(ratio, (_NEIGHBOURS, _NEIGHBOURS), borderType=cv2.BORDER_REPLICATE)
-    ratio = np.asarray(cv2.resize(ratio, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float64)
-    need = ratio / noise_share
-    frame = max(float(np.median(need)), LEAST_SAMPLES)
-    scale = camera.sensor.rows // shape[0]
-    flare_like = np.minimum(scale**2 * ratio / _FLARE_LIKE_SHARE, _FLARE_LIKE_RISE * frame)
-    need = np.maximum(np.minimum(need, _RISE * frame), flare_like).ravel()
-    known = flare_pixels(pilot, camera, shape)
-    noise_in_flares_e2 = np.full(need.size, np.nan)
-    noise_in_flares_e2[known] = _CAUTION * _noise_of_one_sample_e2(flares, scene, exposure_s, known, shape)
-    for aperture in flare_apertures(pilot, camera):
-        pixel, of_it = _film_pixels(aperture, camera, shape)
-        told = ~np.isnan(noise_in_flares_e2[pixel])
-        # What one pixel of the film brings to the sum goes with how many of its sensor pixels lie in it.
-        of_sum_e2 = (of_it**2).sum() * np.average(noise_in_flares_e2[pixel[told]], weights=of_it[told] ** 2)
-        need[pixel] = np.maximum(need[pixel], of_sum_e2 / (noise_share * aperture.sum(temporal_e2)))
-    counts = 2 ** np.ceil(np.log2(np.clip(need, LEAST_SAMPLES, MOST_SAMPLES)))
-    return np.asarray(counts, dtype=np.int64).reshape(shape)
+    sensor_e2 = temporal_variance_e2(expected(pilot, scene, exposure_s), camera)
+    ratio = _share_of_one_sample(pilot, scene, exposure_s, sensor_e2, shape)
+    own, scale = ratio / noise_share, camera.sensor.rows // shape[0]
+    frame = max(float(np.median(own[own > 0.0])) if (own > 0.0).any() else 0.0, LEAST_SAMPLES)
+    flare_like = scale**2 * ratio / _FLARE_LIKE_SHARE
+    of_flares = _needs_of_flares(flares, scene, exposure_s, sensor_e2, noise_share, shape)
+    given = _within_budget(np.minimum(own, _RISE * frame), flare_like, _FLARE_LIKE_RISE * frame)
+    given = np.clip(np.maximum(given, of_flares), LEAST_SAMPLES, MOST_SAMPLES)
+    wanted = np.clip(np.maximum(np.maximum(own, flare_like), of_flares), LEAST_SAMPLES, _MOST_WANTED)
+    return np.asarray(2 ** np.ceil(np.log2([given, wanted])), dtype=np.int64)
 
 
-def flare_pixels(light: Light, camera: Camera, shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return the numbers, row by row, of pixels of the film in flares' apertures, shape (n,).
+def _within_budget(own: Array, flare_like: Array, least_bound: float) -> Array:
+    """Return the larger of two needs, the second cut by the loosest bound that keeps the budget."""
+    budget = _BUDGET * np.maximum(own, LEAST_SAMPLES).mean()
+    bound = float(MOST_SAMPLES)
+    while bound > least_bound:
+        if np.maximum(np.maximum(own, np.minimum(flare_like, bound)), LEAST_SAMPLES).mean() <= budget:
+            break
+        bound /= 2.0
+    return np.maximum(own, np.minimum(flare_like, max(bound, least_bound)))
+
+
+def flare_pixels(light: Light, camera: Camera) -> Numbers:
+    """Return the numbers of the sensor's pixels in flares' apertures, one aperture after the other, (n,)."""
+    places = [one.pixels() for one in flare_apertures(light, camera)]
+    numbers = [row * camera.sensor.columns + column for row, column in places]
+    return np.concatenate([np.empty(0, dtype=np.int64), *numbers])
+
+
+def flare_blocks(light: Light, camera: Camera, scale: int, how: Enlargement) -> Numbers:
+    """Return the numbers of the film's pixels that sums over flares' apertures are made of, shape (n,).
 
     Of a large aperture they are an even part.
     """
     chosen = [np.empty(0, dtype=np.int64)]
-    for aperture in flare_apertures(light, camera):
-        pixel, _ = _film_pixels(aperture, camera, shape)
-        chosen.append(pixel[:: -(-pixel.size // _PIXELS_OF_A_FLARE)])
+    apertures = flare_apertures(light, camera)
+    of_blocks, _ = aperture_weights(apertures, np.ones((how.rows, how.columns)), scale, how)
+    for row in range(len(apertures)):
+        part = slice(*of_blocks.indptr[row : row + 2])
+        blocks = np.sort(of_blocks.indices[part][_counted(of_blocks.data[part])]).astype(np.int64)
+        chosen.append(blocks[:: max(-(-blocks.size // _BLOCKS_OF_A_FLARE), 1)])
     return np.unique(np.concatenate(chosen))
 
 
-def _film_pixels(
-    aperture: Aperture, camera: Camera, shape: tuple[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the numbers of film pixels under an aperture, and how many sensor pixels each has there."""
-    scale = camera.sensor.rows // shape[0]
-    row, column = aperture.pixels()
-    return np.unique(row // scale * shape[1] + column // scale, return_counts=True)
-
-
-def _noise_of_one_sample_e2(
-    light: Light, scene: Scene, exposure_s: float, pixels: NDArray[np.int64], shape: tuple[int, int]
+def _share_of_one_sample(
+    pilot: Light, scene: Scene, exposure_s: float, sensor_e2: Array, shape: tuple[int, int]
 ) -> Array:
-    """Return the variance, in e² of one sensor pixel, of one sample in some pixels of the film, (n,)."""
-    assert light.indirect is not None  # noqa: S101
+    """Return the variance of one sample over that of the sensor, shape of the film; never seen is 0."""
+    assert pilot.indirect is not None  # noqa: S101
+    parts = pilot.indirect.variance.shape[-1:-3:-1]
+    noise_e2: Array = np.zeros(parts[::-1])
+    for electrons, variance in _of_spectra(pilot, scene, exposure_s, pilot.indirect.variance):
+        of_pilot: Array = np.asarray(
+            cv2.resize(electrons, parts, interpolation=cv2.INTER_AREA), dtype=np.float64
+        )
+        noise_e2 += of_pilot**2 * variance
+    shares = noise_e2 * cv2.resize(1.0 / sensor_e2, parts, interpolation=cv2.INTER_AREA)
+    means = cv2.blur(shares, (_NEIGHBOURS, _NEIGHBOURS), borderType=cv2.BORDER_REPLICATE)
+    ratio = np.asarray(cv2.resize(means, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float64)
+    return np.maximum(ratio, 0.0) * (pilot.indirect.samples * _CAUTION)
+
+
+def _needs_of_flares(
+    flares: Light,
+    scene: Scene,
+    exposure_s: float,
+    sensor_e2: Array,
+    noise_share: float,
+    shape: tuple[int, int],
+) -> Array:
+    """Return the counts that bring the sums over flares' apertures to the target, shape of the film.
+
+    Within an aperture they go with d, what a block counts in the sum. One sample brings v c²; with λ d of
+    them the variance of the sum is Σ v c² / (λ d): so λ is the sum of v c² / d over the variance wanted.
+    """
+    assert flares.indirect is not None  # noqa: S101
+    assert flares.indirect.edges is not None  # noqa: S101
+    _, camera = scene.camera(flares.camera)
+    scale, edges = flares.indirect.scale, flares.indirect.edges
+    how, need, apertures = edges.enlargement, np.zeros(shape[0] * shape[1]), flare_apertures(flares, camera)
+    in_block = _blocks_under(how.patch.astype(np.int64), scale, how)
+    of_blocks, of_patch = aperture_weights(apertures, np.ones_like(sensor_e2), scale, how)
+    block = np.union1d(of_blocks.indices, in_block)  # all that any sum is made of
+    under = np.searchsorted(block, in_block)
+    fold = csr_array((np.ones(len(under)), (np.arange(len(under)), under)), shape=(len(under), len(block)))
+
+    def squared(of_blocks: csr_array, of_patch: csr_array) -> tuple[csr_array, csr_array]:
+        some = of_blocks[:, block]
+        return some.multiply(some).tocsr(), of_patch.multiply(of_patch).tocsr()
+
+    counts, alone = squared(of_blocks, of_patch)
+    size = np.sqrt((counts + alone @ fold).toarray())
+    told = np.isin(block, known := flare_blocks(flares, camera, scale, how))
+    brought_e2, brought_alone_e2 = (np.zeros(size.shape) for _ in range(2))
+    spectra = _of_spectra(flares, scene, exposure_s, flares.indirect.variance)
+    patches = _of_spectra(flares, scene, exposure_s, edges.variance)
+    for (electrons, variance), (_, variance_alone) in zip(spectra, patches, strict=True):
+        counts, alone = squared(*aperture_weights(apertures, electrons, scale, how))
+        of_block = np.zeros(len(block))
+        of_block[told] = variance.ravel()[np.isin(known, block)]
+        brought_e2 += counts.toarray() * of_block
+        brought_alone_e2 += (alone.multiply(variance_alone.ravel()[None])).tocsr() @ fold
+    for row, aperture in enumerate(apertures):
+        used = _counted(size[row])
+        of_told = size[row, used[told[used]]].sum()
+        all_of_told = size[row, used].sum() / of_told if of_told > 0.0 else 0.0
+        of_sum_e2 = brought_e2[row, used] * all_of_told + brought_alone_e2[row, used]
+        of_sum_e2 *= flares.indirect.samples / size[row, used]
+        # What one block brings is known to about itself; few that bring all of it tell little.
+        per_size = of_sum_e2.sum() + _CAUTIOUS_ERRORS * float(np.linalg.norm(of_sum_e2))
+        per_size /= noise_share * aperture.sum(sensor_e2)
+        need[block[used]] = np.maximum(need[block[used]], per_size * size[row, used])
+    return need.reshape(shape)
+
+
+def _counted(weights: Array) -> Numbers:
+    """Return the places of weights that count."""
+    size = np.abs(weights)
+    return np.flatnonzero(size > _SLIGHT * size.max(initial=0.0))
+
+
+def _blocks_under(pixels: Numbers, scale: int, how: Enlargement) -> Numbers:
+    row, column = np.divmod(pixels, how.columns)
+    return np.asarray((row // scale) * (how.columns // scale) + column // scale)
+
+
+def _of_spectra(
+    light: Light, scene: Scene, exposure_s: float, variance: NDArray[np.float32]
+) -> list[tuple[Array, Array]]:
+    """Return electrons per radiance, shape (rows, columns), and the variance of each spectrum's radiance."""
     _, camera = scene.camera(light.camera)
     even = np.ones((camera.sensor.rows, camera.sensor.columns))
-    noise_e2 = np.zeros(pixels.size)
-    for emitter, variance in by_spectrum(light, scene, light.indirect.variance, fluxes(light, scene) ** 2):
-        per_radiance = diffuse_electrons(camera, even, emitter, exposure_s)
-        of_film = cv2.resize(per_radiance, shape[::-1], interpolation=cv2.INTER_AREA).ravel()
-        noise_e2 += of_film[pixels] ** 2 * variance.ravel()
-    return noise_e2 * light.indirect.samples
+    return [
+        (diffuse_electrons(camera, even, emitter, exposure_s), part)
+        for emitter, part in by_spectrum(light, scene, variance, fluxes(light, scene) ** 2)
+    ]
 
 
 def settled_exposure_s(camera: Camera, brightest_e_per_s: float) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.emission import emission_units
+from nir_render.camera.enlarge import Enlargement, part_of
 from nir_render.camera.response import response
 from nir_render.errors import InputError
 from nir_render.scene.checks import indivisible_sensor, solid_around
@@ -19,9 +20,10 @@ from nir_render.transport.backend import backend
 from nir_render.transport.cache import LightCache
 from nir_render.transport.direct import direct_table
 from nir_render.transport.facets import facets
+from nir_render.transport.kernel.tables import World
 from nir_render.transport.key import Sampled, Site, geometry_key, light_key, plan_key, versions
 from nir_render.transport.light import DirectTable, Indirect, Light
-from nir_render.transport.sharpen import sharpened
+from nir_render.transport.sharpen import enlargement_of, flare_pilot, sharpened
 
 _STEP, _STEPS = 4, 6
 _PILOT = "pilot"
@@ -40,7 +42,8 @@ def render(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCach
         No such camera, or the camera is inside a body.
     """
     work = _work(scene, camera, time_s, seed, cache)
-    return replace(work.light(work.samples()), time_s=time_s, seed=seed)
+    samples, short_pixels = work.samples()
+    return replace(work.light(samples), time_s=time_s, seed=seed, short_pixels=short_pixels)
 
 
 def mean_samples(scene: Scene, camera: str, time_s: float, seed: int) -> float:
@@ -48,7 +51,7 @@ def mean_samples(scene: Scene, camera: str, time_s: float, seed: int) -> float:
 
     Errors as `render`.
     """
-    samples = _work(scene, camera, time_s, seed, None).samples()
+    samples, _ = _work(scene, camera, time_s, seed, None).samples()
     return 0.0 if samples is None else float(np.mean(samples))
 
 
@@ -65,23 +68,27 @@ class _Work:
     seed: int
     cache: LightCache
 
-    def samples(self) -> Samples | None:
-        """Return the samples in each pixel of the film, None where there is no indirect light."""
+    def samples(self) -> tuple[Samples | None, int]:
+        """Return the samples in each pixel of the film, None where there is no indirect light.
+
+        And in how many pixels they are cut below what the target for the noise asks for.
+        """
         document = self.site.scene.document
         share = document.render.noise
         if not document.has_indirect_light():
-            return None
+            return None, 0
         if share is None or not backend().vectorised:
-            return stock.samples_of(self.site.scene)
-        key = plan_key(self.site, self._geometry, self.seed, versions(backend().variant))
-        return self.cache.plan(key, lambda: self._planned(share))
+            return stock.samples_of(self.site.scene), 0
+        key = plan_key(self.site, self._geometry, self.seed, _made_by())
+        given, wanted = self.cache.plan(key, lambda: self._planned(share))
+        return given, int((given < wanted).sum())
 
     def light(self, samples: Samples | None) -> Light:
         """Return the light with so many samples in each pixel."""
         return self._kept(samples, lambda: self._light(self._indirect(samples)), counts=True)
 
     def _kept(self, samples: Sampled, rendered: Callable[[], Light], *, counts: bool) -> Light:
-        made_by = versions(backend().variant)
+        made_by = _made_by()
         key = light_key(self.site, self._geometry, self.seed, self._power, samples, made_by)
         light = self.cache.get(key, counts=counts)
         if light is None:
@@ -92,7 +99,7 @@ class _Work:
     def _planned(self, noise_share: float) -> NDArray[np.int64]:
         shape = groups.film_shape(self._rays, self.site.scene.document.render.indirect.scale)
         pilot = self._kept(_PILOT, self._pilot, counts=False)
-        pixels = noise.flare_pixels(pilot, self.site.camera, shape)
+        pixels = noise.flare_pixels(pilot, self.site.camera)
         flares = self._kept((_PILOT, pixels), lambda: self._flares(pixels), counts=False)
         return noise.samples_map(pilot, flares, self.site.scene, noise_share, shape)
 
@@ -104,7 +111,10 @@ class _Work:
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
         key = groups.light_seed(self.seed, "flares", site.name, self._geometry)
-        return self._light(groups.some_pixels(site.scene, self._rays, site.time_s, key, self._power, pixels))
+        how = part_of(self._enlargement, pixels)
+        scale = site.scene.document.render.indirect.scale
+        blocks = noise.flare_blocks(self._light(None), site.camera, scale, how)
+        return self._light(flare_pilot(site.scene, self._built, self._rays, key, blocks, how))
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
         scene, time_s, name = self.site.scene, self.site.time_s, self.site.name
@@ -114,7 +124,7 @@ class _Work:
         light = groups.indirect(scene, self._rays, time_s, key, self._power, samples)
         if light is None:
             return None
-        return sharpened(scene, self._rays, time_s, key, self._power, light)
+        return sharpened(scene, self._built, self._rays, key, light, self._enlargement)
 
     def _light(self, indirect: Indirect | None) -> Light:
         site = self.site
@@ -137,6 +147,14 @@ class _Work:
         return group_power(self.site.scene, self.site.camera)
 
     @cached_property
+    def _built(self) -> World:
+        return groups.world_on_device(self.site.scene, self.site.time_s, self._power)
+
+    @cached_property
+    def _enlargement(self) -> Enlargement:
+        return enlargement_of(self._built, self._rays, self.site.scene.document.render.indirect.scale)
+
+    @cached_property
     def _direct(self) -> DirectTable:
         site = self.site
         world.check_meshes(site.scene, site.pose.position_m, f"the camera {site.name} at {site.time_s:g} s")
@@ -157,6 +175,10 @@ def _work(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCache
         raise InputError(f"{scene.path}: {indivisible}")
     site = Site(scene, camera, device, pose, time_s)
     return _Work(site, seed, LightCache() if cache is None else cache)
+
+
+def _made_by() -> tuple[str, ...]:
+    return versions(backend().variant, backend().compiler)
 
 
 def group_power(scene: Scene, camera: Camera) -> NDArray[np.float64]:

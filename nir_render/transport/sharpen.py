@@ -5,16 +5,25 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.enlarge import enlargement
+from nir_render.camera.enlarge import Enlargement, enlargement, without_edges
 from nir_render.scene.load import Scene
 from nir_render.transport import groups, world
 from nir_render.transport.kernel.tables import World
 from nir_render.transport.labels import labels_of
 from nir_render.transport.light import Edges, Indirect
 
+FLARE_PILOT_SAMPLES = 256
+
+
+def enlargement_of(built: World, rays: groups.Rays, scale: int) -> Enlargement:
+    """Return how light in blocks of scale × scale pixels is enlarged; of scale 1 nothing is."""
+    if scale == 1:
+        return without_edges(*(count - 1 for count in rays.corners.shape[:2]))
+    return enlargement(labels_of(built, rays.origin_m, rays.corners), scale)
+
 
 def sharpened(
-    scene: Scene, rays: groups.Rays, time_s: float, seed: int, power: NDArray[np.float64], light: Indirect
+    scene: Scene, built: World, rays: groups.Rays, seed: int, light: Indirect, how: Enlargement
 ) -> Indirect:
     """Return a light with what its enlargement needs: weights beside edges, and pixels rendered one by one.
 
@@ -22,13 +31,11 @@ def sharpened(
 
     Parameters
     ----------
-    rays, time_s, seed, power
-        Those with which the light was rendered, as for `groups.indirect`.
+    built, rays, seed
+        Those with which the light was rendered, as for `groups.estimate`.
     """
     if light.scale == 1:
         return light
-    built = groups.world_on_device(scene, time_s, power)
-    how = enlargement(labels_of(built, rays.origin_m, rays.corners), light.scale)
     blocks = light.radiance_per_w.shape[2:]
     row, column = (at // light.scale for at in np.divmod(how.patch.astype(np.int64), how.columns))
     counts = np.broadcast_to(light.samples if light.counts is None else light.counts, blocks)[row, column]
@@ -36,6 +43,34 @@ def sharpened(
         scene, built, rays, groups.light_seed(seed, "edges"), how.patch.astype(np.int64), counts
     )
     return replace(light, edges=Edges(how, radiance[:, None], variance[:, None]))
+
+
+def flare_pilot(
+    scene: Scene,
+    built: World,
+    rays: groups.Rays,
+    seed: int,
+    blocks: NDArray[np.int64],
+    how: Enlargement,
+) -> Indirect:
+    """Return a pilot in chosen blocks, as an image of one row, and in each pixel of the patch.
+
+    Parameters
+    ----------
+    built, rays, seed
+        As for `groups.estimate`.
+    blocks
+        Numbers of the film's pixels, row by row, shape (n,).
+    """
+    scale, samples = scene.document.render.indirect.scale, FLARE_PILOT_SAMPLES
+    patch = how.patch.astype(np.int64)
+    parts = [
+        _estimated(scene, built, rays, groups.light_seed(seed, of), some, np.full(some.size, samples), size)
+        for of, some, size in (("blocks", blocks, scale), ("edges", patch, 1))
+    ]
+    (radiance, variance), (alone, variance_alone) = parts
+    edges = Edges(how, alone[:, None], variance_alone[:, None])
+    return Indirect(radiance[:, None, None], variance[:, None, None], scale, samples, edges=edges)
 
 
 def rendered_again(

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from nir_render import Scene, load_scene
 
 SceneMaker = Callable[[Mapping[str, Any]], Scene]
+Loader = Callable[[dict[str, Any]], Scene]
 
 
 @pytest.fixture
@@ -22,6 +24,18 @@ def scene_with() -> SceneMaker:
         return still.with_(changes)
 
     return make
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Loader:
+    """Write a document down and load it."""
+
+    def load(document: dict[str, Any]) -> Scene:
+        path = tmp_path / "scene.yaml"
+        path.write_text(yaml.safe_dump(document, sort_keys=False))
+        return load_scene(path)
+
+    return load
 
 
 def source_at(range_m: float, angle_deg: float = 0.0) -> dict[str, Any]:

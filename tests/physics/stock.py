@@ -168,10 +168,13 @@ class _Builder:
                     "eta": self._value(material["index"]), "k": self._value(material["extinction_index"]),
                 }  # fmt: skip
             case "plastic":
+                rough = {"type": "roughplastic", "distribution": "ggx", "alpha": material["roughness"]}
                 made = {
-                    "type": "roughplastic", "distribution": "ggx", "alpha": material["roughness"], "ext_ior": 1.0,
+                    **(rough if material["roughness"] else {"type": "plastic"}), "ext_ior": 1.0,
                     "int_ior": material["index"], "diffuse_reflectance": self._value(material["reflectance"]),
                 }  # fmt: skip
+            case "dielectric":
+                return {"type": "dielectric", "int_ior": material["index"], "ext_ior": 1.0}
             case "mirror":
                 reflectance = self._value(material["reflectance"])
                 made = {"type": "conductor", "material": "none", "specular_reflectance": reflectance}

@@ -1,16 +1,24 @@
 """The light-group integrator against closed forms and quadrature: walls, fog, white furnaces, the dark."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from numpy.typing import NDArray
 
-from nir_render import Scene, load_scene, render
+from nir_render import Scene, render
 from nir_render.transport.backend import backend
+from tests.physics.documents import (
+    FOCAL_PX,
+    camera_document,
+    group_radiance,
+    pixel_rays,
+    rectangle_document,
+    scene_document,
+    source_document,
+    tile_means,
+)
 from tests.physics.fog_forms import PhaseFunction, henyey_greenstein, single_scatter_per_w, tabulated
 from tests.physics.stock import stock_radiance
 
@@ -25,85 +33,8 @@ def _needs_llvm() -> None:
         pytest.skip("without LLVM light groups are rendered by Mitsuba's own path tracer")
 
 
-FOCAL_PX = 80.0
-SPECTRUM = {"gaussian": {"centroid": "940 nm", "fwhm": "42 nm"}}
-
-
-@pytest.fixture
-def make(tmp_path: Path) -> Any:
-    """Write a document down and load it."""
-
-    def load(document: dict[str, Any]) -> Scene:
-        path = tmp_path / "scene.yaml"
-        path.write_text(yaml.safe_dump(document, sort_keys=False))
-        return load_scene(path)
-
-    return load
-
-
-def _camera(columns: int, rows: int, focal_px: float = FOCAL_PX, **pose: Any) -> dict[str, Any]:
-    return {
-        "lens": {"focal_length": f"{focal_px * 22.5e-3!r} mm", "f_number": 2.0, "transmission": 0.9},
-        "sensor": {
-            "columns": columns, "rows": rows, "pixel_pitch": "22.5 um", "quantum_efficiency": 0.15, "full_well": "1e+7 e",
-            "read_noise": "1 e", "system_gain": "0.0004 DN/e", "black_level": "10 DN", "bit_depth": "12 bit",
-        },
-        "point_spread": {"sigma": "0.7 px"}, "exposure": "1 ms", **pose,
-    }  # fmt: skip
-
-
-def _source(place_m: tuple[float, ...], radius_m: float) -> dict[str, Any]:
-    source = {"flux": "1 W", "radius": f"{radius_m!r} m", "spectrum": SPECTRUM}
-    return {"rig": {"sources": {"s": source}}, "position": f"{list(place_m)!r} m"}
-
-
-def _document(
-    cameras: dict[str, Any], sources: dict[str, Any], *, samples: int, max_depth: int, **more: Any
-) -> dict[str, Any]:
-    return {
-        "format": 1,
-        "observe": ["eye"],
-        "render": {"indirect": {"scale": 1, "samples": samples, "max_depth": max_depth}},
-        "robots": {"eye": {"rig": {"cameras": cameras}}, **sources},
-        **more,
-    }
-
-
-def _rectangle(
-    center_m: tuple[float, ...], size_m: tuple[float, float], normal: tuple[float, ...], material: str
-) -> dict[str, Any]:
-    return {
-        "type": "rectangle", "center": f"{list(center_m)!r} m", "size": f"{list(size_m)!r} m", "normal": list(normal),
-        "material": material,
-    }  # fmt: skip
-
-
-def _rays(columns: int, rows: int, focal_px: float = FOCAL_PX, parts: int = 1) -> Array:
-    """Return directions in world axes, x ahead, shape (rows, columns, 3), through the centres of pixels.
-
-    With `parts`, through the centres of parts × parts pieces of each, shape (parts rows, parts columns, 3).
-    """
-    x = ((np.arange(parts * columns) + 0.5) / parts - 0.5 * columns) / focal_px
-    y = ((np.arange(parts * rows) + 0.5) / parts - 0.5 * rows) / focal_px
-    across, down = np.meshgrid(x, y)
-    rays = np.stack([np.ones_like(across), -across, -down], axis=-1)
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
-
-
-def _radiance(scene: Scene, seed: int = 1, camera: str = "eye.c") -> Array:
-    """Return the indirect radiance per unit of each group, shape (groups, rows, columns)."""
-    light = render(scene, camera, seed=seed)
-    assert light.indirect is not None
-    return light.indirect.radiance_per_w[:, 0].astype(np.float64)
-
-
-def _tiles(image: Array, size_px: int = 16) -> Array:
-    rows, columns = (length // size_px for length in image.shape)
-    return np.asarray(image.reshape(rows, size_px, columns, size_px).mean(axis=(1, 3)))
-
-
 WALL_M, REFLECTANCE = 3.0, 0.6
-WALL = {"wall": _rectangle((WALL_M, 0, 0), (40, 40), (-1, 0, 0), "paint")}
+WALL = {"wall": rectangle_document((WALL_M, 0, 0), (40, 40), (-1, 0, 0), "paint")}
 PAINT = {"paint": {"type": "diffuse", "reflectance": REFLECTANCE}}
 
 
@@ -122,17 +53,17 @@ def test_a_source_lights_a_wall_by_the_inverse_square_law(make: Any) -> None:
     A source of 10 mm, 0.2 to 10 m before the wall and 0.3 m aside. Expected: the frame's mean to 0.1 %, every
     pixel to 0.5 %, and the slope of log L against log d, cos θ taken out, −2.000 ± 0.001.
     """
-    rays = _rays(32, 24)
+    rays = pixel_rays(32, 24)
     logs = []
     for away_m in np.geomspace(0.2, 10.0, 6):
         source_m = np.array([WALL_M - away_m, 0.3, 0.0])
         scene = make(
-            _document(
-                {"c": _camera(32, 24)}, {"r": _source(tuple(source_m.tolist()), 0.01)},
+            scene_document(
+                {"c": camera_document(32, 24)}, {"r": source_document(tuple(source_m.tolist()), 0.01)},
                 samples=512, max_depth=2, materials=PAINT, shapes=WALL,
             )
         )  # fmt: skip
-        radiance = _radiance(scene)[0]
+        radiance = group_radiance(scene)[0]
         expected, points_m = _lit_wall(source_m, rays)
         # Where the source stands in the way its body is seen, black.
         beside = np.linalg.norm(np.cross(rays, source_m), axis=-1) > 0.02 + 1.5 / FOCAL_PX * np.linalg.norm(
@@ -166,12 +97,14 @@ def test_flux_falls_as_the_square_of_the_range_in_stock_path() -> None:
     for number, (range_m, centre_px) in enumerate(zip(ranges_m, centres_px, strict=True)):
         direction = np.array([1.0, -(centre_px - 0.5 * columns) / focal_px, 0.0])
         directions.append(direction / np.linalg.norm(direction))
-        sources[f"r{number}"] = _source(tuple((range_m * directions[-1]).tolist()), 0.03)
-    document = _document({"c": _camera(columns, rows, focal_px)}, sources, samples=16, max_depth=2)
+        sources[f"r{number}"] = source_document(tuple((range_m * directions[-1]).tolist()), 0.03)
+    document = scene_document(
+        {"c": camera_document(columns, rows, focal_px)}, sources, samples=16, max_depth=2
+    )
     image = stock_radiance(
         document, [[f"{name}.s" for name in sources]], samples=1024, batches=16, variant=backend().variant, max_depth=1
     )[0].mean(axis=0)  # fmt: skip
-    rays = _rays(columns, rows, focal_px)
+    rays = pixel_rays(columns, rows, focal_px)
     solid_angle_sr = rays[..., 0] ** 3 / focal_px**2
     borders = np.round(left_px).astype(int)
     irradiance = np.array([
@@ -201,18 +134,18 @@ def test_a_closed_room_keeps_its_energy(make: Any, reflectance: float) -> None:
         "above": {"pitch": "-90 deg"}, "below": {"pitch": "90 deg"},
     }  # fmt: skip
     walls = {
-        side: _rectangle(normal, (2.0, 2.0), tuple(-n for n in normal), "paint")
+        side: rectangle_document(normal, (2.0, 2.0), tuple(-n for n in normal), "paint")
         for side, normal in SIDES.items()
     }
     scene = make(
-        _document(
-            {side: _camera(32, 32, 16.0, orientation=turn) for side, turn in turns.items()},
-            {"r": _source((0.35, 0.25, -0.15), 0.005)},
+        scene_document(
+            {side: camera_document(32, 32, 16.0, orientation=turn) for side, turn in turns.items()},
+            {"r": source_document((0.35, 0.25, -0.15), 0.005)},
             samples=512, max_depth=64,
             materials={"paint": {"type": "diffuse", "reflectance": reflectance}}, shapes=walls,
         )
     )  # fmt: skip
-    radiance = [_radiance(scene, camera=f"eye.{side}")[0].mean() for side in turns]
+    radiance = [group_radiance(scene, camera=f"eye.{side}")[0].mean() for side in turns]
     expected = reflectance / (math.pi * 24.0 * (1.0 - reflectance))
     assert np.mean(radiance) == pytest.approx(expected, rel=0.002)
 
@@ -251,19 +184,19 @@ def test_a_white_furnace(make: Any, name: str) -> None:
             "type": "box", "center": "[0.4, -0.3, -0.2] m", "size": "[0.3, 0.3, 0.3] m", "orientation": {"yaw": "30 deg"},
             "material": "white",
         },
-        "mirror": _rectangle((0.7, 0.05, 0.3), (0.3, 0.5), (-1, 0.2, -0.3), "silver"),
+        "mirror": rectangle_document((0.7, 0.05, 0.3), (0.3, 0.5), (-1, 0.2, -0.3), "silver"),
     }  # fmt: skip
-    document = _document(
-        {"c": _camera(64, 48, 32.0)}, {}, samples=128, max_depth=64, lamps=lamps, shapes=shapes,
+    document = scene_document(
+        {"c": camera_document(64, 48, 32.0)}, {}, samples=128, max_depth=64, lamps=lamps, shapes=shapes,
         materials={"white": {"type": "diffuse", "reflectance": 1.0}, "silver": {"type": "mirror", "reflectance": 1.0}},
         **FURNACES[name],
     )  # fmt: skip
     document["robots"]["eye"]["position"] = "[-0.6, 0, 0] m"
     scene = make(document)
     even = 1.0 / (math.pi * 2.1**2)
-    sums = np.stack([_radiance(scene, seed).sum(axis=0) for seed in range(16)])
+    sums = np.stack([group_radiance(scene, seed).sum(axis=0) for seed in range(16)])
     assert sums.mean() == pytest.approx(even, rel=0.002)
-    tiles = np.stack([_tiles(image, 8) for image in sums])
+    tiles = np.stack([tile_means(image, 8) for image in sums])
     # Student's t of 15 degrees of freedom: 5 standard errors are passed once in 6000, 8 in 48 tiles once in 20 000.
     for estimates, width in ((tiles.mean(axis=(1, 2)), 5.0), (tiles, 8.0)):
         error = estimates.std(axis=0, ddof=1) / math.sqrt(len(estimates))
@@ -292,20 +225,20 @@ def test_single_scattering_is_the_integral_along_the_ray(make: Any, name: str) -
     phase_document, phase = PHASES[name]
     source_m, radius_m = np.array([2.5, 0.5, 0.3]), 0.02
     scene = make(
-        _document(
-            {"c": _camera(160, 112)}, {"r": _source(tuple(source_m.tolist()), radius_m)}, samples=256, max_depth=2,
+        scene_document(
+            {"c": camera_document(160, 112)}, {"r": source_document(tuple(source_m.tolist()), radius_m)}, samples=256, max_depth=2,
             fog={"extinction": "0.3 /m", "albedo": 0.9, "phase": phase_document},
         )
     )  # fmt: skip
-    radiance = _radiance(scene)[0]
-    rays = _rays(160, 112)
+    radiance = group_radiance(scene)[0]
+    rays = pixel_rays(160, 112)
     # 2 px beyond the source's rim the radiance, which goes with 1/h there, is even enough within a pixel.
     clear = np.linalg.norm(np.cross(rays, source_m), axis=-1) > radius_m + 3.0 / FOCAL_PX * 2.6
     expected = np.zeros(radiance.shape)
     expected[clear] = single_scatter_per_w(rays[clear], source_m, radius_m, 0.3, 0.9, phase)
     radiance = np.where(clear, radiance, 0.0)
     assert radiance.mean() == pytest.approx(expected.mean(), rel=0.003)
-    np.testing.assert_allclose(_tiles(radiance), _tiles(expected), rtol=0.01)
+    np.testing.assert_allclose(tile_means(radiance), tile_means(expected), rtol=0.01)
 
 
 @pytest.mark.parametrize("asymmetry", [0.0, 0.85])
@@ -318,22 +251,22 @@ def test_the_halo_reaches_up_to_the_source(make: Any, asymmetry: float) -> None:
     radius_m, parts = 0.08, 4
     phase_document = {"type": "henyey_greenstein", "g": asymmetry}
     scene = make(
-        _document(
-            {"c": _camera(48, 48)}, {"r": _source((1.0, 0.0, 0.0), radius_m)}, samples=4096, max_depth=2,
+        scene_document(
+            {"c": camera_document(48, 48)}, {"r": source_document((1.0, 0.0, 0.0), radius_m)}, samples=4096, max_depth=2,
             fog={"extinction": "0.4 /m", "albedo": 0.9, "phase": phase_document},
         )
     )  # fmt: skip
-    radiance = _radiance(scene)[0]
+    radiance = group_radiance(scene)[0]
     tangent = np.linspace(1e-3, 0.45, 300)
     rays = np.stack([np.ones_like(tangent), tangent, np.zeros_like(tangent)], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     profile = single_scatter_per_w(
         rays, np.array([1.0, 0.0, 0.0]), radius_m, 0.4, 0.9, henyey_greenstein(asymmetry), steps=256, rings=24
     )
-    fine = _rays(48, 48, parts=parts)
+    fine = pixel_rays(48, 48, parts=parts)
     off = np.linalg.norm(fine[..., 1:], axis=-1) / fine[..., 0]
-    expected = _tiles(np.interp(off, tangent, profile), parts)
-    centre = _tiles(off, parts)
+    expected = tile_means(np.interp(off, tangent, profile), parts)
+    centre = tile_means(off, parts)
     for low, high in ((0.0, 0.035), (0.035, 0.065), (0.095, 0.12), (0.12, 0.16), (0.16, 0.3)):
         ring = (centre >= low) & (centre < high)
         assert radiance[ring].mean() == pytest.approx(expected[ring].mean(), rel=0.01), (low, high)
@@ -372,14 +305,14 @@ def test_fog_takes_what_beer_and_lambert_say(make: Any, name: str) -> None:
     region, low_m, high_m = REGIONS[name]
     source_m, radius_m, extinction_per_m = np.array([2.0, 0.5, 1.0]), 0.01, 0.7
     scene = make(
-        _document(
-            {"c": _camera(64, 48)}, {"r": _source(tuple(source_m.tolist()), radius_m)}, samples=256, max_depth=2,
+        scene_document(
+            {"c": camera_document(64, 48)}, {"r": source_document(tuple(source_m.tolist()), radius_m)}, samples=256, max_depth=2,
             materials=PAINT, shapes=WALL,
             fog={"extinction": f"{extinction_per_m} /m", "albedo": 0.0, **region},
         )
     )  # fmt: skip
     parts = 8
-    clear, points_m = _lit_wall(source_m, _rays(64, 48, parts=parts))
+    clear, points_m = _lit_wall(source_m, pixel_rays(64, 48, parts=parts))
     inside_m = np.zeros(clear.shape)
     for start_m in (np.zeros(3), source_m):
         starts_m = np.broadcast_to(start_m, points_m.shape)
@@ -387,9 +320,9 @@ def test_fog_takes_what_beer_and_lambert_say(make: Any, name: str) -> None:
     if (source_m > low_m).all() and (source_m < high_m).all():
         inside_m -= 2.0 / 3.0 * radius_m
     weakened = np.exp(-extinction_per_m * inside_m)
-    expected = _tiles(clear * weakened, parts)
-    even = _tiles(weakened**2, parts) / _tiles(weakened, parts) ** 2 < 1.0 + 1e-5
-    radiance = _radiance(scene)[0]
+    expected = tile_means(clear * weakened, parts)
+    even = tile_means(weakened**2, parts) / tile_means(weakened, parts) ** 2 < 1.0 + 1e-5
+    radiance = group_radiance(scene)[0]
     assert radiance.mean() == pytest.approx(expected.mean(), rel=0.001)
     np.testing.assert_allclose(radiance[even], expected[even], rtol=0.005)
     np.testing.assert_allclose(radiance, expected, rtol=0.03)
@@ -403,17 +336,17 @@ def test_a_source_half_sunk_in_a_wall_shines_with_its_free_half(make: Any) -> No
     """
     radius_m = 0.05
     shapes = {
-        "black": _rectangle((2, 0, 0), (10, 10), (-1, 0, 0), "black"),
-        "side": _rectangle((0, 1, 0), (10, 10), (0, -1, 0), "paint"),
+        "black": rectangle_document((2, 0, 0), (10, 10), (-1, 0, 0), "black"),
+        "side": rectangle_document((0, 1, 0), (10, 10), (0, -1, 0), "paint"),
     }
     materials = {**PAINT, "black": {"type": "diffuse", "reflectance": 0.0}}
     scene = make(
-        _document(
-            {"c": _camera(64, 24, 32.0)}, {"r": _source((2.0, 0.0, 0.0), radius_m)}, samples=4096, max_depth=2,
+        scene_document(
+            {"c": camera_document(64, 24, 32.0)}, {"r": source_document((2.0, 0.0, 0.0), radius_m)}, samples=4096, max_depth=2,
             materials=materials, shapes=shapes,
         )
     )  # fmt: skip
-    rays = _rays(64, 24, 32.0)[:, :15]  # these meet the side wall, 0.15 m and more before the black one
+    rays = pixel_rays(64, 24, 32.0)[:, :15]  # these meet the side wall, 0.15 m and more before the black one
     points_m = (rays / rays[..., 1:2]).reshape(-1, 3)
     height, turn = np.meshgrid((np.arange(64) + 0.5) / 64, 2.0 * math.pi * (np.arange(128) + 0.5) / 128)
     flat = np.sqrt(1.0 - height**2)
@@ -425,24 +358,24 @@ def test_a_source_half_sunk_in_a_wall_shines_with_its_free_half(make: Any) -> No
     falling = way_m[..., 1] / distance_m
     irradiance = (leaving * falling / distance_m**2).sum(axis=1) * piece_m2 / (4.0 * math.pi**2 * radius_m**2)
     expected = (REFLECTANCE / math.pi * irradiance).reshape(rays.shape[:2])
-    radiance = _radiance(scene)[0][:, : rays.shape[1]]
+    radiance = group_radiance(scene)[0][:, : rays.shape[1]]
     assert radiance.mean() == pytest.approx(expected.mean(), rel=0.003)
     np.testing.assert_allclose(radiance.mean(axis=0), expected.mean(axis=0), rtol=0.01)
 
 
 def _dark(scene: Scene) -> bool:
-    return bool((_radiance(scene) == 0.0).all())
+    return bool((group_radiance(scene) == 0.0).all())
 
 
 def test_a_black_wall_gives_nothing_back(make: Any) -> None:
     """One black wall that fills the view, and a white one behind the camera which it must not show."""
-    shapes = {**WALL, "behind": _rectangle((-1, 0, 0), (4, 4), (1, 0, 0), "white")}
+    shapes = {**WALL, "behind": rectangle_document((-1, 0, 0), (4, 4), (1, 0, 0), "white")}
     materials = {
         "paint": {"type": "diffuse", "reflectance": 0.0},
         "white": {"type": "diffuse", "reflectance": 0.9},
     }
-    document = _document(
-        {"c": _camera(16, 12)}, {"r": _source((1.0, 0.2, 0.9), 0.01)}, samples=64, max_depth=8, materials=materials,
+    document = scene_document(
+        {"c": camera_document(16, 12)}, {"r": source_document((1.0, 0.2, 0.9), 0.01)}, samples=64, max_depth=8, materials=materials,
         shapes=shapes,
     )  # fmt: skip
     assert _dark(make(document))
@@ -451,24 +384,24 @@ def test_a_black_wall_gives_nothing_back(make: Any) -> None:
 def test_a_source_in_a_closed_box_lights_nothing_outside(make: Any) -> None:
     """And opening one side lets light out, so that the darkness is the box's doing."""
     sides = {
-        side: _rectangle(
+        side: rectangle_document(
             tuple(2.0 * (axis == 0) + 0.25 * n for axis, n in enumerate(normal)), (0.5, 0.5), tuple(-n for n in normal), "paint"
         )
         for side, normal in SIDES.items()
     }  # fmt: skip
-    document = _document(
-        {"c": _camera(32, 24)}, {"r": _source((2.0, 0.0, 0.0), 0.01)}, samples=256, max_depth=8, materials=PAINT,
+    document = scene_document(
+        {"c": camera_document(32, 24)}, {"r": source_document((2.0, 0.0, 0.0), 0.01)}, samples=256, max_depth=8, materials=PAINT,
         shapes={**WALL, **sides},
     )  # fmt: skip
     assert _dark(make(document))
     del document["shapes"]["left"]
-    assert _radiance(make(document))[0].mean() > 1e-4
+    assert group_radiance(make(document))[0].mean() > 1e-4
 
 
 def test_a_source_within_a_solid_box_lights_nothing_outside(make: Any) -> None:
     crate = {"type": "box", "center": "[2, 0, 0] m", "size": "[0.5, 0.5, 0.5] m", "material": "paint"}
-    document = _document(
-        {"c": _camera(32, 24)}, {"r": _source((2.0, 0.0, 0.0), 0.01)}, samples=256, max_depth=8, materials=PAINT,
+    document = scene_document(
+        {"c": camera_document(32, 24)}, {"r": source_document((2.0, 0.0, 0.0), 0.01)}, samples=256, max_depth=8, materials=PAINT,
         shapes={**WALL, "crate": crate},
     )  # fmt: skip
     assert _dark(make(document))
@@ -477,8 +410,12 @@ def test_a_source_within_a_solid_box_lights_nothing_outside(make: Any) -> None:
 @pytest.mark.parametrize("fog", [{}, {"fog": {"extinction": "0.2 /m", "albedo": 1.0}}])
 def test_nothing_shines_in_an_empty_world_but_fog(make: Any, fog: dict[str, Any]) -> None:
     """A source with nothing around it has no indirect light; in fog it has, at most what it sends."""
-    document = _document(
-        {"c": _camera(32, 24)}, {"r": _source((2.0, 0.1, 0.0), 0.01)}, samples=256, max_depth=64, **fog
+    document = scene_document(
+        {"c": camera_document(32, 24)},
+        {"r": source_document((2.0, 0.1, 0.0), 0.01)},
+        samples=256,
+        max_depth=64,
+        **fog,
     )
     light = render(make(document), "eye.c", seed=1)
     if not fog:
@@ -488,5 +425,5 @@ def test_nothing_shines_in_an_empty_world_but_fog(make: Any, fog: dict[str, Any]
     radiance = light.indirect.radiance_per_w[0, 0].astype(float)
     assert np.isfinite(radiance).all()
     assert radiance.min() >= 0.0
-    solid_angle_sr = _rays(32, 24)[..., 0] ** 3 / FOCAL_PX**2
+    solid_angle_sr = pixel_rays(32, 24)[..., 0] ** 3 / FOCAL_PX**2
     assert 0.0 < (radiance * solid_angle_sr).sum() < 1.0 / (4.0 * math.pi * 4.01)

@@ -176,6 +176,12 @@ def test_bad_scenes_get_one_clear_error_and_leave_nothing(case: str, tmp_path: P
         (["run", SCENE, "--set", "clok.frames=2"], "'clok' is no part of a scene"),
         (["run", SCENE, "--estimator", "papr"], "--estimator papr: unknown; known: paper, robust"),
         (["run", SCENE, "--seed", "-1"], "seed"),
+        (["run", SCENE, "--light-cache-gib", "inf"], "--light-cache-gib inf: wanted a size above 0, in GiB"),
+        (["render", SCENE, "--light-cache-gib", "nan"], "--light-cache-gib nan: wanted a size above 0"),
+        (["render", SCENE, "--light-cache-gib", "0"], "--light-cache-gib 0: wanted a size above 0"),
+        (["render", SCENE, "--light-cache-gib", "-1"], "--light-cache-gib -1: wanted a size above 0"),
+        (["render", SCENE, "--estimate", "--light-cache", SCENE], "cannot be a light cache"),
+        (["render", SCENE, "--estimate", "-o", SCENE], "is a file; give a folder for the run"),
         (["perceive", "nowhere"], "nowhere"),
         (["evaluate", "nowhere"], "there is no such file"),
         (["rnder", SCENE], "rnder"),
@@ -189,6 +195,19 @@ def test_bad_calls_end_with_status_2_and_leave_nothing(
     assert done.returncode == 2, done.stderr
     assert said in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_estimate_keeps_to_the_threads(tmp_path: Path) -> None:
+    """It is of the render that the same words would start."""
+    count = "from nir_render.transport.backend import backend; print(backend().dr.thread_count())"
+    code = f"import sys; from nir_render.cli import app; app(sys.argv[1:], standalone_mode=False); {count}"
+    arguments = ["render", SCENE, "--estimate", "--threads", "3", "--json"]
+    command = [sys.executable, "-W", "error", "-c", code, *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    estimate, threads = done.stdout.splitlines()
+    assert json.loads(estimate)["frames"] == 10
+    assert threads == "3"
     assert list(tmp_path.iterdir()) == []
 
 

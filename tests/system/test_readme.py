@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -88,6 +89,40 @@ def test_the_commands_run_in_order(checkout: Path) -> None:
         run = [sys.executable, "-W", "error", "-c", "from nir_render.cli import main; main()", *arguments]
         done = subprocess.run(run, cwd=checkout, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
+
+
+def _fields(document: dict[str, Any]) -> set[str]:
+    """Return the keys of a document and of what it holds, but names that a scene or system gives."""
+    names = set(document)
+    for key, value in document.items():
+        if isinstance(value, dict) and key not in ("versions", "sha256"):
+            by_camera = all(isinstance(inner, dict) for inner in value.values())
+            names |= {one for inner in value.values() for one in inner} if by_camera else _fields(value)
+    return names
+
+
+def test_every_field_of_a_manifest_is_explained(checkout: Path) -> None:
+    """A run with a target for the noise, in blocks of 2 × 2: it has every field but that of a missing error."""
+    wall = "{type: rectangle, center: '[3, 0, 0] m', size: '[4, 4] m', normal: [-1, 0, 0], material: white}"
+    changes = ["clock.frames=1", "materials.white={type: diffuse, reflectance: 0.5}", f"shapes.wall={wall}"]
+    sensor = "robots.r1.rig.cameras.front.sensor"
+    changes += [f"{sensor}.columns=160", f"{sensor}.rows=120", f"{sensor}.pixel_pitch=30 um"]
+    run = [
+        sys.executable,
+        "-c",
+        "from nir_render.cli import main; main()",
+        "render",
+        "scenes/one_source.yaml",
+    ]
+    settings = [word for change in changes for word in ("--set", change)]
+    subprocess.run([*run, "-o", "one", *settings], cwd=checkout, capture_output=True, check=True)
+    manifest = json.loads((checkout / "one" / "manifest.json").read_text(encoding="utf-8"))
+    page = (ROOT / "docs" / "manifest.md").read_text(encoding="utf-8")
+    explained = set(re.findall(r"`(\w+)`", page))
+    assert not _fields(manifest) - explained
+    rows = [row.split("|")[1] for row in page.splitlines() if row.startswith("| `")]
+    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert named - _fields(manifest) == {"reason"}
 
 
 def test_every_command_and_target_that_is_named_exists() -> None:

@@ -18,6 +18,20 @@ def test_a_new_folder_holds_the_examples_as_they_are(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "mine" / FIRST_SCENE).document.name == "one_source"
 
 
+def test_the_examples_show_all_that_a_scene_may_hold() -> None:
+    """Fog, sun, panes, mirrors, emission patterns and a target for the noise, each in one example at least."""
+    documents = [load_scene(path).document for path in sorted(SCENES.glob("*.yaml"))]
+    assert [document.name for document in documents] == sorted(path.stem for path in SCENES.glob("*.yaml"))
+    assert any(document.fog for document in documents)
+    assert any(document.sun for document in documents)
+    assert any(document.render.noise == 0.2 for document in documents)
+    materials = {material.type for document in documents for material in document.materials.values()}
+    assert {"diffuse", "rough_conductor", "mirror", "plastic", "pane"} <= materials
+    robots = [robot for document in documents for robot in document.robots.values()]
+    assert any(source.pattern for robot in robots for source in robot.rig.sources.values())
+    assert any(robot.motion for robot in robots)
+
+
 def test_a_folder_with_anything_in_it_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / ".hidden").write_text("")
     with pytest.raises(InputError, match="holds files already"):

@@ -3,12 +3,15 @@
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from nir_render import InputError, Scene, load_scene
 from nir_render.camera.lens import aperture_area_m2
 from nir_render.expected import expected, expected_electrons, group_electrons
+from nir_render.noise_facts import noise_facts, noise_warning
+from nir_render.render_noise import RenderNoise, render_noise
 from nir_render.transport.light import DirectTable, Indirect, Light
 
 
@@ -60,19 +63,50 @@ def test_each_group_has_its_own_flux(scene: Scene) -> None:
 def test_the_share_of_render_noise_in_the_frame(scene: Scene) -> None:
     """Two groups whose radiances have σ = 1e-3 per watt: variance 2 (0.2 k σ)², over signal + read noise.
 
-    The median pixel is where cos⁴ θ has its median; there both signal and σ are that much smaller.
+    The median pixel is where cos⁴ θ has its median; there both signal and σ are that much smaller. Where no
+    light is, nothing is counted.
     """
-    share = expected(_light(1e-2, 1e-6), scene, 1e-3).render_noise_share
+    light = _light(1e-2, 1e-6, 1)
+    noise = render_noise(expected(light, scene, 1e-3), scene)
+    share = noise.median_share
+    assert noise.reached == 1.0
+    assert share < noise.share_of_99_percent < noise.largest_share
     columns, rows = (np.arange(1280) - 639.5) / 480.0, (np.arange(960) - 479.5) / 480.0
     cos4 = (1.0 + columns**2 + rows[:, None] ** 2) ** -2
     signal_e = _electrons_on_axis(0.4 * 1e-2, 1e-3) * cos4
     noise_e2 = 2.0 * (_electrons_on_axis(0.2 * 1e-3, 1e-3) * cos4) ** 2
     assert share == pytest.approx(float(np.median(noise_e2 / (signal_e + 100.0))), rel=0.005)
+    assert noise.mean_share == pytest.approx(noise_e2.sum() / (signal_e + 100.0).sum(), rel=0.005)
+    assert light.indirect is not None
+    for array in (light.indirect.radiance_per_w, light.indirect.variance):
+        array[..., 320:, :] = 0.0
+    noise = render_noise(expected(light, scene, 1e-3), scene)
+    assert noise.reached == pytest.approx(1.0 / 3.0)
+    upper = (noise_e2 / (signal_e + 100.0))[:320]
+    assert noise.median_share == pytest.approx(float(np.median(upper)), rel=0.005)
+    assert render_noise(expected(_light(0.0, 0.0), scene, 1e-3), scene) == RenderNoise()
+
+
+def test_a_target_is_kept_by_frame_and_flares() -> None:
+    noises = [RenderNoise(median_share=0.04, largest_share=3.0), RenderNoise(0.01, aperture_share=0.06)]
+    assert [noise.keeps(0.05) for noise in noises] == [True, False]
+    facts = noise_facts(0.05, noises)
+    assert (facts["target_reached"], facts["frames_above_target"]) == (False, 1)
+    assert (facts["largest_share_in_a_pixel"], facts["largest_share_in_apertures"]) == (3.0, 0.06)
+    warning = noise_warning(facts, 2)
+    assert warning is not None
+    assert "0.05 of temporal variance is not kept in 1 of 2 frames" in warning
+    reached = noise_facts(0.05, noises[:1])
+    assert reached["target_reached"] is True
+    assert noise_warning(reached, 1) is None
+    without = noise_facts(None, noises)
+    assert without["target_reached"] is None
+    assert noise_warning(without, 2) is None
 
 
 @pytest.mark.parametrize("scale", [1, 2, 4])
 def test_the_share_of_render_noise_in_a_flare(scene: Scene, scale: int) -> None:
-    """A flare on the axis: the sum over its 32 pixels, of which scale² have the same noise at a time."""
+    """A flare on the axis: the sum over its 32 pixels, each made of the four blocks around it."""
     light = _light(1e-2, 1e-6, scale)
     table = dataclasses.replace(
         light.direct, group=np.array([1]), facet=np.array([-1]), seen=np.ones((1, 1024), dtype=bool), direction=np.array([[0.0, 0.0, 1.0]]),
@@ -85,9 +119,13 @@ def test_the_share_of_render_noise_in_a_flare(scene: Scene, scale: int) -> None:
     temporal_e2 = flare_e * (1.0 - np.exp(-0.5 * 9.0 / 0.49)) + 32 * (
         _electrons_on_axis(0.4 * 1e-2, 1e-3) + 100.0
     )
-    noise_e2 = 32 * scale**2 * 2.0 * _electrons_on_axis(0.2 * 1e-3, 1e-3) ** 2
-    assert mean.aperture_noise_share == pytest.approx(noise_e2 / temporal_e2, rel=0.005)
-    assert expected(light, scene, 1e-3).aperture_noise_share == 0.0
+    disc = np.hypot(*(np.mgrid[:32, :32] - 15.5)) <= 3.0
+    assert disc.sum() == 32
+    single = np.eye((32 // scale) ** 2).reshape(-1, 32 // scale, 32 // scale)
+    counts = [cv2.resize(block, (32, 32), interpolation=cv2.INTER_LINEAR)[disc].sum() for block in single]
+    noise_e2 = np.square(counts).sum() * 2.0 * _electrons_on_axis(0.2 * 1e-3, 1e-3) ** 2
+    assert render_noise(mean, scene).aperture_share == pytest.approx(noise_e2 / temporal_e2, rel=0.005)
+    assert render_noise(expected(light, scene, 1e-3), scene).aperture_share == 0.0
 
 
 @pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan"), float("inf")])

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 
+from nir_render.camera.enlarge import Enlargement
 from nir_render.export.spectral_exr import direct_document, write_light
-from nir_render.transport.light import DirectTable, Indirect, Light
+from nir_render.transport.light import DirectTable, Edges, Indirect, Light
 
 # The channel names of the layout (Fichet et al. 2021): Stokes component, wavelength with a comma, unit.
 _CHANNEL = re.compile(r"^S0\.(\d+,\d+)nm$")
@@ -43,6 +44,30 @@ def test_every_group_is_a_part_and_reads_back_to_the_bit(tmp_path: Path) -> None
         ((_, variance),) = parts[f"{name}.variance"].channels.items()
         np.testing.assert_array_equal(variance.pixels, light.indirect.variance[group, 0])
     assert parts["r2.top"].header["emissiveUnits"] == "W.m^-2.sr^-1"
+
+
+def test_the_samples_are_a_part_and_what_is_left_out_is_said(tmp_path: Path) -> None:
+    """Frames cannot be made again from the file alone: the enlargement of edges is not in it."""
+    light = _light()
+    assert light.indirect is not None
+    counts = np.arange(48, dtype=np.int32).reshape(6, 8)
+    how = Enlargement(
+        rows=12, columns=16, pixels=np.array([3]), first=np.array([0, 1]), block=np.array([2]),
+        weight=np.array([0.5]), patch=np.array([7]),
+    )  # fmt: skip
+    patch = light.indirect.radiance_per_w[:, :, 0, :1]
+    whole = replace(light.indirect, counts=counts, edges=Edges(how, patch, patch))
+    write_light(tmp_path / "plain.exr", light)
+    write_light(tmp_path / "whole.exr", replace(light, indirect=whole))
+    parts = {part.name(): part for part in OpenEXR.File(str(tmp_path / "whole.exr")).parts}
+    samples = parts["samples"].channels["samples"].pixels
+    assert samples.dtype == np.uint32
+    np.testing.assert_array_equal(samples, counts)
+    for part in parts.values():
+        assert (part.header["scale"], part.header["samples"]) == (2, 16)
+        assert part.header["edges"].startswith("left out")
+    (plain, *_) = OpenEXR.File(str(tmp_path / "plain.exr")).parts
+    assert plain.header["edges"] == "none"
 
 
 def test_the_direct_table_as_json() -> None:

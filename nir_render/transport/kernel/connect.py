@@ -301,7 +301,10 @@ class _Rectangle:
         self.b0, self.b1 = n0, n2
         self.rest = 2.0 * dr.pi - angles[2] - angles[3]
         self.solid_angle = angles[0] + angles[1] - self.rest
-        roughly = self.size * dr.abs(self.z) / dr.power(dr.squared_norm(self.center), 1.5)
+        # As large as it can look, from its nearest point: right before a large lamp its middle may be far.
+        beside_x, beside_y = dr.maximum(dr.abs(x) - width, 0.0), dr.maximum(dr.abs(y) - height, 0.0)
+        nearest2 = beside_x * beside_x + beside_y * beside_y + self.z * self.z
+        roughly = self.size * dr.abs(self.z) / dr.power(nearest2, 1.5)
         self.by_area = roughly < _SMALL_SR
 
     def density(self, direction: Any) -> Any:

@@ -1,5 +1,6 @@
 """Flares' apertures: which pixels, by hand."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from nir_render import load_scene
-from nir_render.camera.apertures import flare_aperture
+from nir_render.camera.apertures import Aperture, aperture_weights, flare_aperture
+from nir_render.camera.enlarge import enlarge, without_edges
 from nir_render.camera.lens import intrinsics_of
 from nir_render.scene.devices import Camera
 
@@ -67,3 +69,23 @@ def test_the_sum_is_over_the_disc(camera: Camera) -> None:
     image[500, 700] = 2.0
     image[503, 703] = 100.0  # in the rectangle, √18 px away
     assert aperture.sum(image) == 2.0
+
+
+def test_what_blocks_count_in_a_sum_is_how_they_are_enlarged() -> None:
+    """The weighted sum over two overlapping discs of an enlarged image, with two pixels rendered one by one."""
+    rows, columns, scale = 24, 32, 4
+    how = replace(
+        without_edges(rows, columns), patch=np.array([10 * columns + 12, 13 * columns + 3], np.int32)
+    )
+    disc = np.hypot(*np.mgrid[-3:4, -3:4]) <= 3.0
+    apertures = [Aperture(slice(8, 15), slice(first, first + 7), disc) for first in (8, 11)]
+    rng = np.random.default_rng(4)
+    blocks, patch, per_pixel = rng.random((6, 8)), rng.random(2), rng.random((rows, columns))
+    image = per_pixel * enlarge(blocks, rows, columns, how, patch)
+    of_blocks, of_patch = aperture_weights(apertures, per_pixel, scale, how)
+    sums = of_blocks @ blocks.ravel() + of_patch @ patch
+    np.testing.assert_allclose(sums, [one.sum(image) for one in apertures])
+    # The first patched pixel lies in both discs, the second in none.
+    np.testing.assert_array_equal(of_patch.toarray() > 0.0, [[True, False], [True, False]])
+    of_blocks, of_patch = aperture_weights([], per_pixel, scale, how)
+    assert (of_blocks.shape, of_patch.shape) == ((0, 48), (0, 2))

@@ -48,7 +48,7 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"shapes.w": _wall(size="[-1, 1] m")}, "shapes.w.size: each extent must be greater than 0"),
     ({"shapes.w": _wall(normal=[0, 0, 0])}, "shapes.w.normal: a direction must not be [0, 0, 0]"),
     ({"shapes.w": _wall(material="blakc")}, "shapes.w.material: there is no material 'blakc'; known: black"),
-    ({"shapes.w": _wall(type="rectangel")}, "shapes.w"),
+    ({"shapes.w": _wall(type="rectangel")}, "shapes.w: there is no type 'rectangel'; did you mean 'rectangle'?"),
     ({"materials.m": {"type": "diffuse", "reflectance": [0.8, 0.1, 0.1]}}, "RGB colours have no meaning at 940 nm"),
     ({"materials.m": {"type": "diffuse", "reflectance": "#ff0000"}}, "RGB colours have no meaning at 940 nm"),
     ({"materials.m": {"type": "diffuse", "reflectance": 1.2}}, "materials.m.reflectance: input should be less than"),
@@ -110,7 +110,7 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"fog": {"visibility": "0 m"}}, "fog: visibility: '0 m' is not greater than 0"),
     ({"fog": {**FOG, "albedo": 1.1}}, "fog.albedo: input should be less than or equal to 1"),
     ({"fog": {**FOG, "phase": {"type": "henyey_greenstein", "g": 1.0}}}, "fog.phase.g: input should be less than"),
-    ({"fog": {**FOG, "phase": {"type": "mie"}}}, "fog.phase"),
+    ({"fog": {**FOG, "phase": {"type": "mie"}}}, "fog.phase: there is no type 'mie'; known: henyey_greenstein, table; write it such as"),
     ({"fog": {**FOG, "phase": _table(["0 deg", 1], ["90 deg", 1])}}, "wanted angles from 0 to 180 deg, not from 0 to 90"),
     ({"fog": {**FOG, "phase": _table(["5 deg", 1], ["180 deg", 1])}}, "not from 5 to 180 deg"),
     ({"fog": {**FOG, "phase": _table(["0 deg", 1], ["0 deg", 2], ["180 deg", 1])}}, "increasing angles"),
@@ -126,7 +126,27 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"fog": {**FOG, "center": "[1, 0, 0] m", "size": "[1, 0, 1] m"}}, "fog: size: each extent must be greater than 0"),
     ({"fog": FOG, "sun": SUN}, "fog: has no end on the way to the sun, so that the sun is black; give it a 'top'"),
     ({"sun": {**SUN, "elevation": "0 deg"}}, "sun.elevation: input should be greater than 0"),
-    ({"sun": {**SUN, "elevation": "91 deg"}}, "sun.elevation: input should be less than or equal to"),
+    ({"sun": {**SUN, "elevation": "91 deg"}}, "sun.elevation: input should be less than or equal to 90 deg, not '91 deg'"),
+    ({"sun": "bright"}, "sun: 'bright' stands where keys with values are wanted, such as {azimuth: 30 deg, elevation: 40 deg"),
+    ({"sun": {**SUN, "azimut": "1 deg"}}, "sun: unknown key 'azimut'; did you mean 'azimuth'?"),
+    ({"fog": "heavy"}, "fog: 'heavy' stands where keys with values are wanted, such as {visibility: 50 m}"),
+    ({"fog": {"extintion": "0.05 /m"}}, "fog: unknown key 'extintion'; did you mean 'extinction'?"),
+    ({"fog": {"visibility": "50 m", "density": 3}}, "fog: unknown key 'density'; known keys: albedo, center, extinction, phase, size, top, visibility"),
+    ({"fog": {"visibility": 50}}, "fog: visibility: 50 is a bare number; write it with its unit, such as '50 m'"),
+    ({"fog": {**FOG, "phase": "hg"}}, "fog.phase: 'hg' stands where keys with values are wanted, 'type' among them; known: henyey_greenstein, table"),
+    ({"fog": {**FOG, "phase": {"g": 0.9}}}, "fog.phase: the key 'type' is missing; known: henyey_greenstein, table; write it such as {type: henyey"),
+    ({"fog": {**FOG, "phase": {"type": "table", "pionts": []}}}, "fog.phase: unknown key 'pionts'; did you mean 'points'?"),
+    ({"fog": {**FOG, "phase": _table(["180 deg"])}}, "such as ['0 deg', 1.0]: ['180 deg'] is no such pair"),
+    ({"fog": {**FOG, "phase": _table("180 deg")}}, "'180 deg' is no such pair"),
+    ({PATTERN: {"pionts": []}}, f"{PATTERN}: unknown key 'pionts'; did you mean 'points'?"),
+    ({PATTERN: "lambertian"}, f"{PATTERN}: 'lambertian' stands where 'points', 'grid' or 'file' is wanted, such as"),
+    ({"materials.m": {"type": "chrome"}}, "materials.m: there is no type 'chrome'; known: diffuse, rough_conductor, mirror,"),
+    ({"render.indirect.samples": 48}, "render.indirect.samples: 48 is no power of two: only these render to the same bits on any machine; take 32 or 64"),
+    ({"render.indirect.samples": 2}, "render.indirect.samples: input should be greater than or equal to 4, not 2"),
+    ({"render.indirect": 64}, "render.indirect: 64 stands where keys with values are wanted, such as {samples: 64}"),
+    ({"render.noise": False}, "render: 'noise' is a target, no switch: write it such as '5 % of temporal variance', or leave it out and fix"),
+    ({"robots.r2.rig.sources.top.flux": "-3 mW"}, "top.flux: input should be greater than 0 mW, not '-3 mW'"),
+    ({"seed": True}, "'seed' is true; nothing here is true or false; to do without it, leave the key out"),
     ({"sun": {**SUN, "irradiance": "3.05 W/m^2"}}, "sun.irradiance: '3.05 W/m^2' is an irradiance; wanted a spectral irradiance"),
     ({PATTERN: {}}, f"{PATTERN}: wanted one of 'points', 'grid' and 'file', not none"),
     ({PATTERN: {"points": [["0 deg", 1], ["90 deg", 1]]}}, "wanted polar angles from 0 to 180 deg, not from 0 to 90 deg"),
@@ -169,6 +189,24 @@ def test_errors_name_file_and_line(tmp_path: Path) -> None:
     path = _write(tmp_path, GOOD.replace("{rig: infra_swarm}", "{rig: infra_swarm, position: 3}"))
     with pytest.raises(InputError, match=r"scene\.yaml:4: robots\.a\.position: 3 is not a vector"):
         load_scene(path)
+
+
+def test_a_bad_override_is_not_laid_at_a_line_of_the_file(tmp_path: Path) -> None:
+    """The file's line holds another, good value; a bad value beside it keeps its line."""
+    path = _write(tmp_path, GOOD + "seed: 3\nclock: {frames: 0}\n")
+    with pytest.raises(InputError) as caught:
+        load_scene(path, {"seed": -1})
+    assert caught.value.problems == (
+        f"{path} with --set: seed: input should be greater than or equal to 0, not -1",
+        f"{path}:6: clock.frames: input should be greater than or equal to 1, not 0",
+    )
+
+
+def test_a_bound_that_a_preset_is_beyond_is_in_its_unit(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("{preset: infra_swarm, flux: -3 mW}")
+    scene = _write(tmp_path, GOOD.replace("rig: infra_swarm", "rig: {cameras: {}, sources: {s: mine.yaml}}"))
+    with pytest.raises(InputError, match=r"flux: input should be greater than 0 mW, not '-3 mW'"):
+        load_scene(scene)
 
 
 @pytest.mark.parametrize(

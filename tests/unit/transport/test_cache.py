@@ -2,11 +2,14 @@
 
 import dataclasses
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,10 +142,12 @@ def test_the_folder_keeps_its_limit_and_the_least_recently_used_goes(tmp_path: P
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 2.5 * size
 
 
-def test_a_light_above_the_limit_is_not_written(tmp_path: Path) -> None:
+def test_a_light_above_the_limit_is_not_written_and_that_is_said_once(tmp_path: Path) -> None:
     light = _light()
     cache = LightCache(tmp_path, limit_bytes=bytes_of(light) - 1)
-    cache.put(KEY, light)
+    with pytest.warns(UserWarning, match=r"larger than the limit of .* GiB and is not kept there"):
+        cache.put(KEY, light)
+    cache.put(OTHER, light)  # a warning would be an error
     assert list(tmp_path.iterdir()) == []
     assert cache.get(KEY) is light
 
@@ -167,10 +172,75 @@ def test_a_full_disk_is_no_reason_to_stop(tmp_path: Path, monkeypatch: pytest.Mo
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "savez", full)
-    cache = LightCache(tmp_path)
+    said: list[str] = []
+    cache = LightCache(tmp_path, say=said.append)
     cache.put(KEY, _light())
+    cache.put(OTHER, _light())
     assert list(tmp_path.iterdir()) == []
     assert cache.get(KEY) is not None
+    assert len(said) == 1
+    assert "cannot be written (No space left on device)" in said[0]
+
+
+def test_a_folder_of_another_user_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who does not own a file cannot set its time, and may not be able to write beside it either."""
+    light = _light()
+    LightCache(tmp_path).put(KEY, light)
+
+    def refused(*_: object, **__: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "utime", refused)
+    assert LightCache(tmp_path).get(KEY) is not None
+    monkeypatch.setattr(tempfile, "TemporaryFile", refused)
+    monkeypatch.setattr(np, "savez", refused)
+    said: list[str] = []
+    cache = LightCache(tmp_path, say=said.append)
+    assert len(said) == 1  # when it is opened, before anything is rendered
+    assert "cannot be written (Operation not permitted)" in said[0]
+    found = cache.get(KEY)
+    assert found is not None
+    _assert_same_bits(found, light)
+    cache.put(OTHER, light)
+    assert len(said) == 1
+
+
+def test_a_folder_that_goes_during_a_run_is_no_reason_to_stop(tmp_path: Path) -> None:
+    said: list[str] = []
+    cache = LightCache(tmp_path / "lights", say=said.append)
+    shutil.rmtree(tmp_path / "lights")
+    cache.put(KEY, _light())
+    assert cache.get(KEY) is not None
+    assert cache.get(OTHER) is None
+    assert len(said) == 1
+
+
+def test_any_flipped_bit_is_a_miss_or_changes_nothing(tmp_path: Path) -> None:
+    """Flips in the archive's tables name zip methods, encryption, sizes and offsets that are not there."""
+    light = _light()
+    LightCache(tmp_path).put(KEY, light)
+    (path,) = tmp_path.iterdir()
+    data = path.read_bytes()
+    random = np.random.default_rng(0)
+    misses = 0
+    for place in random.choice(8 * len(data), 1500, replace=False):
+        flipped = bytearray(data)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        found = LightCache(tmp_path).get(KEY)
+        misses += found is None
+        if found is not None:
+            _assert_same_bits(found, light)
+    assert misses > 500
+
+
+def test_a_seed_out_of_an_array_is_written_too(tmp_path: Path) -> None:
+    out_of_an_array: Any = {"seed": np.int64(3), "time_s": np.float32(0.5)}
+    light = dataclasses.replace(_light(), **out_of_an_array)
+    LightCache(tmp_path).put(KEY, light)
+    found = LightCache(tmp_path).get(KEY)
+    assert found is not None
+    assert (found.seed, found.time_s) == (3, 0.5)
 
 
 def test_a_folder_that_cannot_be_is_an_input_error(tmp_path: Path) -> None:

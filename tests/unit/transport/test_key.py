@@ -10,7 +10,9 @@ import yaml
 
 from nir_render import Scene, load_scene
 from nir_render.scene.motion import camera_pose
+from nir_render.transport.backend import backend
 from nir_render.transport.key import Site, geometry_key, light_key, plan_key, versions
+from nir_render.transport.llvm.choice import choose, cpu_name
 
 CAMERA = "robots.r1.rig.cameras.c"
 SOURCE = "robots.r2.rig.sources.s"
@@ -245,8 +247,17 @@ def test_a_plan_of_samples_follows_what_makes_electrons(scene: Scene, change: di
     assert keys[0] == plan_key(_site(scene), geometry_key(_site(scene)), 1, ("llvm_ad_mono",))
 
 
-def test_the_versions_name_the_variant_the_packages_and_this_code() -> None:
-    variant, *packages, own = versions("llvm_ad_mono")
-    assert variant == "llvm_ad_mono"
+def test_the_versions_name_the_variant_the_packages_the_machine_and_this_code() -> None:
+    """Lights of another compiler or processor may have other bits: they are no lights of the same key."""
+    variant, compiler, *packages, processor, own = versions("llvm_ad_mono", "LLVM 19.1.7")
+    assert (variant, compiler) == ("llvm_ad_mono", "LLVM 19.1.7")
     assert [package.split()[0] for package in packages] == ["nir-render", "mitsuba", "drjit", "numpy"]
+    assert processor == cpu_name() != ""
     assert len(own) == 64
+
+
+@pytest.mark.mitsuba
+def test_the_compiler_is_the_one_that_was_chosen() -> None:
+    used = backend()
+    expected = f"LLVM {choose().version}" if used.variant.startswith("llvm") else ""
+    assert used.compiler == expected

@@ -3,15 +3,19 @@
 A camera of 1280 × 960, 10 e read noise, without a filter; two sources of 0.2 W; a film of 2 × 2 sensor pixels.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from nir_render import DirectTable, Indirect, Light, Scene, load_scene
+from nir_render.camera.enlarge import Enlargement, without_edges
 from nir_render.camera.lens import aperture_area_m2
-from nir_render.transport.noise import flare_pixels, samples_map, settled_exposure_s
+from nir_render.transport.light import Edges
+from nir_render.transport.noise import flare_blocks, flare_pixels, samples_map, settled_exposure_s
 
 FILM = (480, 640)
 RADIANCE, EXPOSURE_S = 1e-2, 1e-3
@@ -50,11 +54,29 @@ def _counts(
     share: float,
     flares: Array | None = None,
     directions: list[list[float]] | None = None,
+    how: Enlargement | None = None,
 ) -> NDArray[np.int64]:
+    return np.asarray(_plan(scene, variance, share, flares, directions, how)[0])
+
+
+def _plan(
+    scene: Scene,
+    variance: Array,
+    share: float,
+    flares: Array | None = None,
+    directions: list[list[float]] | None = None,
+    how: Enlargement | None = None,
+) -> NDArray[np.int64]:
+    """The counts given and wanted; of `flares` the variance in each block, and in each pixel of the patch."""
     pilot = _light(variance, 16, directions)
-    pixels = flare_pixels(pilot, scene.camera("r1.front")[1], FILM)
-    of_flares = np.zeros((1, pixels.size)) if flares is None else np.broadcast_to(flares, (1, pixels.size))
-    return samples_map(pilot, _light(of_flares, 64, directions), scene, share, FILM)
+    how = how or without_edges(960, 1280)
+    blocks = flare_blocks(pilot, scene.camera("r1.front")[1], 2, how)
+    of_flares = np.zeros(1) if flares is None else flares
+    light = _light(np.broadcast_to(of_flares, (1, blocks.size)), 64, directions)
+    assert light.indirect is not None
+    patch = np.broadcast_to(of_flares, (2, 1, how.patch.size)).astype(np.float32)
+    indirect = replace(light.indirect, scale=2, edges=Edges(how, patch, patch))
+    return samples_map(pilot, replace(light, indirect=indirect), scene, share, FILM)
 
 
 def _per_radiance(scene: Scene) -> float:
@@ -95,19 +117,50 @@ def test_dim_corners_take_fewer(scene: Scene) -> None:
     ("rise", "count"),
     [
         (1.8, 32),  # its own need is 27
-        (
-            4.5,
-            64,
-        ),  # more than 4 times the frame's: 60; to bring the sum over 2 × 2 px to a quarter 54 would do
+        # More than 4 times the frame's: 60; to bring the sum over 2 × 2 px to a quarter 54 would do.
+        (4.5, 64),
         (8.0, 128),  # that sum brought to a quarter of the variance: 2² · 8 · 15 / 5 = 96
-        (1e4, 256),  # 16 times the frame's: 240
+        (1e2, 2048),  # 1200
+        (1e4, 4096),
     ],
 )
 def test_a_noisy_patch_gets_its_own_need_within_bounds(scene: Scene, rise: float, count: int) -> None:
-    """The frame's need is 15 in every pixel; a patch of the pilot is `rise` times noisier."""
+    """The frame's need is 15 in every pixel; a patch of the pilot is `rise` times noisier.
+
+    It is 8 × 8 of 120 × 160 places of the pilot, with the mean over 5 × 5 12 × 12: 0.75 % of the frame, which
+    4096 in each bring to 3 times its samples.
+    """
     variance = _even_need(scene, 15.0)
-    variance[50:70, 70:90] *= rise
-    assert _counts(scene, variance, 0.05)[240, 320] == count
+    variance[56:64, 76:84] *= rise
+    given, wanted = _plan(scene, variance, 0.05)
+    assert given[240, 320] == count
+    need = 15.0 * max(rise, rise * 4 / 5)
+    assert wanted[240, 320] == 2 ** np.ceil(np.log2(need))
+    assert (given < wanted).any() == (rise > 4.0)
+    assert given[10, 10] == wanted[10, 10] == 16
+
+
+def test_noise_everywhere_is_cut_to_the_budget(scene: Scene) -> None:
+    """A tenth of the frame wants 3750 samples in each pixel, the rest 15.
+
+    Without care for what looks like flares these are 60 and 15, 19.5 on average; the budget is 4 times that,
+    78. With 512 in that tenth the mean is 65, with 1024 it is 116.
+    """
+    variance = _even_need(scene, 15.0)
+    variance[:12] *= 250.0
+    given, wanted = _plan(scene, variance, 0.05)
+    assert given[10, 320] == 512
+    assert wanted[10, 320] == 4096
+    assert 0.1 * given.size < (given < wanted).sum() < 0.13 * given.size
+
+
+def test_what_no_light_reaches_does_not_count(scene: Scene) -> None:
+    """Light in a third of the frame, which needs 240 samples: it gets them, though the median pixel is dark."""
+    variance = _even_need(scene, 240.0)
+    variance[40:] = 0.0
+    given = _counts(scene, variance, 0.05)
+    assert given[60, 320] == 256
+    assert given[400, 320] == 8
 
 
 def _even_need(scene: Scene, need: float) -> Array:
@@ -119,20 +172,51 @@ def _even_need(scene: Scene, need: float) -> Array:
     return np.asarray(_variance_for(scene, need, 0.05) * even)
 
 
-def test_an_aperture_gets_what_its_sum_needs(scene: Scene) -> None:
-    """A flare whose middle is the corner of four sensor pixels that make one pixel of the film.
+def _flare() -> list[float]:
+    """A flare whose middle is the corner of four sensor pixels that make one pixel of the film: (640.5, 480.5)."""
+    towards = [640.5 - 639.5, 480.5 - 479.5, 480.0]
+    return list((np.array(towards) / np.linalg.norm(towards)).tolist())
 
-    Within 3 px of it lie 32 sensor pixels, in 3 × 3 pixels of the film: 4 in the middle, 4 in each of its
-    neighbours, 3 in each at the corners. The sum's variance is (5 · 4² + 4 · 3²) = 116 times that of one sensor
-    pixel, its temporal variance 32 T; at equal variance it needs 116/32 = 3.625 times what a pixel would.
+
+def test_an_aperture_gets_what_its_sum_needs(scene: Scene) -> None:
+    """Within 3 px lie 32 sensor pixels, in 3 × 3 pixels of the film, made of these and the 12 beside them.
+
+    With c what each counts in the sum, by enlarging images of one block, counts of λ c bring Σ c² v / (λ c) to
+    the share: λ = v Σ c / (share · 32 T); two standard errors on top: 1 + 2 √Σ c² / Σ c.
     """
-    need = 16.0
-    quiet = np.full((120, 160), _variance_for(scene, need, 0.05) / 100.0)
-    beside = np.array([[_variance_for(scene, need, 0.05) / 4.0]])  # of 64 samples
-    towards = [-0.5 + 1.0 - 639.5 + 640.0, -0.5 + 1.0 - 479.5 + 480.0, 480.0]  # pixel (640.5, 480.5)
-    direction = (np.array(towards) / np.linalg.norm(towards)).tolist()
-    counts = _counts(scene, quiet, 0.05, beside, [direction])
-    assert (counts[239:242, 319:322] == 64).all()  # 58 rounded up
+    need = 64.0
+    quiet = np.full((120, 160), _variance_for(scene, need, 0.05) / 1000.0)
+    beside = np.array(_variance_for(scene, need, 0.05) / 4.0)  # of 64 samples
+    counts = _counts(scene, quiet, 0.05, beside, [_flare()])
+    single = np.eye(64).reshape(64, 8, 8)
+    disc = np.hypot(*(np.mgrid[:16, :16] - 6.5)) <= 3.0  # (6.5, 6.5) is the middle of block (3, 3)
+    assert disc.sum() == 32
+    sums = np.array([cv2.resize(one, (16, 16), interpolation=cv2.INTER_LINEAR)[disc].sum() for one in single])
+    assert (sums > 0).sum() == 9 + 12
+    rate = need / 1.1 / 32 * (sums.sum() + 2.0 * np.sqrt((sums**2).sum()))
+    wanted = 2 ** np.ceil(np.log2(np.maximum(rate * sums, 8.0))).reshape(8, 8)
+    np.testing.assert_array_equal(counts[237:245, 317:325], wanted)
+    assert wanted.max() >= 128
+    counts[237:245, 317:325] = 8
+    assert (counts == 8).all()
+
+
+def test_pixels_rendered_one_by_one_count_in_the_sum(scene: Scene) -> None:
+    """Where all 32 are, nothing of the blocks counts: 4 in the middle, 4 and 3 around it, in 3 × 3 blocks.
+
+    A block counts by √4 or √3 what a pixel counts.
+    """
+    camera = scene.camera("r1.front")[1]
+    need = 64.0
+    pixels = np.sort(flare_pixels(_light(np.zeros((1, 1)), 1, [_flare()]), camera))
+    assert pixels.size == 32
+    how = replace(without_edges(960, 1280), patch=pixels.astype(np.int32))
+    quiet = np.full((120, 160), _variance_for(scene, need, 0.05) / 1000.0)
+    beside = np.array(_variance_for(scene, need, 0.05) / 4.0)
+    counts = _counts(scene, quiet, 0.05, beside, [_flare()], how)
+    size = np.sqrt(np.array([[3, 4, 3], [4, 4, 4], [3, 4, 3]]))
+    rate = need / 1.1 / 32 * (size.sum() + 2.0 * np.sqrt((size**2).sum()))
+    np.testing.assert_array_equal(counts[239:242, 319:322], 2 ** np.ceil(np.log2(rate * size)))
     counts[239:242, 319:322] = 8
     assert (counts == 8).all()
 

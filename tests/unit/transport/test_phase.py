@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from nir_render.errors import InputError
 from nir_render.transport.phase import CELLS, PhaseTable, henyey_greenstein, phase_table, tabulated
 
 # A droplet's forward peak: 5000 times the side, within a degree, in steps of any size.
@@ -48,6 +49,18 @@ def test_henyey_greenstein_is_its_formula_and_its_mean_cosine_is_g() -> None:
         middle = 0.5 * (table.versine[1:] + table.versine[:-1])
         mean_cosine = float(((1.0 - middle) * np.diff(table.cumulative)).sum())
         assert mean_cosine == pytest.approx(asymmetry, abs=1e-4)
+
+
+def test_a_table_that_falls_between_the_angles_is_refused_and_one_of_a_cell_is_not() -> None:
+    """A spike of 0.1 deg where the table's angles are 0.26 deg apart is nothing to draw from; of 1 deg, it is."""
+    for width_deg, held in ((0.1, False), (1.0, True)):
+        at_deg = 100.0 + np.array([0.0, 0.5, 1.0]) * width_deg
+        spike = tabulated(np.radians([0.0, *at_deg, 180.0]), np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
+        if held:
+            assert phase_table(spike).cumulative[-1] == pytest.approx(1.0, abs=1e-12)
+        else:
+            with pytest.raises(InputError, match="widen it to 1 deg"):
+                phase_table(spike)
 
 
 @pytest.mark.mitsuba
