@@ -6,6 +6,9 @@ Times are medians of five renders of 640 × 480 pixels, 64 samples, depth 6, one
 process. Variances are those between seeds (the same number for both sides), median over the pixels; a gain is
 variance × time of Mitsuba over variance × time of ours. Light that comes straight is left out but where the
 field says otherwise. Mitsuba renders all sources at once, into one image; ours gives one array per source.
+`fog_gain_scattered` is of light that fog alone scatters, between black surfaces; `fog_gain_room` of all
+indirect light in the room with its walls; `clear_gain` and `fog_gain` of the light in flares' apertures,
+straight light included.
 """
 
 import argparse
@@ -336,14 +339,16 @@ def main() -> None:
         result |= {"many_gain_128": hall["gain"], "details_128": hall}
     if "fog" in wanted:
         for extinction_per_m in (0.05, 0.2):
-            for black in (True, False):
-                fog = compare(partial(fog_room, extinction_per_m, black), repeats, seeds)
-                kind = "scattered" if black else "room"
-                result |= {
-                    f"fog_gain_{kind}_{extinction_per_m}": fog["gain"],
-                    f"fog_gain_{kind}_in_flares_{extinction_per_m}": fog["gain_in_flares"],
-                    f"details_fog_{kind}_{extinction_per_m}": fog,
-                }
+            scattered, room = (
+                compare(partial(fog_room, extinction_per_m, black), repeats, seeds) for black in (True, False)
+            )
+            result |= {
+                f"fog_gain_scattered_{extinction_per_m}": scattered["gain"],
+                f"fog_gain_room_{extinction_per_m}": room["gain"],
+                f"fog_gain_{extinction_per_m}": room["gain_in_flares"],
+                f"details_fog_scattered_{extinction_per_m}": scattered,
+                f"details_fog_room_{extinction_per_m}": room,
+            }
     if "smooth" in wanted:
         result |= smooth(repeats)
     if "scaling" in wanted:
