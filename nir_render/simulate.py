@@ -15,7 +15,8 @@ from nir_render.evaluate.truth import SourceTruth, truth_of
 from nir_render.expected import Expected, expected
 from nir_render.randomness import generator
 from nir_render.render_noise import RenderNoise, render_noise
-from nir_render.scene.devices import AutoExposure, Camera
+from nir_render.scene.devices import Camera
+from nir_render.scene.exposure import AutoExposure
 from nir_render.scene.load import Scene
 from nir_render.transport.cache import LightCache
 from nir_render.transport.light import Light

@@ -1,6 +1,7 @@
 """What a light group sends: its spectrum of unit flux, and how many units of emission."""
 
-from nir_render.scene.devices import CurveDocument, Source
+from nir_render.scene.curves import CurveDocument
+from nir_render.scene.devices import Source
 from nir_render.scene.world import Lamp, Sun
 from nir_render.spectra.curve import Curve, constant_curve, curve_from_points
 from nir_render.spectra.illuminants import SILICON_M, incandescent_flux_w, incandescent_spectrum

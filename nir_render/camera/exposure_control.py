@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.sensor import saturation_dn
-from nir_render.scene.devices import AutoExposure, Sensor
+from nir_render.scene.exposure import AutoExposure
+from nir_render.scene.sensor import Sensor
 
 _LARGEST_STEP = 4.0
 

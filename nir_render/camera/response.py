@@ -16,7 +16,8 @@ from scipy.interpolate import PchipInterpolator
 
 from nir_render.camera.emission import Emitter, curve_of, emission_spectrum
 from nir_render.camera.lens import intrinsics_of
-from nir_render.scene.devices import Camera, Orientation
+from nir_render.scene.devices import Camera
+from nir_render.scene.fields import Orientation
 from nir_render.scene.world import Lamp, Sun
 from nir_render.spectra.bandpass import transmission
 from nir_render.spectra.curve import Curve

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.scene.devices import Sensor
+from nir_render.scene.sensor import Sensor
 
 _READ_NOISE_MARGIN = 4.0
 

@@ -8,7 +8,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from nir_render.scene.base import Document, expand_preset, preset_names
-from nir_render.scene.devices import Name, NotNegative, Orientation, Positive, Rig
+from nir_render.scene.devices import Rig
+from nir_render.scene.fields import Name, NotNegative, Orientation, Positive
 from nir_render.scene.fog import Fog
 from nir_render.scene.noise import NoiseTarget
 from nir_render.scene.units import Frequency, Position, Time

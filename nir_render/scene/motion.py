@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from nir_render.scene.devices import Camera, Orientation
+from nir_render.scene.devices import Camera
 from nir_render.scene.document import Robot
+from nir_render.scene.fields import Orientation
 
 # Columns: the camera's x (right), y (down) and z (forward) in a mount that looks along x, y left, z up.
 _MOUNT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

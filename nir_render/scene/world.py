@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
 
 from nir_render.scene.base import RGB_REFUSED, Document, PresetDocument, resolve_file, typed
-from nir_render.scene.devices import NotNegative, Orientation, Positive
+from nir_render.scene.fields import NotNegative, Orientation, Positive
 from nir_render.scene.units import (
     Angle,
     Fraction,

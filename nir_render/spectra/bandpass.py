@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nir_render.scene.devices import Bandpass
+from nir_render.scene.bandpass import Bandpass
 
 
 def transmission(bandpass: Bandpass, wavelength_m: ArrayLike, cos_angle: ArrayLike) -> NDArray[np.float64]:

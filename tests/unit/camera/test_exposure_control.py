@@ -8,7 +8,7 @@ import pytest
 from nir_render import load_scene, simulate
 from nir_render.camera.exposure_control import next_exposure_s
 from nir_render.camera.sensor import saturation_dn
-from nir_render.scene.devices import AutoExposure
+from nir_render.scene.exposure import AutoExposure
 from tests.unit.camera.conftest import CameraMaker
 
 CONTROL = AutoExposure.model_validate({"target": 0.7, "shortest": "20 us", "longest": "5 ms"})

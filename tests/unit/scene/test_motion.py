@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nir_render.scene.devices import Orientation
 from nir_render.scene.document import Robot, Waypoint
+from nir_render.scene.fields import Orientation
 from nir_render.scene.motion import Pose, robot_pose, rotation_of
 
 QUARTER = {"yaw": "90 deg"}

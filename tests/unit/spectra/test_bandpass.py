@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nir_render.scene.devices import Bandpass
+from nir_render.scene.bandpass import Bandpass
 from nir_render.spectra.bandpass import transmission
 
 
