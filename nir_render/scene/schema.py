@@ -3,15 +3,18 @@
 from typing import Any
 
 from nir_render.scene import devices, world
+from nir_render.scene.bandpass import Bandpass
 from nir_render.scene.base import PresetDocument, preset_names
 from nir_render.scene.document import SceneDocument
+from nir_render.scene.lens import Lens
+from nir_render.scene.sensor import Sensor
 from nir_render.scene.units import VISIBILITY
 
 _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     devices.Source,
-    devices.Lens,
-    devices.Bandpass,
-    devices.Sensor,
+    Lens,
+    Bandpass,
+    Sensor,
     devices.Camera,
     devices.Rig,
     world.Lamp,
