@@ -10,7 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from nir_render.camera.exposure import Beam, expected_electrons
+from nir_render.camera.gaussian_fit import gaussian_fit
 from nir_render.camera.lens import aperture_area_m2, intrinsics_of
+from nir_render.camera.otf import core_of
 from nir_render.camera.response import response
 from nir_render.camera.sensor import quantise, saturation_dn
 from nir_render.errors import InputError
@@ -64,7 +66,7 @@ def calibration(scene: Scene, camera: str) -> Calibration:
         black_level_dn=device.sensor.black_level_dn,
         saturation_dn=saturation_dn(device.sensor),
         bit_depth=int(device.sensor.bit_depth_bit),
-        psf_sigma_px=device.point_spread.sigma_px,
+        psf_sigma_px=gaussian_fit(core_of(device)).sigma_px,
         response_angle_rad=on_axis.angle_rad,
         response_relative=on_axis.electrons_per_j / on_axis.electrons_per_j[0],
         range_constant_dn_m2_per_s=float(np.mean(flux_constants)),
@@ -72,16 +74,28 @@ def calibration(scene: Scene, camera: str) -> Calibration:
         source_radius_m=float(np.mean(radii_m)),
         wavelength_m=940e-9,
         sigma={name: sigma for name, sigma in spread.items() if sigma > 0.0},
+        dsnu_e=device.sensor.dsnu.total_e,
+        prnu=device.sensor.prnu.total,
+        lens_model=device.lens.model,
+        distortion=device.lens.distortion,
     )
     return replace(known, range_constant_paper_dn_m2_per_s=_paper_constant(known, device, sources[0]))
 
 
 def range_constant(camera: Camera, source: Source) -> float:
-    """Return K of the integrated flux on axis, in DN m²/s: system gain · A_ap · C(0) · Φ/4π."""
+    """Return K of a flare's flux on axis, in DN m²/s: system gain · A_ap · C(0) · Φ/4π · share.
+
+    The share leaves out what glare and ghosts take, and what the core spreads beyond a flare.
+    """
     electrons_per_j = float(response(camera, source).electrons_per_j[0])
     intensity_w_per_sr = source.flux_w / (4.0 * np.pi)
+    flare_share = camera.point_spread.core_share * gaussian_fit(core_of(camera)).share
     return (
-        camera.sensor.system_gain_dn_per_e * aperture_area_m2(camera) * electrons_per_j * intensity_w_per_sr
+        camera.sensor.system_gain_dn_per_e
+        * aperture_area_m2(camera)
+        * electrons_per_j
+        * intensity_w_per_sr
+        * flare_share
     )
 
 
@@ -91,9 +105,7 @@ def _paper_constant(known: Calibration, camera: Camera, source: Source) -> float
     Noise-free frames of the source on the axis at 1 to 10 m, measured by the paper's own detector. NaN where
     that detector finds the source at fewer than two ranges.
     """
-    headroom_e = min(
-        camera.sensor.full_well_e, camera.sensor.full_scale_dn / camera.sensor.system_gain_dn_per_e
-    )
+    headroom_e = min(camera.sensor.well_e, camera.sensor.full_scale_dn / camera.sensor.system_gain_dn_per_e)
     brightest_e_per_s = expected_electrons(camera, [_beam(camera, source, _RAIL_M[0])], 1.0).max()
     exposure_s = float(_RAIL_PEAK * headroom_e / brightest_e_per_s)
     measured = []
@@ -114,4 +126,5 @@ def _beam(camera: Camera, source: Source, range_m: float) -> Beam:
         angular_radius_rad=float(np.arcsin(min(source.radius_m / range_m, 1.0))),
         irradiance_w_per_m2=source.flux_w / (4.0 * np.pi * range_m**2),
         response=response(camera, source),
+        distance_m=range_m,
     )

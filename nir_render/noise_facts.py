@@ -1,6 +1,6 @@
 """What the manifest of a run states about render noise, samples, and the error of enlarging."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,21 +14,26 @@ from nir_render.transport.noise import MOST_SAMPLES
 _DIGITS = 6
 
 
-def noise_facts(target_share: float | None, noises: Sequence[RenderNoise]) -> dict[str, Any]:
+def noise_facts(target_share: float | None, by_frame: Mapping[str, RenderNoise]) -> dict[str, Any]:
     """Return the shares of render noise over all frames of a run, and whether the target was reached.
 
-    It is where every frame keeps it, by what the render measured of itself. Null without a target.
+    It is where every frame keeps it, by what the render measured of itself; the others are named, as
+    "r1.front 3". Null without a target.
     """
+    noises = list(by_frame.values())
     medians = [one.median_share for one in noises]
     apertures = [one.aperture_share for one in noises]
-    above = None if target_share is None else sum(not one.keeps(target_share) for one in noises)
+    above = None
+    if target_share is not None:
+        above = [name for name, one in by_frame.items() if not one.keeps(target_share)]
     return {
         "target_share": target_share,
-        "target_reached": None if above is None else above == 0,
+        "target_reached": None if above is None else not above,
         "frames_above_target": above,
         "share_of_temporal_variance": _rounded(np.median(medians)),
         "largest_share": _rounded(max(medians)),
         "mean_share": _rounded(np.mean([one.mean_share for one in noises])),
+        "share_behind_lens": _rounded(np.mean([one.share_behind_lens for one in noises])),
         "share_in_99_percent_of_pixels": _rounded(max(one.share_of_99_percent for one in noises)),
         "largest_share_in_a_pixel": _rounded(max(one.largest_share for one in noises)),
         "share_in_apertures": _rounded(np.median(apertures)),
@@ -42,7 +47,7 @@ def noise_warning(facts: dict[str, Any], frames: int) -> str | None:
         return None
     return (
         f"render.noise: the target of {facts['target_share']:.3g} of temporal variance is not kept in "
-        f"{facts['frames_above_target']} of {frames} frames: render noise reaches "
+        f"{len(facts['frames_above_target'])} of {frames} frames: render noise reaches "
         f"{facts['largest_share']:.3g} in a frame's median pixel, "
         f"{facts['largest_share_in_apertures']:.3g} in a flare; manifest.json says more (render_noise). "
         "More samples than these, fixed by render.indirect.samples, bring it down"

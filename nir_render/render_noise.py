@@ -1,23 +1,27 @@
 """How much noise the Monte Carlo render adds to a frame, beside the sensor's own.
 
 Both are variances in e² per pixel: that of the render as it measured it itself, from batches, and the
-temporal variance of the sensor, shot plus read noise. The lens's blur is left out: it moves render noise to
-neighbours, and by averaging only lowers it. Pixels that saturate count with the shot noise that they would
-have without.
+temporal variance of the sensor, shot plus read noise. The lens's blur is left out where a pixel is spoken of:
+it moves render noise to neighbours, and by averaging only lowers it; `share_behind_lens` has it. Pixels that
+saturate count with the shot noise that they would have without. Sources count as they are driven in the
+frame, over all its rows.
 
 What a render says of itself is its own estimate: paths so rare that no sample found them are not in it.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.apertures import Aperture, aperture_weights
-from nir_render.camera.enlarge import enlarge_variance, without_edges
-from nir_render.camera.exposure import diffuse_electrons
+from nir_render.camera.enlarge import enlarge, enlarge_variance, without_edges
+from nir_render.camera.exposure import blur, diffuse_electrons
+from nir_render.camera.sensor import dark_variance_e2
 from nir_render.expected import Expected, by_spectrum, flare_apertures, fluxes
+from nir_render.randomness import generator
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
 from nir_render.transport.light import Light
@@ -26,6 +30,8 @@ Array = NDArray[np.float64]
 
 _TINY_E2 = 1e-12  # a noiseless sensor in the dark has no noise to compare with
 _NEARLY_ALL = 0.99
+_PIXELS_DRAWN = 2_000_000
+_MOST_DRAWS = 64
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,9 @@ class RenderNoise:
     mean_share
         Sum of the render's variance over that of the sensor's, over the same pixels: what rare paths bring
         is in the mean before it is in the median.
+    share_behind_lens
+        `mean_share` of the frame as the sensor sees it, behind the lens's blur: by so much the variance of
+        frames from independent renders is above that of frames which share one light.
     share_of_99_percent, largest_share
         What 99 % of these pixels keep, and the largest of all.
     aperture_share
@@ -49,6 +58,7 @@ class RenderNoise:
 
     median_share: float = 0.0
     mean_share: float = 0.0
+    share_behind_lens: float = 0.0
     share_of_99_percent: float = 0.0
     largest_share: float = 0.0
     aperture_share: float = 0.0
@@ -64,18 +74,23 @@ def render_noise(mean: Expected, scene: Scene) -> RenderNoise:
     _, camera = scene.camera(mean.light.camera)
     if mean.light.indirect is None:
         return RenderNoise()
-    noise_e2 = render_variance_e2(mean.light, scene, mean.exposure_s)
+    apertures = flare_apertures(mean.light, camera)
+    per_s2 = _variance_per_s2(mean.light, scene, tuple(mean.levels.tolist()))
+    square_s2 = mean.exposure_s**2  # light is linear in the exposure
+    noise_e2 = per_s2.of_pixels_e2 * square_s2
     sensor_e2 = temporal_variance_e2(mean, camera)
     reached = noise_e2 > 0.0
     if not reached.any():
         return RenderNoise()
     share = noise_e2[reached] / sensor_e2[reached]
-    apertures = flare_apertures(mean.light, camera)
-    of_sums_e2 = aperture_variances_e2(mean.light, scene, mean.exposure_s, apertures)
-    of_apertures = [noise / one.sum(sensor_e2) for noise, one in zip(of_sums_e2, apertures, strict=True)]
+    of_apertures = [
+        noise * square_s2 / one.sum(sensor_e2)
+        for noise, one in zip(per_s2.of_apertures_e2, apertures, strict=True)
+    ]
     return RenderNoise(
         median_share=float(np.median(share)),
         mean_share=float(noise_e2[reached].sum() / sensor_e2[reached].sum()),
+        share_behind_lens=per_s2.behind_lens_e2 * square_s2 / float(sensor_e2.mean()),
         share_of_99_percent=float(np.quantile(share, _NEARLY_ALL)),
         largest_share=float(share.max()),
         aperture_share=float(max(of_apertures, default=0.0)),
@@ -83,13 +98,60 @@ def render_noise(mean: Expected, scene: Scene) -> RenderNoise:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Variance:
+    """What rendering adds to an exposure of one second: to each pixel, to apertures, to the mean pixel."""
+
+    of_pixels_e2: Array
+    of_apertures_e2: Array
+    behind_lens_e2: float
+
+
+@lru_cache(maxsize=8)
+def _variance_per_s2(light: Light, scene: Scene, levels: tuple[float, ...]) -> _Variance:
+    _, camera = scene.camera(light.camera)
+    driven = np.array(levels)
+    apertures = flare_apertures(light, camera)
+    return _Variance(
+        of_pixels_e2=render_variance_e2(light, scene, 1.0, driven),
+        of_apertures_e2=aperture_variances_e2(light, scene, 1.0, apertures, driven),
+        behind_lens_e2=variance_behind_lens_e2(light, scene, 1.0, driven),
+    )
+
+
+def variance_behind_lens_e2(light: Light, scene: Scene, exposure_s: float, levels: Array) -> float:
+    """Return the variance that rendering adds to a frame behind the lens's blur, the mean over its pixels.
+
+    Noise of the variance that the render states is drawn, block by block, and goes the way of light: it is
+    enlarged, weighted with the response, blurred. Its mean square has the expectation of that variance,
+    whatever enlarging and blur mix; of 2 million pixels drawn it is off by about 1 %.
+    """
+    _, camera = scene.camera(light.camera)
+    rows, columns = camera.sensor.rows, camera.sensor.columns
+    edges = None if light.indirect is None else light.indirect.edges
+    how = None if edges is None else edges.enlargement
+    draws = int(np.clip(np.ceil(_PIXELS_DRAWN / (rows * columns)), 1, _MOST_DRAWS))
+    random = generator(light.seed, "render_noise", light.camera, 0)
+    total_e2 = 0.0
+    for _ in range(draws):
+        noise_e = np.zeros((rows, columns))
+        for factor, variance, patch in _variances(light, scene, exposure_s, levels):
+            of_blocks = np.sqrt(variance) * random.standard_normal(variance.shape)
+            of_patch = None if patch is None else np.sqrt(patch) * random.standard_normal(patch.shape)
+            noise_e += factor * enlarge(of_blocks, rows, columns, how, of_patch)
+        total_e2 += float((blur(camera, noise_e) ** 2).mean())
+    return total_e2 / draws
+
+
 def temporal_variance_e2(mean: Expected, camera: Camera) -> Array:
-    """Return the sensor's shot and read variance per pixel, shape (rows, columns)."""
-    return mean.electrons + camera.sensor.read_noise_e**2 + _TINY_E2
+    """Return the sensor's shot and dark variance per pixel, shape (rows, columns)."""
+    return mean.electrons + dark_variance_e2(camera.sensor, mean.exposure_s) + _TINY_E2
 
 
-def render_variance_e2(light: Light, scene: Scene, exposure_s: float) -> Array:
+def render_variance_e2(light: Light, scene: Scene, exposure_s: float, levels: Array | None = None) -> Array:
     """Return the variance per pixel that rendering adds, the blur's averaging left out, (rows, columns).
+
+    `levels` is what a frame collects of each group, relative to full drive, shape (groups,); None: all.
 
     All groups share one pass. Each time a path asks for light it asks for that of one group, and the others
     get nothing: their covariances are about zero, or slightly below. Variances are added: the variance of the
@@ -100,15 +162,22 @@ def render_variance_e2(light: Light, scene: Scene, exposure_s: float) -> Array:
     total = np.zeros((rows, columns))
     edges = None if light.indirect is None else light.indirect.edges
     how = None if edges is None else edges.enlargement
-    for factor, variance, patch in _variances(light, scene, exposure_s):
+    for factor, variance, patch in _variances(light, scene, exposure_s, levels):
         total += factor**2 * enlarge_variance(variance, rows, columns, how, patch)
     return total
 
 
-def aperture_variances_e2(light: Light, scene: Scene, exposure_s: float, apertures: list[Aperture]) -> Array:
+def aperture_variances_e2(
+    light: Light,
+    scene: Scene,
+    exposure_s: float,
+    apertures: list[Aperture],
+    levels: Array | None = None,
+) -> Array:
     """Return the variance that rendering adds to the sum over each aperture, shape (apertures,).
 
-    Pixels of one block share its noise: `aperture_weights` says how much of it comes into the sum.
+    Pixels of one block share its noise: `aperture_weights` says how much of it comes into the sum. `levels`
+    is that of `render_variance_e2`.
     """
     _, camera = scene.camera(light.camera)
     total = np.zeros(len(apertures))
@@ -116,7 +185,7 @@ def aperture_variances_e2(light: Light, scene: Scene, exposure_s: float, apertur
         return total
     edges = light.indirect.edges
     how = without_edges(camera.sensor.rows, camera.sensor.columns) if edges is None else edges.enlargement
-    for factor, variance, patch in _variances(light, scene, exposure_s):
+    for factor, variance, patch in _variances(light, scene, exposure_s, levels):
         of_blocks, of_patch = aperture_weights(apertures, factor, light.indirect.scale, how)
         total += of_blocks.multiply(of_blocks) @ variance.ravel()
         if patch is not None:
@@ -124,12 +193,15 @@ def aperture_variances_e2(light: Light, scene: Scene, exposure_s: float, apertur
     return total
 
 
-def _variances(light: Light, scene: Scene, exposure_s: float) -> list[tuple[Array, Array, Array | None]]:
+def _variances(
+    light: Light, scene: Scene, exposure_s: float, levels: Array | None
+) -> list[tuple[Array, Array, Array | None]]:
     """Return, by spectrum, electrons per radiance (rows, columns), variances of blocks and of the patch."""
     if light.indirect is None:
         return []
     _, camera = scene.camera(light.camera)
-    even, squares = np.ones((camera.sensor.rows, camera.sensor.columns)), fluxes(light, scene) ** 2
+    even = np.ones((camera.sensor.rows, camera.sensor.columns))
+    squares = (fluxes(light, scene) * (1.0 if levels is None else levels)) ** 2
     edges = light.indirect.edges
     parts = by_spectrum(light, scene, light.indirect.variance, squares)
     patches = [] if edges is None else by_spectrum(light, scene, edges.variance, squares)

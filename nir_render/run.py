@@ -16,6 +16,7 @@ from nir_render.evaluate.lamps import lamp_outlines_px
 from nir_render.evaluate.metrics import Evaluation, FrameKey, evaluate
 from nir_render.evaluate.truth import SourceTruth, parse_truth
 from nir_render.noise_facts import enlarging_facts, noise_facts, noise_warning, sample_facts
+from nir_render.render_noise import RenderNoise
 from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene, load_scene
 from nir_render.simulate import simulate
@@ -74,7 +75,8 @@ def render_run(
     total = scene.document.clock.frames * len(cameras)
     calibrations = {name: scene.calibration(name) for name in cameras}
     with run_folder.new_run_folder(folder, overwrite) as aside:
-        records, truth, noises = [], [], []
+        records, truth = [], []
+        noises: dict[str, RenderNoise] = {}
         sampled: dict[str, dict[str, Any]] = {}
         enlarged: dict[str, dict[str, Any]] = {}
         cache = LightCache() if cache is None else cache
@@ -85,7 +87,7 @@ def render_run(
             run_folder.write_file(aside / file, encode_png16(shot.frame.data_dn))
             records.append(frame_record(shot.frame, file))
             truth += [row.record() for row in shot.truth]
-            noises.append(shot.noise)
+            noises[f"{shot.frame.camera} {shot.frame.index}"] = shot.noise
             if shot.frame.camera not in enlarged:
                 enlarged[shot.frame.camera] = enlarging_facts(scene, shot)
                 if shot.light.indirect is not None:

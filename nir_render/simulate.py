@@ -5,24 +5,23 @@ Light is rendered once for a geometry; exposing it is arithmetic.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
-import numpy as np
-
-from nir_render.camera.exposure_control import next_exposure_s
+from nir_render.camera.exposure_control import ExposureState, first_state, next_state, own_setting
 from nir_render.camera.sensor import read_out
+from nir_render.camera.shutter import mid_exposure_s, row_delay_s
 from nir_render.errors import InputError
 from nir_render.evaluate.truth import SourceTruth, truth_of
-from nir_render.expected import Expected, expected
-from nir_render.randomness import generator
+from nir_render.expected import Expected, Rates, exposed, rates
+from nir_render.randomness import FrameKey
 from nir_render.render_noise import RenderNoise, render_noise
-from nir_render.scene.devices import Camera
-from nir_render.scene.exposure import AutoExposure
+from nir_render.scene.exposure import MOST_GAIN, AutoExposure
 from nir_render.scene.load import Scene
 from nir_render.transport.cache import LightCache
 from nir_render.transport.light import Light
 from perception.types import RawFrame
 
-_SETTLING_FRAMES = 8  # steps of at most 4: enough for a factor of 65 000
+_SETTLING_STEPS = 8  # of at most 4: enough for a factor of 65 000
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,68 +57,112 @@ def render(
 
 
 def expose(
-    light: Light, scene: Scene, exposure_s: float | None = None, seed: int | None = None, index: int = 0
+    light: Light,
+    scene: Scene,
+    exposure_s: float | None = None,
+    seed: int | None = None,
+    index: int = 0,
+    gain: float | None = None,
+    time_s: float | None = None,
 ) -> RawFrame:
     """Return the raw frame that a camera takes of a light, its noise keyed by (seed, camera, index).
 
-    The light's time is mid-exposure; the frame's `time_s` the start of the exposure. `exposure_s` replaces
-    the camera's own exposure, `seed` the one that the light was rendered with.
+    One light can be exposed many times while its sources blink; the first time takes longest.
+
+    Parameters
+    ----------
+    exposure_s, gain
+        In place of the camera's own; of a bracket that is the exposure whose turn it is by `index`.
+    seed
+        In place of the one that the light was rendered with.
+    time_s
+        When row 0 begins its exposure; without it the light's time is mid-exposure, of the middle row.
+
+    Raises
+    ------
+    InputError
+        An exposure that is not positive, a gain outside 1 to 64.
     """
     _, camera = scene.camera(light.camera)
+    own = own_setting(camera, index)
     seed = light.seed if seed is None else seed
-    exposure_s = camera.exposure_s if exposure_s is None else exposure_s
-    return _frame(expected(light, scene, exposure_s), scene, seed, index)
+    mean = exposed(_last_rates(light, scene), own.exposure_s if exposure_s is None else exposure_s, time_s)
+    return _frame(mean, own.gain if gain is None else gain, FrameKey(seed, "read_out", light.camera, index))
 
 
 def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = None) -> Iterator[Shot]:
     """Yield frames with their truth: for each time of the clock, each observing camera.
 
     `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
-    Light is rendered only where geometry is new; `cache` keeps it beyond this run.
+    Geometry stands still within a frame, as it is at mid-exposure of its middle row. Light is rendered only
+    where geometry is new; `cache` keeps it beyond this run.
     """
     run_seed = scene.document.seed if seed is None else seed
     cache = LightCache() if cache is None else cache
-    exposures_s: dict[str, float] = {}
+    kept: dict[str, Rates] = {}
+    states: dict[str, ExposureState] = {}
     for index, time_s in enumerate(scene.document.frame_times_s()):
         for name in scene.cameras():
             _, camera = scene.camera(name)
-            control = camera.auto_exposure
-            if name not in exposures_s and control is not None:
-                light = render(scene, name, time_s, run_seed, cache)
-                exposures_s[name] = _settled_exposure(scene, light, camera, control, run_seed)
-            exposure_s = exposures_s.setdefault(name, camera.exposure_s)
-            light = render(scene, name, time_s + 0.5 * exposure_s, run_seed, cache)
-            mean = expected(light, scene, exposure_s)
-            frame = _frame(mean, scene, run_seed, index)
+            control, setting = camera.auto_exposure, own_setting(camera, index)
+            if control is not None:
+                if name not in states:
+                    light = render(scene, name, time_s, run_seed, cache)
+                    kept[name] = _rates(light, scene, kept.get(name))
+                    states[name] = _settled(kept[name], control, time_s, run_seed)
+                setting = states[name].upcoming[0]
+            middle_s = time_s + mid_exposure_s(camera, setting.exposure_s)
+            light = render(scene, name, middle_s, run_seed, cache)
+            kept[name] = _rates(light, scene, kept.get(name))
+            mean = exposed(kept[name], setting.exposure_s, time_s)
+            frame = _frame(mean, setting.gain, FrameKey(run_seed, "read_out", name, index))
             truth = tuple(truth_of(scene, mean, frame))
             yield Shot(frame, light, truth, mean, render_noise(mean, scene))
             if control is not None:
-                exposures_s[name] = next_exposure_s(control, camera.sensor, frame.data_dn, exposure_s)
+                states[name] = next_state(states[name], control, camera, frame)
 
 
-def _settled_exposure(scene: Scene, light: Light, camera: Camera, control: AutoExposure, seed: int) -> float:
-    """Return the exposure that a camera has found before its first frame, by frames that are not kept."""
-    exposure_s = camera.exposure_s
-    mean = expected(light, scene, exposure_s)
-    for frame in range(_SETTLING_FRAMES):
-        electrons = mean.electrons * (exposure_s / mean.exposure_s)  # light is linear in the exposure
-        random = generator(seed, "settling", light.camera, frame)
-        exposure_s = next_exposure_s(
-            control, camera.sensor, read_out(electrons, camera.sensor, random), exposure_s
-        )
-    return exposure_s
+@lru_cache(maxsize=1)
+def _last_rates(light: Light, scene: Scene) -> Rates:
+    """Return the rates of a light, and keep them for its next exposure."""
+    return rates(light, scene)
 
 
-def _frame(mean: Expected, scene: Scene, seed: int, index: int) -> RawFrame:
-    name = mean.light.camera
-    _, camera = scene.camera(name)
-    if not np.isfinite(mean.electrons).all():
-        raise InputError(f"{scene.path}: the light of {name} is not finite; a body or source is degenerate")
+def _rates(light: Light, scene: Scene, kept: Rates | None) -> Rates:
+    """Return the rates of a light: those that are kept where it is the same one."""
+    if kept is None or kept.light.indirect is not light.indirect or kept.light.direct is not light.direct:
+        return rates(light, scene)
+    return kept
+
+
+def _settled(of_light: Rates, control: AutoExposure, time_s: float, seed: int) -> ExposureState:
+    """Return what a camera has found before its first frame, by frames that are not kept.
+
+    They come at the clock's pace right before that frame, with the geometry as it is then.
+    """
+    camera, name = of_light.camera, of_light.light.camera
+    period_s = 1.0 / of_light.scene.document.clock.frame_rate_hz
+    state = first_state(camera, control)
+    frames = _SETTLING_STEPS * control.latency
+    for number in range(frames):
+        setting = state.upcoming[0]
+        mean = exposed(of_light, setting.exposure_s, time_s + (number - frames) * period_s)
+        frame = _frame(mean, setting.gain, FrameKey(seed, "settling", name, number))
+        state = next_state(state, control, camera, frame)
+    return state
+
+
+def _frame(mean: Expected, gain: float, key: FrameKey) -> RawFrame:
+    if not 1.0 <= gain <= MOST_GAIN:
+        raise InputError(f"gain is {gain!r}; wanted a factor from 1 to {MOST_GAIN:g} on the system gain")
+    camera = mean.rates.camera
     return RawFrame(
-        camera=name,
-        index=index,
-        time_s=mean.light.time_s - 0.5 * mean.exposure_s,
+        camera=key.camera,
+        index=key.frame,
+        time_s=mean.time_s,
         exposure_s=mean.exposure_s,
-        data_dn=read_out(mean.electrons, camera.sensor, generator(seed, "read_out", name, index)),
+        data_dn=read_out(mean.electrons, camera, mean.exposure_s, key, gain),
         black_level_dn=camera.sensor.black_level_dn,
+        line_time_s=row_delay_s(camera),
+        gain=gain,
     )

@@ -58,7 +58,8 @@ def upsampling_error(
     where the electrons of the blocks that a pixel is made of differ, and where they change other than
     linearly (Hansen and Hurwitz: each square counts by one over its pixel's probability). Pixels that the
     light holds one by one are right. All is rendered twice, and the square of an error is the product of two
-    differences that are independent of each other: noise has the expectation 0.
+    differences that are independent of each other: noise has the expectation 0. Sources count as they are
+    driven in the frame.
 
     Parameters
     ----------
@@ -83,6 +84,9 @@ def upsampling_error(
         return "edges are not known without LLVM"
     if camera.sensor.read_noise_e == 0.0 and not mean.electrons.any():
         return "a dark frame of a sensor without noise"
+    flux = fluxes(light, scene) * mean.levels
+    if not flux.any():
+        return "nothing shines in the frame"
     blocks = indirect.radiance_per_w[0, 0].size
     if pixels is None:
         pixels = int(np.clip(_PIXELS_PER_BLOCK * blocks, _LEAST_PIXELS, _MOST_PIXELS))
@@ -90,10 +94,10 @@ def upsampling_error(
         samples = 2 ** int(np.ceil(np.log2(_SAMPLES_FACTOR * indirect.samples)))
         samples = int(np.clip(samples, _LEAST_SAMPLES, _MOST_SAMPLES))
     how = indirect.edges.enlargement
-    chance = _chances(mean, scene, how)
+    chance = _chances(mean, scene, flux, how)
     drawn = _drawn(chance, pixels, generator(light.seed, "upsampling", light.camera, 0))
     chosen, times = np.unique(drawn, return_counts=True)
-    square_e2 = _squares(light, indirect.scale, how, scene, mean.exposure_s, chosen, samples)
+    square_e2 = _squares(light, indirect.scale, how, scene, flux, mean.exposure_s, chosen, samples)
     each = np.repeat(square_e2 / (chance[chosen] * len(chance)), times) / float(sensor_e2.mean())
     return UpsamplingError(
         share=float(each.mean()),
@@ -104,14 +108,14 @@ def upsampling_error(
     )
 
 
-def _chances(mean: Expected, scene: Scene, how: Enlargement) -> Array:
+def _chances(mean: Expected, scene: Scene, flux: Array, how: Enlargement) -> Array:
     """Return the probability with which each pixel is drawn, those of the patch never, shape (n,)."""
     light = mean.light
     assert light.indirect is not None  # noqa: S101
     _, camera = scene.camera(light.camera)
     blocks_e = np.zeros(light.indirect.radiance_per_w.shape[2:])
     even = np.ones((how.rows, how.columns))
-    for emitter, radiance in by_spectrum(light, scene, light.indirect.radiance_per_w, fluxes(light, scene)):
+    for emitter, radiance in by_spectrum(light, scene, light.indirect.radiance_per_w, flux):
         per_radiance = diffuse_electrons(camera, even, emitter, mean.exposure_s)
         size = blocks_e.shape[::-1]
         blocks_e += radiance * cv2.resize(per_radiance, size, interpolation=cv2.INTER_AREA)
@@ -160,6 +164,7 @@ def _squares(
     scale: int,
     how: Enlargement,
     scene: Scene,
+    flux: Array,
     exposure_s: float,
     pixels: Numbers,
     samples: int,
@@ -177,7 +182,7 @@ def _squares(
     rays, power = rays_of(camera, camera_pose(robot, camera, light.time_s)), group_power(scene, camera)
     wanted = {1: pixels, scale: used}
     renders = rendered_again(scene, rays, light.time_s, light.seed, power, wanted, samples)
-    flux, image = fluxes(light, scene), np.ones((sensor.rows, sensor.columns))
+    image = np.ones((sensor.rows, sensor.columns))
     square_e2 = np.ones(len(pixels))
     for radiance_per_w in renders:
         error_e = np.zeros(len(pixels))

@@ -1,8 +1,9 @@
-"""From a pixel to a direction: through the rectilinear lens, then from camera axes to body axes."""
+"""From a pixel to a direction: through the lens, then from camera axes to body axes."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from perception.lens import unproject
 from perception.types import Calibration
 
 
@@ -20,7 +21,7 @@ def direction_camera(points_px: ArrayLike, calibration: Calibration) -> NDArray[
 
     Returns
     -------
-    Unit vectors, shape (n, 3).
+    Unit vectors, shape (n, 3); NaN beyond a fisheye's image circle.
 
     Raises
     ------
@@ -30,14 +31,7 @@ def direction_camera(points_px: ArrayLike, calibration: Calibration) -> NDArray[
     points = np.asarray(points_px, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"points_px must have shape (n, 2), not {points.shape}")
-    rays = np.column_stack(
-        [
-            (points[:, 0] - calibration.cx_px) / calibration.fx_px,
-            (points[:, 1] - calibration.cy_px) / calibration.fy_px,
-            np.ones(len(points)),
-        ]
-    )
-    return _normalised(rays)
+    return unproject(points, calibration)
 
 
 def field_angle_rad(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:

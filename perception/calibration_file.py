@@ -2,7 +2,8 @@
 
 {"format": 1, "cameras": {name: {...}}}. Fields are named as in `Calibration`, but for the pose, which stands
 as `quaternion_body_camera_xyzw` and `position_body_m`. An entry whose standard deviation is known is written
-as {"value": v, "sigma": s}; that of the quaternion is an angle in radians.
+as {"value": v, "sigma": s}; that of the quaternion is an angle in radians. `lens_model` and `distortion` may
+be missing: the lens is then rectilinear; `dsnu_e` and `prnu` too: they are then 0.
 """
 
 import math
@@ -22,6 +23,7 @@ from perception.json_fields import (
     number_or_nan,
     numbers,
 )
+from perception.lens import COEFFICIENTS
 from perception.types import Calibration
 
 _WHOLE = ("width_px", "height_px", "saturation_dn", "bit_depth")
@@ -36,7 +38,7 @@ _REAL = (
     "source_radius_m",
 )
 _QUATERNION = "quaternion_body_camera_xyzw"
-_LISTS = (_QUATERNION, "position_body_m", "response_angle_rad", "response_relative")
+_LISTS = (_QUATERNION, "position_body_m", "response_angle_rad", "response_relative", "distortion")
 
 
 def calibration_document(calibrations: Iterable[Calibration]) -> dict[str, Any]:
@@ -77,6 +79,9 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     record[_QUATERNION] = Rotation.from_matrix(matrix).as_quat(canonical=True).tolist()
     for name in ("position_body_m", "response_angle_rad", "response_relative"):
         record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
+    record["dsnu_e"], record["prnu"] = calibration.dsnu_e, calibration.prnu
+    record["lens_model"] = calibration.lens_model
+    record["distortion"] = [float(number) for number in calibration.distortion]
     for field, sigma in calibration.sigma.items():
         name = _QUATERNION if field == "rotation_body_camera" else field
         if name not in record:
@@ -126,9 +131,12 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
     if angles[0] != 0.0 or np.any(np.diff(angles) <= 0.0):
         raise place.error("does not increase from 0", "Sort the angles, the first is 0", "response_angle_rad")
     response = np.array(numbers(values, "response_relative", place, len(angles)))
-    for field in ("read_noise_e", "source_radius_m"):
+    values = {"dsnu_e": 0.0, "prnu": 0.0, **values}
+    for field in ("read_noise_e", "source_radius_m", "dsnu_e", "prnu"):
         if number(values, field, place) < 0.0:
             raise place.error(f"is {values[field]!r}", "Write a number, 0 or more", field)
+
+    lens_model, distortion = _lens(values, place)
 
     def whole(field: str) -> int:
         return integer(values, field, place)
@@ -159,7 +167,24 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
         source_radius_m=real("source_radius_m"),
         wavelength_m=real("wavelength_m"),
         sigma=sigma,
+        lens_model=lens_model,
+        dsnu_e=real("dsnu_e"),
+        prnu=real("prnu"),
+        distortion=distortion,
     )
+
+
+def _lens(values: Mapping[str, Any], place: Place) -> tuple[str, tuple[float, ...]]:
+    """Return lens model and coefficients; without, rectilinear."""
+    model = values.get("lens_model", "rectilinear")
+    if model not in COEFFICIENTS:
+        raise place.error(f"is {model!r}", f"Known are {', '.join(COEFFICIENTS)}", "lens_model")
+    distortion = values.get("distortion", [])
+    if not isinstance(distortion, list) or len(distortion) not in COEFFICIENTS[model]:
+        wanted = " or ".join(str(count) for count in COEFFICIENTS[model])
+        problem = f"is {distortion!r}"
+        raise place.error(problem, f"A {model} lens takes {wanted} numbers in OpenCV's order", "distortion")
+    return model, tuple(numbers(values, "distortion", place)) if distortion else ()
 
 
 def _split_sigmas(record: Mapping[str, Any], place: Place) -> tuple[dict[str, Any], dict[str, float]]:

@@ -12,7 +12,7 @@ from perception.measurement import Measurement, is_extended, measure
 from perception.photometry import grey_levels_paper
 from perception.preparation import PreparedFrame, prepare
 from perception.ranging import range_paper_m
-from perception.sensor import check_frame, gain_dn_per_e
+from perception.sensor import check_frame, gain_dn_per_e, saturation_dn
 from perception.types import Calibration, Detection, RawFrame
 
 PAPER_MIN_AREA_PX = 5
@@ -57,6 +57,7 @@ def detect_paper(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     check_frame(frame, calibration)
     data = frame.data_dn
     lit = data > 2.0 * float(data.mean(dtype=np.float64))
+    clipped_dn = saturation_dn(calibration, frame.gain)
     found = []
     for blob in components(lit, PAPER_MIN_AREA_PX):
         aspect = blob.box.width / blob.box.height
@@ -78,7 +79,7 @@ def detect_paper(frame: RawFrame, calibration: Calibration) -> list[Detection]:
                 mean_dn=grey.mean_dn,
                 background_dn=grey.background_dn,
                 area_px=blob.area_px,
-                saturated=bool(np.any(data[blob.box.slices][blob.pixels] >= calibration.saturation_dn)),
+                saturated=bool(np.any(data[blob.box.slices][blob.pixels] >= clipped_dn)),
                 merged=False,
                 ghost=False,
                 range_m=range_paper_m(grey.mean_dn, grey.background_dn, frame.exposure_s, calibration),

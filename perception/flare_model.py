@@ -1,4 +1,4 @@
-"""The expected image of a source: a uniform sphere, seen through a rectilinear lens and a Gaussian PSF.
+"""The expected image of a source: a uniform sphere, seen through a lens and a Gaussian PSF.
 
 A sphere of radius r at distance d fills the cap of directions within asin(r / d) of its centre, at uniform
 radiance. Each direction ω of the cap gives light in proportion to cos θ · response(θ) · dΩ, θ the field
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from perception.bearing import direction_camera
+from perception.lens import project, stretch
 from perception.types import Calibration
 
 # Quadrature nodes per ratio of image radius to smoothing: the smallest numbers, found by comparison with
@@ -70,10 +71,15 @@ class FlareImage:
 def image_radius_px(u_px: float, v_px: float, angular_radius_rad: float, calibration: Calibration) -> float:
     """Larger half axis of a sphere's image before the PSF, to first order in the angular radius.
 
-    f · ρ / cos² θ: a rectilinear lens stretches radially by 1 / cos² θ.
+    f · ρ / cos² θ for a rectilinear lens, which stretches radially by 1 / cos² θ.
     """
-    cos_theta = float(direction_camera([[u_px, v_px]], calibration)[0, 2])
-    return max(calibration.fx_px, calibration.fy_px) * math.tan(angular_radius_rad) / cos_theta**2
+    direction = direction_camera([[u_px, v_px]], calibration)[0]
+    return stretch(direction, calibration) * math.tan(angular_radius_rad)
+
+
+def has_image(u_px: float, v_px: float, angular_radius_rad: float, calibration: Calibration) -> bool:
+    """Tell whether a sphere lies within 90° of the axis, and so has an image."""
+    return _in_front(direction_camera([[u_px, v_px]], calibration)[0], angular_radius_rad)
 
 
 def flare_image(
@@ -86,9 +92,10 @@ def flare_image(
     functions). The number of nodes follows the ratio of image radius to PSF width; the error stays below
     1e-4 of the brightest pixel (usually 1e-6).
 
-    With a flat response the flux centroid is exactly the projection of the sphere's centre, because
-    ∫ cos θ (ω_x / ω_z) dΩ = ∫ ω_x dΩ; the image itself is an ellipse whose middle lies elsewhere. Beyond the
-    last angle of its table the response is held: the edge of a cap may reach beyond the image's corner.
+    With a flat response and a rectilinear lens the flux centroid is exactly the projection of the sphere's
+    centre, because ∫ cos θ (ω_x / ω_z) dΩ = ∫ ω_x dΩ; the image itself is an ellipse whose middle lies
+    elsewhere. Beyond the last angle of its table the response is held: the edge of a cap may reach beyond the
+    image's corner.
 
     Parameters
     ----------
@@ -128,11 +135,10 @@ def _cap_nodes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Image positions and weights (sum 1) of quadrature nodes over the cap, shape (nodes,) each."""
     centre = direction_camera([[u_px, v_px]], calibration)[0]
-    off_axis = math.acos(min(1.0, float(centre[2])))
-    if not angular_radius_rad >= 0.0 or not off_axis + angular_radius_rad < 0.5 * math.pi:
+    if not angular_radius_rad >= 0.0 or not _in_front(centre, angular_radius_rad):
         raise ValueError(
-            f"a sphere of angular radius {angular_radius_rad} rad at {off_axis:.3f} rad from the axis "
-            "has no rectilinear image; the radius must be ≥ 0 and the sphere within 90° of the axis"
+            f"a sphere of angular radius {angular_radius_rad} rad at the pixel ({u_px:.1f}, {v_px:.1f}) "
+            "has no image; the radius must be ≥ 0 and the sphere within 90° of the axis"
         )
     # The pixel smooths like a box of variance 1/12 px², on top of the PSF.
     smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
@@ -160,9 +166,13 @@ def _cap_nodes(
     theta = np.arctan2(np.hypot(omega[:, 0], omega[:, 1]), omega[:, 2])
     response = np.interp(theta, calibration.response_angle_rad, calibration.response_relative)
     weight = ring_weight[ring] / around[ring] * omega[:, 2] * response  # cos θ · response(θ) · dΩ
-    x_px = calibration.cx_px + calibration.fx_px * omega[:, 0] / omega[:, 2]
-    y_px = calibration.cy_px + calibration.fy_px * omega[:, 1] / omega[:, 2]
+    x_px, y_px = project(omega, calibration).T
     return x_px, y_px, weight / weight.sum()
+
+
+def _in_front(centre: NDArray[np.float64], angular_radius_rad: float) -> bool:
+    """Tell whether a cap lies within 90° of the axis; one whose middle has no direction (NaN) does not."""
+    return math.acos(float(np.clip(centre[2], -1.0, 1.0))) + angular_radius_rad < 0.5 * math.pi
 
 
 def _tangents(direction: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

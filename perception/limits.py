@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.flare_model import FlareImage, Window, flare_image, image_radius_px
+from perception.flare_model import FlareImage, Window, flare_image, has_image, image_radius_px
 from perception.ranging import angular_radius_rad
-from perception.sensor import clip_level_e, noise_floor_e2
+from perception.sensor import clip_level_e, noise_floor_e2, pixel_variance_e2
 from perception.types import Calibration
 
 WIDE_PX = 64.0
@@ -82,7 +82,9 @@ def _wide_limit(
     pixels = math.pi * (calibration.fx_px * math.tan(min(angular_radius, 1.5))) ** 2
     if flux_e / pixels + background_e >= clip_level_e(calibration, calibration.black_level_dn):
         return FlareLimit(math.nan, math.nan, math.inf, math.inf)
-    flux_sigma = math.sqrt(flux_e + pixels * (max(background_e, 0.0) + noise_floor_e2(calibration)))
+    lit_e = np.array(flux_e / pixels + max(background_e, 0.0))
+    of_pixel_e2 = pixel_variance_e2(lit_e, noise_floor_e2(calibration), calibration.prnu)
+    flux_sigma = math.sqrt(pixels * float(of_pixel_e2))
     return FlareLimit(math.nan, math.nan, flux_sigma, 0.5 * range_m * flux_sigma / flux_e)
 
 
@@ -130,6 +132,8 @@ def flare_limit(
     angular_radius = angular_radius_rad(range_m, calibration.source_radius_m)
     if image_radius_px(u_px, v_px, angular_radius, calibration) > WIDE_PX:
         return _wide_limit(calibration, range_m, flux_e, background_e, angular_radius)
+    if not has_image(u_px, v_px, angular_radius, calibration):
+        return FlareLimit(math.inf, math.inf, math.inf, math.inf)
     # Beyond 8 σ the pixels tell about the background only, and a ring that wide tells it well enough.
     half_px = image_radius_px(u_px, v_px, angular_radius, calibration) + 8.0 * calibration.psf_sigma_px + 8.0
     window = Window.around(u_px, v_px, half_px, calibration)
@@ -138,7 +142,7 @@ def flare_limit(
     used = np.ones(expected_e.shape, dtype=bool)
     if clipped_tell_nothing:
         used = expected_e < clip_level_e(calibration, calibration.black_level_dn)
-    variance_e2 = np.maximum(expected_e, 0.0) + noise_floor_e2(calibration)
+    variance_e2 = pixel_variance_e2(expected_e, noise_floor_e2(calibration), calibration.prnu)
     information = fisher_information(flare_jacobian(image, flux_e)[:, used], variance_e2[used])
     inverse = covariance(information)
     if inverse is None:

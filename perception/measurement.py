@@ -12,7 +12,7 @@ from perception.flare_model import Window, image_radius_px
 from perception.photometry import aperture_flux, core_goodness
 from perception.preparation import PreparedFrame
 from perception.ranging import angular_radius_rad, range_from_flux
-from perception.sensor import clip_level_e, gain_dn_per_e
+from perception.sensor import clip_level_e, gain_dn_per_e, saturation_dn
 from perception.source_fit import SourceFit, fit_source
 
 MODEL_ERROR = 0.05
@@ -260,7 +260,8 @@ def _others(blob: Blob, prepared: PreparedFrame, window: Window) -> NDArray[np.b
 
 
 def _clipped(prepared: PreparedFrame, window: Window) -> NDArray[np.bool_]:
-    return np.asarray(prepared.frame.data_dn[window.slices] >= prepared.calibration.saturation_dn)
+    clipped_dn = saturation_dn(prepared.calibration, prepared.frame.gain)
+    return np.asarray(prepared.frame.data_dn[window.slices] >= clipped_dn)
 
 
 def _grown(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:

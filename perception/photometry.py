@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from perception.flare_model import FlareImage, Window, flare_image
+from perception.flare_model import Window, flare_image, has_image
 from perception.limits import covariance, fisher_information, flare_jacobian
-from perception.sensor import noise_floor_e2
+from perception.sensor import noise_floor_e2, pixel_variance_e2
 from perception.types import Calibration
 
 # Free choices where the paper says "sampled from the immediate vicinity": a ring of 3 px about the bounding
@@ -189,9 +189,10 @@ def fit_flare(
 ) -> FlareFit:
     """Fit place, flux and background of a flare of known size, by Fisher scoring.
 
-    Maximises the shifted Poisson likelihood, x + σ² ~ Poisson(λ + σ²) with λ = F·S(u, v) + B and σ² the read
-    noise and rounding (Snyder et al., J. Opt. Soc. Am. A 12, 272, 1995), whose score is
-    Σ ∂λ (x - λ)/(λ + σ²). The variance comes from the model, not from the data: weights from the data
+    Maximises the shifted Poisson likelihood, x + σ² ~ Poisson(λ + σ²) with λ = F·S(u, v) + B and σ² the
+    variance of a dark pixel (Snyder et al., J. Opt. Soc. Am. A 12, 272, 1995), whose score is
+    Σ ∂λ (x - λ)/(λ + σ²). The spread of the pixels' responses adds (PRNU λ)² to each pixel's variance. That
+    comes from the model, not from the data: weights from the data
     would favour pixels that came out low and bias the flux.
 
     Parameters
@@ -234,9 +235,14 @@ def fit_flare(
     u, v, flux, background = start
     converged = False
     inverse: NDArray[np.float64] | None = None
+    expected = np.full(shape, background)
+    variance = pixel_variance_e2(expected, floor_e2, calibration.prnu)
     for _ in range(_MAX_STEPS):
+        if not has_image(u, v, angular_radius_rad, calibration):
+            break
         image = flare_image(u, v, angular_radius_rad, window, calibration)
-        expected, variance = _mean_and_variance(image, flux, background, floor_e2)
+        expected = flux * image.fraction + background
+        variance = pixel_variance_e2(expected, floor_e2, calibration.prnu)
         jacobian = flare_jacobian(image, flux)[:, usable]
         inverse = covariance(fisher_information(jacobian, variance[usable]))
         if inverse is None:
@@ -266,14 +272,6 @@ def fit_flare(
         used=usable,
         converged=converged,
     )
-
-
-def _mean_and_variance(
-    image: FlareImage, flux_e: float, background_e: float, floor_e2: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    expected = flux_e * image.fraction + background_e
-    # A background below black level (an offset that drifted) has no negative shot noise.
-    return expected, np.maximum(expected, 0.0) + floor_e2
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from perception.limits import flare_limit
 from perception.pipeline import detect
 from perception.rail_result import SETTLED, HeldOut, RailCalibration
 from perception.ranging import effective_exposure_s
+from perception.sensor import at_gain
 from perception.types import Calibration, Detection, RawFrame
 
 LEAST_PLACES = 6
@@ -237,20 +238,20 @@ def _judge(seen: Sequence[_Sighting]) -> HeldOut:
 
 def _limit_m(sighting: _Sighting, found: Detection, calibration: Calibration) -> float:
     """Return the Cramér–Rao σ of the range, from the known range and the background found."""
-    # `flare_limit` knows no gain: a frame at another gain is one of a camera with that system gain.
-    system_gain_dn_per_e = calibration.system_gain_dn_per_e * sighting.gain
+    # `flare_limit` knows no gain: a frame at another gain is one of a camera that has it for good.
+    same_camera = at_gain(calibration, sighting.gain)
     effective_s = effective_exposure_s(
         found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration
     )
     flux_dn = calibration.range_constant_dn_m2_per_s * effective_s / sighting.range_m**2
     background_dn = max(found.background_dn - sighting.black_level_dn, 0.0)
     limit = flare_limit(
-        replace(calibration, system_gain_dn_per_e=system_gain_dn_per_e),
+        same_camera,
         found.u_px,
         found.v_px,
         sighting.range_m,
-        flux_dn / system_gain_dn_per_e,
-        background_dn / system_gain_dn_per_e,
+        flux_dn / same_camera.system_gain_dn_per_e,
+        background_dn / same_camera.system_gain_dn_per_e,
     )
     return limit.range_sigma_m
 

@@ -1,5 +1,8 @@
 """From counts to electrons, and what the sensor adds on the way (EMVA 1288 linear model)."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,20 +49,57 @@ def electrons(frame: RawFrame, calibration: Calibration) -> NDArray[np.float32]:
 
 
 def noise_floor_e2(calibration: Calibration, gain: float = 1.0) -> float:
-    """Variance of a dark pixel, in electrons squared: read noise and rounding to whole counts.
+    """Variance of a dark pixel, in electrons squared: read noise, fixed offsets, rounding to whole counts.
 
-    σ_d² + 1 / (12 K²), EMVA 1288 release 4.0 (linear model), K the system gain in DN/e.
+    σ_d² + DSNU² + 1 / (12 K²), EMVA 1288 release 4.0 (linear model), K the system gain in DN/e.
 
     Parameters
     ----------
     calibration
-        Read noise and system gain.
+        Read noise, DSNU and system gain.
     gain
         Factor on the calibrated system gain.
     """
-    return calibration.read_noise_e**2 + 1.0 / (12.0 * (calibration.system_gain_dn_per_e * gain) ** 2)
+    rounding_e2 = 1.0 / (12.0 * (calibration.system_gain_dn_per_e * gain) ** 2)
+    return calibration.read_noise_e**2 + calibration.dsnu_e**2 + rounding_e2
+
+
+def pixel_variance_e2(expected_e: NDArray[np.float64], floor_e2: float, prnu: float) -> NDArray[np.float64]:
+    """Variance of pixels that expect some electrons: max(λ, 0) + (PRNU λ)² + that of a dark pixel.
+
+    An expectation below black level (an offset that drifted) has no negative shot noise.
+    """
+    lit_e = np.maximum(expected_e, 0.0)
+    return np.asarray(lit_e + (prnu * lit_e) ** 2 + floor_e2)
+
+
+def saturation_dn(calibration: Calibration, gain: float) -> int:
+    """Count from which on a pixel is clipped, at a gain.
+
+    Below full scale it is the full well that clips: its count rises with the gain, up to full scale.
+
+    Parameters
+    ----------
+    calibration
+        With the count at gain 1.
+    gain
+        Factor on the calibrated system gain.
+    """
+    full_scale_dn = max(2**calibration.bit_depth - 1, calibration.saturation_dn)
+    above_black_dn = calibration.saturation_dn - calibration.black_level_dn
+    return int(min(math.floor(calibration.black_level_dn + gain * above_black_dn), full_scale_dn))
+
+
+def at_gain(calibration: Calibration, gain: float) -> Calibration:
+    """Calibration of a camera that has a gain for good."""
+    return replace(
+        calibration,
+        system_gain_dn_per_e=calibration.system_gain_dn_per_e * gain,
+        saturation_dn=saturation_dn(calibration, gain),
+    )
 
 
 def clip_level_e(calibration: Calibration, black_level_dn: float, gain: float = 1.0) -> float:
-    """Electrons at which a pixel reaches `saturation_dn`."""
-    return (calibration.saturation_dn - black_level_dn) / (calibration.system_gain_dn_per_e * gain)
+    """Electrons at which a pixel is clipped, at a gain."""
+    above_black_dn = saturation_dn(calibration, gain) - black_level_dn
+    return above_black_dn / (calibration.system_gain_dn_per_e * gain)

@@ -45,17 +45,24 @@ class Calibration:
     camera
         Name, `robot.camera`.
     width_px, height_px, fx_px, fy_px, cx_px, cy_px
-        Intrinsics of a rectilinear lens.
+        Intrinsics.
+    lens_model, distortion
+        `rectilinear`, or a model of OpenCV's with its coefficients in OpenCV's order: `brown_conrady` (k1,
+        k2, p1, p2[, k3[, k4, k5, k6]]) or `fisheye` (k1, k2, k3, k4).
     rotation_body_camera
         Rotation that takes camera axes to body axes, shape (3, 3).
     position_body_m
         The camera's centre in body axes, shape (3,).
     system_gain_dn_per_e, read_noise_e, black_level_dn, saturation_dn, bit_depth
         EMVA 1288 linear model. A pixel at or above `saturation_dn` is clipped.
+    dsnu_e, prnu
+        Standard deviations of the pixels' fixed offsets and relative responses (EMVA 1288). Which pixel
+        has which is not known: they add to the noise of a place, and do not average over frames.
     psf_sigma_px
         Standard deviation of the Gaussian point spread function, without the pixel's own aperture.
     response_angle_rad, response_relative
-        Spectral response against field angle (increasing from 0), relative to the axis, shape (n,) each.
+        Response (filter, vignetting) against field angle (increasing from 0), relative to the axis, shape
+        (n,) each.
         The cosine of the tilted lens aperture is not part of it.
     range_constant_dn_m2_per_s
         K of the *integrated* flux: flux_dn = K · exposure · cos θ · response(θ) / range².
@@ -92,6 +99,10 @@ class Calibration:
     source_radius_m: float
     wavelength_m: float
     sigma: Mapping[str, float] = field(default_factory=dict)
+    lens_model: str = "rectilinear"
+    distortion: tuple[float, ...] = ()
+    dsnu_e: float = 0.0
+    prnu: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from nir_render.camera.enlarge import Enlargement, weights_of
+from nir_render.camera.gaussian_fit import BLUR_SIGMAS, LEAST_RADIUS_PX, gaussian_fit
 from nir_render.camera.lens import intrinsics_of
+from nir_render.camera.otf import core_of
 from nir_render.scene.devices import Camera
-
-LEAST_RADIUS_PX = 3.0
-_BLUR_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +53,8 @@ def flare_aperture(
     if direction[2] <= 0.0:
         return None
     u_px, v_px = lens.project(direction)
-    # A rectilinear image grows by 1/cos² θ along the radius, more than across it.
-    image_px = lens.fx_px * math.tan(min(angular_radius_rad, 1.5)) / max(float(direction[2]), 0.05) ** 2
-    radius_px = max(image_px + _BLUR_SIGMAS * camera.point_spread.sigma_px, LEAST_RADIUS_PX)
+    image_px = lens.image_radius_px(direction, angular_radius_rad)
+    radius_px = max(image_px + BLUR_SIGMAS * gaussian_fit(core_of(camera)).sigma_px, LEAST_RADIUS_PX)
     rows, columns = (
         slice(max(math.ceil(middle_px - radius_px), 0), min(math.floor(middle_px + radius_px) + 1, count))
         for middle_px, count in ((v_px, lens.height_px), (u_px, lens.width_px))

@@ -1,7 +1,8 @@
 """Light at the lens to expected electrons in pixels, before any noise."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,11 @@ from scipy.ndimage import gaussian_filter
 from nir_render.camera.emission import Emitter
 from nir_render.camera.enlarge import enlarge
 from nir_render.camera.lens import aperture_area_m2, intrinsics_of
+from nir_render.camera.otf import core_of
 from nir_render.camera.psf import Window, source_window
 from nir_render.camera.response import Response, response_map
+from nir_render.camera.veil import veil
+from nir_render.camera.waves import convolve
 from nir_render.scene.devices import Camera
 
 
@@ -22,6 +26,7 @@ class Beam:
     `direction` is the unit vector to its centre in camera axes, shape (3,); `angular_radius_rad` half the
     angle that it fills; `irradiance_w_per_m2` what falls on a plane across its direction at the lens. Of a
     partly hidden source, `seen` holds unit directions that cover the visible part evenly, shape (n, 3).
+    `distance_m`, straight to the centre, is what the lens focuses by.
     """
 
     direction: NDArray[np.float64]
@@ -29,16 +34,17 @@ class Beam:
     irradiance_w_per_m2: float
     response: Response
     seen: NDArray[np.float64] | None = None
+    distance_m: float = math.inf
 
 
 def beam_window(camera: Camera, beam: Beam, exposure_s: float) -> Window:
-    """Return the expected electrons of one beam.
+    """Return the expected electrons of one beam: what the core of the point spread brings; in all, all.
 
     A beam from field angle θ gives E · A_ap cos θ · C(θ) · t electrons in all: the aperture is seen tilted.
     E is L ∫ cos ψ dΩ over the angles ψ from the source's centre, and each of its directions is weighted with
     its own cos θ, which holds that cos ψ already; so L Ω = 2 E / (1 + cos α) is what is spread over the disc.
-    The cos⁴ θ of the irradiance of an extended image is this cos θ and the cos³ θ by which the solid angle
-    of a pixel shrinks, which the projection of the directions brings about.
+    The cos⁴ θ of the irradiance of an extended image behind a rectilinear lens is this cos θ and the cos³ θ
+    by which the solid angle of a pixel shrinks, which the projection of the directions brings about.
     """
     obliquity = 0.5 * (1.0 + np.cos(beam.angular_radius_rad))
     collected_j = beam.irradiance_w_per_m2 / obliquity * aperture_area_m2(camera) * exposure_s
@@ -47,14 +53,18 @@ def beam_window(camera: Camera, beam: Beam, exposure_s: float) -> Window:
         angle_rad = np.arccos(np.clip(cos_angle, -1.0, 1.0))
         return np.asarray(collected_j * cos_angle * beam.response(angle_rad))
 
-    return source_window(
+    # A rectilinear lens focuses planes, a fisheye about spheres.
+    depth_m = beam.distance_m * (1.0 if camera.lens.model == "fisheye" else max(beam.direction[2], 0.0))
+    window = source_window(
         intrinsics_of(camera),
-        camera.point_spread.sigma_px,
+        core_of(camera, depth_m),
         beam.direction,
         beam.angular_radius_rad,
         electrons,
         beam.seen,
     )
+    share = camera.point_spread.core_share
+    return window if share == 1.0 else replace(window, values=share * window.values)
 
 
 def diffuse_electrons(
@@ -62,7 +72,7 @@ def diffuse_electrons(
 ) -> NDArray[np.float64]:
     """Return the expected electrons, before the blur, of light of one spectrum from everywhere.
 
-    A pixel of area A gets L · A_ap cos θ · (A/f²) cos³ θ · C(θ) · t electrons.
+    A pixel that sees the solid angle Ω gets L · A_ap cos θ · Ω · C(θ) · t electrons.
 
     Parameters
     ----------
@@ -80,8 +90,16 @@ def diffuse_electrons(
 
 
 def blur(camera: Camera, image_e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return an image spread by the camera's point spread function, the edge pixels continued outside."""
-    return np.asarray(gaussian_filter(image_e, camera.point_spread.sigma_px, mode="nearest", truncate=6.0))
+    """Return an image spread by the core of the point spread, the edge pixels continued outside.
+
+    Extended light has no distance here: it is as far out of focus as what is infinitely far.
+    """
+    core, share = core_of(camera), camera.point_spread.core_share
+    sigma_px = core.gaussian_px
+    if sigma_px is None:
+        return share * convolve(core, image_e)
+    blurred_e = np.asarray(gaussian_filter(image_e, sigma_px, mode="nearest", truncate=6.0))
+    return blurred_e if share == 1.0 else share * blurred_e
 
 
 def _collected_per_radiance(camera: Camera) -> float:
@@ -94,4 +112,4 @@ def expected_electrons(camera: Camera, beams: Sequence[Beam], exposure_s: float)
     image = np.zeros((camera.sensor.rows, camera.sensor.columns))
     for beam in beams:
         beam_window(camera, beam, exposure_s).add_to(image)
-    return image
+    return image + veil(camera, image) if camera.point_spread.core_share < 1.0 else image

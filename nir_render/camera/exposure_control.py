@@ -1,42 +1,120 @@
-"""Adaptive exposure: the next frame's exposure from the brightest pixel of the last one.
+"""A camera's exposures and gains, frame by frame: fixed, a bracket's, or chosen by the frames before.
 
-The paper's camera adapts "to prevent pixel saturation from proximal robots or signal loss at long ranges".
+The paper's camera adapts "to prevent pixel saturation from proximal robots or signal loss at long ranges":
+the brightest pixel is that of the nearest robot, and all others get as much exposure as that one allows.
 """
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.sensor import saturation_dn
+from nir_render.scene.devices import Camera
 from nir_render.scene.exposure import AutoExposure
-from nir_render.scene.sensor import Sensor
+from perception.types import RawFrame
 
 _LARGEST_STEP = 4.0
+# A point's brightest pixel has a neighbour of 1/16 of it with any point spread of σ ≥ 0.32 px.
+_MOST_OVER_NEIGHBOURS = 16
+_AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
 
 
-def next_exposure_s(
-    control: AutoExposure, sensor: Sensor, data_dn: NDArray[np.uint16], exposure_s: float
-) -> float:
-    """Return the exposure that would bring the brightest pixel of a frame to the target.
+@dataclass(frozen=True)
+class Setting:
+    """What a frame is taken with."""
+
+    exposure_s: float
+    gain: float
+
+
+@dataclass(frozen=True)
+class ExposureState:
+    """What an automatic exposure knows before a frame.
+
+    Attributes
+    ----------
+    upcoming
+        Settings of the frames to come, the next one's first, the newest choice last.
+    seen
+        Start of, and electrons per second in the brightest pixel of, the frames that count still.
+    """
+
+    upcoming: tuple[Setting, ...]
+    seen: tuple[tuple[float, float], ...] = ()
+
+
+def own_setting(camera: Camera, index: int) -> Setting:
+    """Return the camera's own exposure and gain for a frame; of a bracket the one whose turn it is."""
+    exposures_s = camera.bracket or (camera.exposure_s,)
+    return Setting(exposures_s[index % len(exposures_s)], camera.gain)
+
+
+def first_state(camera: Camera, control: AutoExposure) -> ExposureState:
+    """Return the state of a camera that has seen nothing."""
+    return ExposureState((Setting(camera.exposure_s, camera.gain),) * control.latency)
+
+
+def next_state(state: ExposureState, control: AutoExposure, camera: Camera, frame: RawFrame) -> ExposureState:
+    """Return the state after a frame that was taken with `state.upcoming[0]`.
+
+    The choice is the setting at which the brightest pixel, of the frames that `control.hold_s` lets count,
+    would be at the target. One step is at most a factor of 4; a clipped pixel tells only that the exposure
+    was too long, and takes that whole step.
+    """
+    range_dn = saturation_dn(camera.sensor, frame.gain) - frame.black_level_dn
+    level = (brightest_dn(frame.data_dn) - frame.black_level_dn) / range_dn
+    level = max(level, control.target / _LARGEST_STEP)
+    if level >= 1.0:
+        level = _LARGEST_STEP * control.target
+    rate_e_per_s = level * _range_e(camera, frame.gain) / frame.exposure_s
+    held = tuple(one for one in state.seen if one[0] >= frame.time_s - control.hold_s)
+    seen = (*held, (frame.time_s, rate_e_per_s))
+    chosen = setting_for(camera, control, max(rate for _, rate in seen))
+    return ExposureState((*state.upcoming[1:], chosen), seen)
+
+
+def setting_for(camera: Camera, control: AutoExposure, brightest_e_per_s: float) -> Setting:
+    """Return the setting that brings electrons per second in a pixel to the target, within the limits.
+
+    Gain is raised only at the longest exposure: it adds no light.
+    """
+    rate_e_per_s = max(brightest_e_per_s, 1e-300)
+    wanted_s = control.target * _range_e(camera, camera.gain) / rate_e_per_s
+    exposure_s = float(np.clip(wanted_s, control.shortest_s, control.longest_s))
+    gain = camera.gain
+    if control.most_gain is not None and wanted_s > control.longest_s:
+        sensor = camera.sensor
+        full_scale_e = (sensor.full_scale_dn - sensor.black_level_dn) / sensor.system_gain_dn_per_e
+        wanted = control.target * full_scale_e / (rate_e_per_s * exposure_s)
+        gain = float(np.clip(wanted, camera.gain, control.most_gain))
+    return Setting(exposure_s, gain)
+
+
+def brightest_dn(data_dn: NDArray[np.uint16]) -> float:
+    """Return the brightest pixel of a frame, as far as its neighbours bear it out.
+
+    Light spreads over neighbours: what stands out alone, a hot or stuck pixel, is none. So a pixel counts at
+    most as the local median (5 × 5: more than half of it is free of a far source's 2 × 2 or 3 × 3 pixels)
+    plus 16 times what the brightest of its eight neighbours exceeds that by.
 
     Parameters
     ----------
-    control
-        Target level and limits.
-    sensor
-        Where the frame's counts begin and clip.
     data_dn
-        The last frame's counts, shape (rows, columns).
-    exposure_s
-        Its exposure.
-
-    Returns
-    -------
-    Seconds, within the limits. One step is at most a factor of 4; a clipped pixel tells only that the
-    exposure was too long, and takes that whole step.
+        Counts, shape (rows, columns).
     """
-    range_dn = saturation_dn(sensor) - sensor.black_level_dn
-    level = (float(data_dn.max()) - sensor.black_level_dn) / range_dn
-    step = control.target / max(level, control.target / _LARGEST_STEP)
-    if level >= 1.0:
-        step = 1.0 / _LARGEST_STEP
-    return float(np.clip(exposure_s * step, control.shortest_s, control.longest_s))
+    # Reflected, so that a flare in a corner is not its own surroundings.
+    wider = cv2.copyMakeBorder(data_dn, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
+    local = cv2.medianBlur(wider, 5)[2:-2, 2:-2].astype(np.int32)
+    borne_out = np.maximum(cv2.dilate(data_dn, _AROUND), local.astype(np.uint16)).astype(np.int32) - local
+    borne_out *= _MOST_OVER_NEIGHBOURS
+    borne_out += local
+    return float(np.minimum(data_dn, borne_out).max())
+
+
+def _range_e(camera: Camera, gain: float) -> float:
+    """Return the electrons at which a pixel counts as clipped."""
+    sensor = camera.sensor
+    range_dn = saturation_dn(sensor, gain) - sensor.black_level_dn
+    return range_dn / (sensor.system_gain_dn_per_e * gain)

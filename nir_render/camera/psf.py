@@ -2,8 +2,9 @@
 
 A sphere of uniform radiance fills a cone of directions evenly. The power that the tilted aperture takes from
 each is weighted cos θ · response(θ) · dΩ. The cone is represented by quadrature nodes in *direction*, so any
-projection serves; each node is a point whose Gaussian image is integrated over pixels exactly, by error
-functions. Nothing is truncated but the tail beyond 8 sigma (1e-15 of the light).
+projection serves; each node is a point. Its image under a Gaussian is integrated over pixels exactly, by
+error functions; nothing is truncated but the tail beyond 8 sigma (1e-15 of the light). Under any other core
+it is made from the core's transfer function, which loses no light and moves none (`camera/waves.py`).
 """
 
 import math
@@ -15,9 +16,12 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from nir_render.camera.lens import Intrinsics
+from nir_render.camera.otf import Core
+from nir_render.camera.waves import image_of_points
 from nir_render.geometry import cone_directions, cone_versine
 
 _TAIL_SIGMAS = 8.0
+_WAVES_PER_SIGMA = 0.84
 
 
 def cone_nodes(
@@ -57,7 +61,7 @@ class Window:
 
 def source_window(
     intrinsics: Intrinsics,
-    sigma_px: float,
+    core: Core,
     direction: NDArray[np.float64],
     angular_radius_rad: float,
     power_at: Callable[[NDArray[np.float64]], NDArray[np.float64]],
@@ -67,6 +71,8 @@ def source_window(
 
     Parameters
     ----------
+    core
+        What a point at the source's distance becomes.
     direction
         Unit vector to the source's centre in camera axes, shape (3,).
     angular_radius_rad
@@ -83,7 +89,7 @@ def source_window(
     if seen is not None:
         directions, shares = seen, np.full(len(seen), 1.0 / len(seen))
     elif angular_radius_rad > 0.0:
-        rings = _rings(intrinsics, sigma_px, direction, angular_radius_rad)
+        rings = _rings(intrinsics, _finest_px(core), direction, angular_radius_rad)
         directions, shares = cone_nodes(direction, angular_radius_rad, rings)
     in_front = directions[:, 2] > 1e-6
     if not in_front.any():
@@ -91,18 +97,28 @@ def source_window(
     directions, shares = directions[in_front], shares[in_front]
     power = shares * power_at(directions[:, 2])
     pixels = intrinsics.project(directions)
+    total = float(power.sum())
+    sigma_px = core.gaussian_px
+    if sigma_px is None:
+        values, row, column = image_of_points(core, pixels, power, intrinsics.height_px, intrinsics.width_px)
+        return Window(values, row, column, total)
     u_shares, column = _pixel_shares(pixels[:, 0], sigma_px, intrinsics.width_px)
     v_shares, row = _pixel_shares(pixels[:, 1], sigma_px, intrinsics.height_px)
-    return Window((v_shares * power[:, None]).T @ u_shares, row, column, float(power.sum()))
+    return Window((v_shares * power[:, None]).T @ u_shares, row, column, total)
+
+
+def _finest_px(core: Core) -> float:
+    """Return the σ of the Gaussian that passes as fine waves as a core, to 1e-6 of their contrast."""
+    sigma_px = core.gaussian_px
+    return _WAVES_PER_SIGMA / core.highest_frequency if sigma_px is None else sigma_px
 
 
 def _rings(
     intrinsics: Intrinsics, sigma_px: float, direction: NDArray[np.float64], angular_radius_rad: float
 ) -> int:
     """Return how many rings resolve the disc's image against the blur: error below 1e-6 of the flux."""
-    stretch = 1.0 / max(direction[2], 0.05) ** 2  # a rectilinear image grows by 1/cos² θ along the radius
-    radius_px = intrinsics.fx_px * angular_radius_rad * stretch
-    return min(6 + math.ceil(1.5 * float(radius_px) / sigma_px), 128)
+    radius_px = intrinsics.image_radius_px(direction, angular_radius_rad)
+    return min(6 + math.ceil(1.5 * radius_px / sigma_px), 128)
 
 
 def _pixel_shares(

@@ -2,9 +2,10 @@
 
 Everything spectral about a light group and a camera folds into one factor (PHYSICS section 1),
 
-    C(θ) = ∫ S(λ) τ_lens τ_filter(λ, θ) η(λ) λ / (h c) dλ,
+    C(θ) = V(θ) ∫ S(λ) τ_lens τ_filter(λ, θ) η(λ) λ / (h c) dλ,
 
-with S the group's spectrum of unit flux. Geometry (aperture, cos θ, distance) is not part of it.
+with S the group's spectrum of unit flux and V the lens's vignetting. Geometry (aperture, cos θ, distance) is
+not part of it.
 """
 
 from dataclasses import dataclass
@@ -15,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 
 from nir_render.camera.emission import Emitter, curve_of, emission_spectrum
-from nir_render.camera.lens import intrinsics_of
+from nir_render.camera.lens import field_of, intrinsics_of
 from nir_render.scene.devices import Camera
+from nir_render.scene.drive import FULL_DRIVE
 from nir_render.scene.fields import Orientation
+from nir_render.scene.shutter import GlobalShutter
 from nir_render.scene.world import Lamp, Sun
 from nir_render.spectra.bandpass import transmission
 from nir_render.spectra.curve import Curve
@@ -59,7 +62,10 @@ def response(camera: Camera, emitter: Emitter) -> Response:
 
 
 def response_map(camera: Camera, emitter: Emitter) -> NDArray[np.float64]:
-    """Return cos⁴ θ · C(θ) at each pixel's centre, in electrons per joule, shape (rows, columns)."""
+    """Return cos θ · Ω/Ω_axis · C(θ) at each pixel's centre, in electrons per joule, shape (rows, columns).
+
+    Ω is the pixel's solid angle; outside a fisheye's image circle there is no light.
+    """
     return _response_map(_optics(camera), _kind(emitter))
 
 
@@ -70,19 +76,24 @@ def _optics(camera: Camera) -> Camera:
             "position_m": (0.0, 0.0, 0.0),
             "orientation": Orientation(),
             "exposure_s": 1.0,
+            "gain": 1.0,
             "auto_exposure": None,
+            "bracket": None,
+            "shutter": GlobalShutter(),
+            "serial": None,
         }
     )
 
 
 def _kind(emitter: Emitter) -> Emitter:
-    """Return the emitter without its place, size, directions and flux, likewise."""
+    """Return the emitter without its place, size, directions, flux and drive, likewise."""
     if isinstance(emitter, Lamp):
         update = {
             "center_m": (0.0, 0.0, 0.0),
             "size_m": (1.0, 1.0),
             "normal": (0.0, 0.0, 1.0),
             "luminous_flux_lm": 1.0,
+            "drive": FULL_DRIVE,
         }
         return emitter.model_copy(update=update)
     if isinstance(emitter, Sun):
@@ -90,30 +101,32 @@ def _kind(emitter: Emitter) -> Emitter:
             update={"azimuth_rad": 0.0, "elevation_rad": 1.0, "irradiance_w_per_m3": 1.0}
         )
     update = {"position_m": (0.0, 0.0, 0.0), "radius_m": 1.0, "flux_w": 1.0}
-    return emitter.model_copy(update={**update, "orientation": Orientation(), "pattern": None})
+    update |= {"orientation": Orientation(), "pattern": None, "drive": FULL_DRIVE}
+    return emitter.model_copy(update=update)
 
 
 @lru_cache(maxsize=16)
 def _response_map(camera: Camera, emitter: Emitter) -> NDArray[np.float64]:
     lens = intrinsics_of(camera)
-    x = (np.arange(lens.width_px) - lens.cx_px) / lens.fx_px
-    y = (np.arange(lens.height_px) - lens.cy_px) / lens.fy_px
-    tan_squared = x**2 + y[:, None] ** 2
+    field = field_of(lens)
     of_angle = _response(camera, emitter)
     # C is smooth in the angle: a table of it, finer than a pixel, read linearly, keeps 1e-6.
     angle_rad = np.linspace(0.0, lens.corner_angle_rad, 4096)
-    at_pixel = np.interp(np.arctan(np.sqrt(tan_squared)), angle_rad, of_angle(angle_rad))
-    return np.asarray(at_pixel / (1.0 + tan_squared) ** 2)
+    return np.asarray(np.interp(field.angle_rad, angle_rad, of_angle(angle_rad)) * field.weight)
 
 
 @lru_cache(maxsize=256)
 def _response(camera: Camera, emitter: Emitter) -> Response:
     # A little beyond the corner, for sources that are centred outside the image and reach into it.
-    angle_rad = np.linspace(0.0, min(1.2 * intrinsics_of(camera).corner_angle_rad, 0.5 * np.pi), _ANGLES)
+    last_rad = min(1.2 * intrinsics_of(camera).corner_angle_rad, 0.5 * np.pi)
+    angle_rad = np.linspace(0.0, last_rad, _ANGLES)
+    bends = [bend for bend, _ in camera.lens.vignetting or () if np.abs(angle_rad - bend).min() > 1e-6]
+    angle_rad = np.union1d(angle_rad, [bend for bend in bends if bend < last_rad])
     cosines, weights = incidence(camera, angle_rad)
     nodes = np.linspace(cosines.min(), 1.0, _COSINES)
     at_nodes = PchipInterpolator(nodes, _electrons_per_j(camera, emitter, nodes))
-    return Response(angle_rad, np.asarray(at_nodes(cosines)) @ weights)
+    passed = np.asarray(at_nodes(cosines)) @ weights
+    return Response(angle_rad, passed * vignetting(camera, angle_rad))
 
 
 def _electrons_per_j(camera: Camera, emitter: Emitter, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,6 +147,18 @@ def efficiency_of(camera: Camera) -> Curve:
     return curve_of(camera.sensor.quantum_efficiency, "quantum_efficiency")
 
 
+def vignetting(camera: Camera, angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the throughput at field angles relative to the axis: monotone cubic between the lens's points.
+
+    Beyond the last of them, outside the image, it keeps its last value.
+    """
+    points = camera.lens.vignetting
+    if points is None:
+        return np.ones_like(angle_rad)
+    angles_rad, values = np.array(points).T
+    return np.asarray(PchipInterpolator(angles_rad, values)(np.minimum(angle_rad, angles_rad[-1])))
+
+
 def incidence(
     camera: Camera, angle_rad: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -150,7 +175,9 @@ def incidence(
     if bandpass is None or bandpass.placement == "in_front_of_lens":
         return np.cos(angle_rad)[:, None], np.ones(1)
     # The chief ray's angle grows linearly with the image height (beyond the corner: up to 85 degrees).
-    height = np.tan(angle_rad) / np.tan(intrinsics_of(camera).corner_angle_rad)
+    lens = intrinsics_of(camera)
+    height = lens.distortion.image_height(angle_rad)
+    height = height / lens.distortion.image_height(np.array(lens.corner_angle_rad))
     chief = np.tan(np.clip(height * bandpass.chief_ray_angle_at_corner_rad, 0.0, np.radians(85.0)))
     nodes, ring_weights = np.polynomial.legendre.leggauss(_PUPIL_RINGS)
     radius = np.sqrt(0.5 * (nodes + 1.0)) / (2.0 * camera.lens.f_number)  # Gauss–Legendre in area

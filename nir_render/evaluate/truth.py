@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.drive import drive_of
 from nir_render.camera.lens import intrinsics_of
-from nir_render.camera.psf import Window
 from nir_render.camera.sensor import saturation_dn
-from nir_render.expected import Expected, group_electrons
+from nir_render.camera.shutter import on_fractions
+from nir_render.expected import Expected, place_of
+from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import camera_pose_on_robot
 from perception.types import RawFrame
@@ -24,11 +26,13 @@ class SourceTruth:
 
     `u_px, v_px` is the projection of the source's centre; `range_m` the straight distance from the lens to
     it, `depth_z_m` its part along the optical axis; bearings are unit vectors from the camera's centre;
-    `position_body_m` counts from the observing robot's origin. `direct_e` are the expected electrons that
-    came straight, those beyond the sensor's edge included; `scattered_e` those of the source's own light that
-    came by way of bodies or fog into the pixels of the flare. `background_e` is all light but the flare's,
-    the source's own scattered light included, as a mean per pixel there; `peak_snr` the flare's brightest
-    pixel over the noise there.
+    `position_body_m` counts from the observing robot's origin. `on_fraction` is the mean of the source's
+    drive over the exposure of the row of pixels that its centre is in. All electrons are those in the frame,
+    with the sources as they were driven: `direct_e` are the expected electrons that came straight, those
+    beyond the sensor's edge included; `scattered_e` those of the source's own light that came by way of
+    bodies or fog into the pixels of the flare. `background_e` is all light but the flare's, the source's own
+    scattered light included, as a mean per pixel there; `peak_snr` the flare's brightest pixel over the noise
+    there.
 
     A ghost, the image of a source in one flat smooth surface, has a row of its own: `ghost_of` is the name
     `robot.source` of whom it shows (None for a source itself), place and range are those of the image behind
@@ -81,6 +85,7 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
     mount = camera_pose_on_robot(camera)
     table = light.direct
     pixels = intrinsics.project(table.direction)
+    emitters = scene.emitters()
     for row, window in enumerate(mean.windows):
         u_px, v_px = pixels[row]
         lit = float(window.values.sum()) >= 1.0
@@ -91,7 +96,8 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
             continue
         robot, _, source = light.groups[group].partition(".")
         direction, distance_m = table.direction[row], float(table.distance_m[row])
-        flare = _flare(scene, mean, frame, window, group)
+        flare = _flare(camera, mean, frame, row)
+        on = on_fractions(camera, drive_of(emitters[light.groups[group]]), mean.time_s, mean.exposure_s)
         yield SourceTruth(
             camera=light.camera,
             index=frame.index,
@@ -112,7 +118,7 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
             background_e=flare.background_e,
             peak_snr=flare.peak_snr,
             saturated_px=flare.saturated_px,
-            on_fraction=1.0,
+            on_fraction=float(on[mean.rates.centre_row[row]]),
             ghost_of=light.groups[group] if is_ghost else None,
         )
 
@@ -127,24 +133,23 @@ class _Flare:
     background_e: float = 0.0
 
 
-def _flare(scene: Scene, mean: Expected, frame: RawFrame, window: Window, group: int) -> _Flare:
+def _flare(camera: Camera, mean: Expected, frame: RawFrame, row: int) -> _Flare:
     """Return what is in the flare: its pixels are those that hold 1 % of its brightest one's own light."""
+    window = mean.windows[row]
     own = window.values
     if own.size == 0 or not own.max() > 0.0:
         return _Flare()
-    _, camera = scene.camera(mean.light.camera)
-    rows, columns = own.shape
-    place = np.s_[window.row : window.row + rows, window.column : window.column + columns]
+    place = place_of(window)
     all_e = mean.electrons[place]
     # A noiseless sensor has no noise where there is no light, and no signal either.
     noise_e = np.sqrt(all_e + camera.sensor.read_noise_e**2)
     snr = np.divide(own, noise_e, out=np.zeros_like(own), where=noise_e > 0.0)
     pixels = own > 0.01 * own.max()
-    clipped = (own > 0.5 * all_e) & (frame.data_dn[place] >= saturation_dn(camera.sensor))
+    clipped = (own > 0.5 * all_e) & (frame.data_dn[place] >= saturation_dn(camera.sensor, frame.gain))
     return _Flare(
         peak_snr=float(snr.max()),
         saturated_px=int(clipped.sum()),
-        scattered_e=float(group_electrons(mean, scene, group)[place][pixels].sum()),
+        scattered_e=float(mean.scattered(row)[pixels].sum()),
         background_e=float((all_e - own)[pixels].mean()),
     )
 

@@ -10,6 +10,8 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo, model_validator
 
 _UNIT_SUFFIXES = (
+    "_m_per_k",
+    "_e_per_s",
     "_dn_per_e",
     "_w_per_m3",
     "_per_m",
@@ -27,7 +29,14 @@ _UNIT_SUFFIXES = (
     "_bit",
 )
 # Keys of which a document has one: a change that writes another replaces the first.
-_ALTERNATIVES = ({"constant", "gaussian", "points", "grid", "file"}, {"extinction", "visibility"})
+_ALTERNATIVES = (
+    {"constant", "gaussian", "points", "grid", "file"},
+    {"extinction", "visibility"},
+    {"full_well", "saturation_capacity"},
+    {"values", "file"},
+    {"constant", "square", "bits"},
+    {"auto_exposure", "bracket"},
+)
 _COLOUR_KEYS = {"rgb", "color", "colour", "srgb"}
 RGB_REFUSED = "RGB colours have no meaning at 940 nm; give the value in the band, a number from 0 to 1"
 

@@ -1,18 +1,20 @@
 """Models of what a robot carries: sources, and cameras with lens, filter and sensor."""
 
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import field_validator
+from pydantic import BeforeValidator, field_validator, model_validator
 
 from nir_render.scene.bandpass import Bandpass
 from nir_render.scene.base import PresetDocument
 from nir_render.scene.curves import CurveDocument
-from nir_render.scene.exposure import AutoExposure
+from nir_render.scene.drive import FULL_DRIVE, Drive
+from nir_render.scene.exposure import AutoExposure, Bracket, Gain
 from nir_render.scene.fields import Name, Orientation, Positive
-from nir_render.scene.lens import Lens
+from nir_render.scene.lens import Lens, check_field
 from nir_render.scene.pattern import PatternDocument
 from nir_render.scene.point_spread import PointSpread
 from nir_render.scene.sensor import Sensor
+from nir_render.scene.shutter import GlobalShutter, Shutter
 from nir_render.scene.units import Length, Position, Power, Time
 
 
@@ -21,7 +23,8 @@ class Source(PresetDocument):
 
     `flux` is the radiant flux over the whole spectrum and all directions, `spectrum` its shape (any scale),
     `position` the sphere's centre on the robot. Without `pattern` it shines the same in all directions;
-    `orientation` turns the pattern's axes on the robot.
+    `orientation` turns the pattern's axes on the robot. `drive` is what it sends over time; a calibration
+    speaks of a source that is fully lit.
     """
 
     preset_folder: ClassVar[str] = "sources"
@@ -32,6 +35,7 @@ class Source(PresetDocument):
     position_m: Position = (0.0, 0.0, 0.0)
     orientation: Orientation = Orientation()
     pattern: PatternDocument | None = None
+    drive: Drive = FULL_DRIVE
 
     @field_validator("spectrum")
     @classmethod
@@ -41,10 +45,15 @@ class Source(PresetDocument):
         return spectrum
 
 
+def _as_text(serial: Any) -> Any:
+    return str(serial) if isinstance(serial, int) else serial
+
+
 class Camera(PresetDocument):
     """A camera on a robot. Without orientation it looks along the robot's x axis, upright.
 
-    With `auto_exposure`, `exposure` is only where it starts from before the first frame is taken.
+    `gain` is a factor on the sensor's system gain. With `auto_exposure`, `exposure` is only where it starts
+    from before the first frame is taken; with `bracket`, frames take its exposures by turns.
     """
 
     preset_folder: ClassVar[str] = "cameras"
@@ -54,9 +63,32 @@ class Camera(PresetDocument):
     sensor: Sensor
     point_spread: PointSpread
     exposure_s: Annotated[Time, Positive]
+    gain: Gain = 1.0
     auto_exposure: AutoExposure | None = None
+    bracket: Bracket | None = None
+    shutter: Shutter = GlobalShutter()
     position_m: Position = (0.0, 0.0, 0.0)
     orientation: Orientation = Orientation()
+    serial: Annotated[str, BeforeValidator(_as_text)] | None = None
+
+    @model_validator(mode="after")
+    def _one_choice_of_exposure(self) -> Self:
+        auto = self.auto_exposure
+        if auto is not None and self.bracket is not None:
+            raise ValueError(
+                "'auto_exposure' chooses each exposure by the frames before, 'bracket' by a list: write one "
+                "of them, or set the other to null"
+            )
+        if auto is not None and auto.most_gain is not None and auto.most_gain < self.gain:
+            raise ValueError(
+                f"auto_exposure.most_gain, {auto.most_gain:g}, is below the camera's own gain, {self.gain:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _lens_reaches_the_corners(self) -> Self:
+        check_field(self.lens, self.sensor)
+        return self
 
 
 class Rig(PresetDocument):

@@ -71,6 +71,11 @@ def _describe_curves(definitions: dict[str, Any]) -> None:
         "azimuth": angles,
         "values": {"type": "array", "items": row, "minItems": 2},
     }
+    definitions["MeasuredKernel"]["properties"] |= {
+        "file": {"type": "string", "description": "CSV of rows of numbers, without a header"},
+        "values": {"type": "array", "items": row, "minItems": 3},
+    }
+    definitions["MeasuredKernel"]["required"].remove("values")
 
 
 def _or_preset(definition: dict[str, Any], folder: str) -> dict[str, Any]:

@@ -70,6 +70,8 @@ LUMINOUS_FLUX = Quantity("luminous flux", "lm", "4000 lm")
 ELECTRONS = Quantity("number of electrons", "e", "5500 e")
 COUNTS = Quantity("count", "DN", "64 DN")
 SYSTEM_GAIN = Quantity("system gain", "DN/e", "0.74 DN/e")
+DARK_CURRENT = Quantity("dark current", "e/s", "20 e/s")
+FOCUS_SHIFT = Quantity("focus shift", "m/K", "5 um/K")
 PIXELS = Quantity("length in the image", "px", "0.7 px")
 BITS = Quantity("number of bits", "bit", "12 bit")
 FRACTION = Quantity("fraction", "", "0.8")
@@ -85,8 +87,8 @@ _OTHERS = (
     Quantity("speed", "m/s", ""),
 )
 _KNOWN = (
-    LENGTH, TIME, FREQUENCY, ANGLE, POWER, TEMPERATURE, LUMINOUS_FLUX, ELECTRONS, COUNTS, SYSTEM_GAIN, PIXELS,
-    BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, *_OTHERS,
+    LENGTH, TIME, FREQUENCY, ANGLE, POWER, TEMPERATURE, LUMINOUS_FLUX, ELECTRONS, COUNTS, SYSTEM_GAIN,
+    DARK_CURRENT, FOCUS_SHIFT, PIXELS, BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, *_OTHERS,
 )  # fmt: skip
 
 _NUMBER = re.compile(
@@ -264,7 +266,10 @@ LuminousFlux = Annotated[float, Unit(LUMINOUS_FLUX)]
 Electrons = Annotated[float, Unit(ELECTRONS)]
 Counts = Annotated[float, Unit(COUNTS)]
 SystemGain = Annotated[float, Unit(SYSTEM_GAIN)]
+DarkCurrent = Annotated[float, Unit(DARK_CURRENT)]
+FocusShift = Annotated[float, Unit(FOCUS_SHIFT)]
 Pixels = Annotated[float, Unit(PIXELS)]
+Pixels2 = Annotated[tuple[float, float], Unit(PIXELS, 2)]
 Bits = Annotated[float, Unit(BITS)]
 Fraction = Annotated[float, Unit(FRACTION)]
 Extinction = Annotated[float, Unit(EXTINCTION)]

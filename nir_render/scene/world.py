@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
 
 from nir_render.scene.base import RGB_REFUSED, Document, PresetDocument, resolve_file, typed
+from nir_render.scene.drive import FULL_DRIVE, Drive
 from nir_render.scene.fields import NotNegative, Orientation, Positive
 from nir_render.scene.units import (
     Angle,
@@ -193,7 +194,10 @@ ShapeDocument = Annotated[
 
 
 class Lamp(PresetDocument):
-    """A rectangular lamp that shines along `normal`, an incandescent body of `temperature`."""
+    """A rectangular lamp that shines along `normal`, an incandescent body of `temperature`.
+
+    `drive` is what it sends over time.
+    """
 
     preset_folder: ClassVar[str] = "lamps"
 
@@ -202,6 +206,7 @@ class Lamp(PresetDocument):
     normal: Direction = (0.0, 0.0, -1.0)
     luminous_flux_lm: Annotated[LuminousFlux, Positive]
     temperature_k: Annotated[Temperature, Field(ge=500, le=20000)]
+    drive: Drive = FULL_DRIVE
 
     _direction = field_validator("normal")(_not_zero)
 

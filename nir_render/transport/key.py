@@ -36,7 +36,14 @@ from nir_render.transport.llvm.choice import cpu_name
 
 _PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
 # Files of this package that decide the bits of light: a change of one is another version.
-_CODE = ("transport/**/*.py", "scene/*.py", "geometry.py", "camera/lens.py", "camera/enlarge.py")
+_CODE = (
+    "transport/**/*.py",
+    "scene/*.py",
+    "geometry.py",
+    "distortion.py",
+    "camera/lens.py",
+    "camera/enlarge.py",
+)
 
 Sampled = NDArray[np.int64] | int | str | tuple[str, NDArray[np.int64]] | None
 

@@ -21,6 +21,10 @@ too small; its mean is right. So needs are means over 5 × 5 pixels of the pilot
   are enlarged.
 
 Counts are powers of two from 8 to 4096.
+
+A light serves many frames. The plan is for one in which every source that blinks is fully lit, at the longest
+of a bracket's exposures. In a frame in which the brightest are dark, the share that the others' render noise
+has can be larger; `render_noise` tells it frame by frame.
 """
 
 import cv2
@@ -31,8 +35,8 @@ from scipy.sparse import csr_array
 from nir_render.camera.apertures import aperture_weights
 from nir_render.camera.enlarge import Enlargement
 from nir_render.camera.exposure import diffuse_electrons
-from nir_render.camera.sensor import saturation_dn
-from nir_render.expected import by_spectrum, expected, flare_apertures, fluxes
+from nir_render.camera.exposure_control import setting_for
+from nir_render.expected import by_spectrum, flare_apertures, fluxes, fully_lit, rates
 from nir_render.render_noise import temporal_variance_e2
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
@@ -70,9 +74,9 @@ def samples_map(
     """
     assert pilot.indirect is not None  # noqa: S101 (without indirect light nothing is sampled)
     _, camera = scene.camera(pilot.camera)
-    at_one_second = expected(pilot, scene, 1.0)
-    exposure_s = settled_exposure_s(camera, float(at_one_second.electrons.max()))
-    sensor_e2 = temporal_variance_e2(expected(pilot, scene, exposure_s), camera)
+    of_pilot = rates(pilot, scene)
+    exposure_s = planned_exposure_s(camera, float(fully_lit(of_pilot, 1.0).electrons.max()))
+    sensor_e2 = temporal_variance_e2(fully_lit(of_pilot, exposure_s), camera)
     ratio = _share_of_one_sample(pilot, scene, exposure_s, sensor_e2, shape)
     own, scale = ratio / noise_share, camera.sensor.rows // shape[0]
     frame = max(float(np.median(own[own > 0.0])) if (own > 0.0).any() else 0.0, LEAST_SAMPLES)
@@ -211,11 +215,11 @@ def _of_spectra(
     ]
 
 
-def settled_exposure_s(camera: Camera, brightest_e_per_s: float) -> float:
-    """Return a camera's exposure; an automatic one's as it settles, but for noise in its brightest pixel."""
-    control, sensor = camera.auto_exposure, camera.sensor
-    if control is None:
-        return camera.exposure_s
-    range_e = (saturation_dn(sensor) - sensor.black_level_dn) / sensor.system_gain_dn_per_e
-    wanted_s = control.target * range_e / max(brightest_e_per_s, 1e-300)
-    return float(np.clip(wanted_s, control.shortest_s, control.longest_s))
+def planned_exposure_s(camera: Camera, brightest_e_per_s: float) -> float:
+    """Return the exposure to plan for: the camera's own, a bracket's longest, an automatic one as it settles.
+
+    The latter but for noise in its brightest pixel.
+    """
+    if camera.auto_exposure is not None:
+        return setting_for(camera, camera.auto_exposure, brightest_e_per_s).exposure_s
+    return max(camera.bracket or (camera.exposure_s,))

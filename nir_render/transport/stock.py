@@ -53,7 +53,7 @@ def indirect(
     """
     if not scene.document.has_indirect_light():
         return None
-    _refuse_what_only_groups_render(scene)
+    _refuse_what_only_groups_render(scene, camera)
     settings = scene.document.render.indirect
     samples = samples_of(scene)
     batches = min(_BATCHES, samples)
@@ -83,13 +83,17 @@ def indirect(
     )
 
 
-def _refuse_what_only_groups_render(scene: Scene) -> None:
-    """Raise InputError where a scene has what Mitsuba's own path tracer, as it is used here, leaves out."""
+def _refuse_what_only_groups_render(scene: Scene, camera: Camera) -> None:
+    """Raise InputError where there is what Mitsuba's own path tracer and camera, as used here, leave out."""
     document = scene.document
+    lens = intrinsics_of(camera)
+    middle_px = ((lens.width_px - 1) / 2, (lens.height_px - 1) / 2)
     parts = [
         ("fog", document.fog is not None),
         ("the sun", document.sun is not None),
         ("emission patterns", any(source.pattern is not None for _, source in scene.sources().values())),
+        (f"a {camera.lens.model} lens", camera.lens.model != "rectilinear"),
+        ("a principal point off the sensor's middle", (lens.cx_px, lens.cy_px) != middle_px),
     ]
     asked = [name for name, is_there in parts if is_there]
     if asked:

@@ -181,7 +181,7 @@ def test_an_error_in_few_pixels_is_found(scale: int, tmp_path: Path) -> None:
     assert light.indirect.edges is not None
     how = light.indirect.edges.enlargement
     every = np.setdiff1d(np.arange(160 * 120), how.patch)
-    square_e2 = _squares(light, scale, how, scene, camera.exposure_s, every, 256)
+    square_e2 = _squares(light, scale, how, scene, fluxes(light, scene), camera.exposure_s, every, 256)
     truth = float(square_e2.sum()) / (160 * 120) / sensor_e2
     assert np.sort(square_e2)[-20:].sum() > 0.5 * square_e2.sum()
     for seed in range(12):

@@ -21,7 +21,7 @@ from nir_render.evaluate.match import countable, match
 from nir_render.evaluate.metrics import angle_deg, source_limits
 from nir_render.evaluate.truth import SourceTruth
 from nir_render.expected import expected
-from nir_render.randomness import generator
+from nir_render.randomness import FrameKey
 from perception import Calibration, Detection, detect
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.verify]
@@ -60,11 +60,12 @@ def tally(scene: Scene, calibrations: dict[str, Calibration]) -> Tally:
     for render_seed in range(RENDERS):
         for shot in simulate(scene, seed=render_seed):
             name = shot.frame.camera
-            sensor = scene.camera(name)[1].sensor
+            camera = scene.camera(name)[1]
             mean_e = expected(shot.light, scene, shot.frame.exposure_s).electrons
             for draw in range(DRAWS):
                 seed = 1000 * render_seed + draw
-                data_dn = read_out(mean_e, sensor, generator(seed, "read_out", name, 0))
+                key = FrameKey(seed, "read_out", name, 0)
+                data_dn = read_out(mean_e, camera, shot.frame.exposure_s, key, shot.frame.gain)
                 frame = dataclasses.replace(shot.frame, data_dn=data_dn)
                 found = detect(frame, calibrations[name], "robust")
                 pairing = match(shot.truth, found, calibrations[name])

@@ -82,12 +82,12 @@ from nir_render import load_scene
 from nir_render.camera.exposure import Beam, expected_electrons
 from nir_render.camera.response import response
 from nir_render.camera.sensor import read_out
-from nir_render.randomness import generator
+from nir_render.randomness import FrameKey
 scene = load_scene(Path("scenes/one_source.yaml"))
 _, camera = scene.camera("r1.front")
 source = scene.sources()["r2.top"][1]
 beam = Beam(np.array([0.0, 0.0, 1.0]), 0.002, 0.2 / (4 * np.pi * 25), response(camera, source))
-data = read_out(expected_electrons(camera, [beam], 1e-3), camera.sensor, generator(1, "read_out", "r1.front", 0))
+data = read_out(expected_electrons(camera, [beam], 1e-3), camera, 1e-3, FrameKey(1, "read_out", "r1.front", 0))
 frame = perception.RawFrame("r1.front", 0, 0.0, 1e-3, data, 64.0)
 (found,) = perception.detect(frame, scene.calibration("r1.front"))
 assert abs(found.range_m - 5.0) < 0.1, found

@@ -18,7 +18,7 @@ from perception.types import RawFrame
 pytestmark = pytest.mark.mitsuba
 
 EXPOSURE_S = 4e-4
-GAIN_DN_PER_E = 0.74
+GAIN_DN_PER_E = 0.69
 APERTURE_M2 = math.pi * 0.9e-3**2 / 4.0
 
 
@@ -103,14 +103,15 @@ def test_calibration(scene: Scene) -> None:
     assert (calibration.cx_px, calibration.cy_px) == (639.5, 479.5)
     assert (calibration.width_px, calibration.height_px, calibration.bit_depth) == (1280, 960, 12)
     assert (calibration.system_gain_dn_per_e, calibration.read_noise_e, calibration.black_level_dn) == (
-        0.74,
+        0.69,
         10,
         64,
     )
     assert (calibration.psf_sigma_px, calibration.source_radius_m) == (0.7, 0.01)
     assert calibration.wavelength_m == 940e-9
-    # floor(64 + 0.74 · (5500 − 4 · 10)) is below full scale: read noise may show a full well up to there.
-    assert calibration.saturation_dn == min(4095, math.floor(64 + 0.74 * 5460))
+    # A capacity of 5500 e is a full well of 5748 e; read noise and offsets, √(10² + 4.22²) e, may show it up to
+    # 4 σ lower.
+    assert calibration.saturation_dn == math.floor(64 + 0.69 * (5748.3 - 4.0 * 10.854))
 
 
 def test_the_papers_constant_is_the_slope_of_its_regression(scene: Scene) -> None:

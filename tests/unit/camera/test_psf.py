@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nir_render.camera.lens import Intrinsics
+from nir_render.camera.otf import Core
 from nir_render.camera.psf import Window, source_window
 from nir_render.geometry import sunflower
 from perception.flare_model import Window as FlareWindow
@@ -47,7 +48,7 @@ def test_energy_and_centroid_are_those_of_the_projection(
     Pixels sample the blurred image, which moves a centroid by up to exp(−2π²σ²)/π: 2e-5 px at σ = 0.7.
     """
     direction = _direction(*place)
-    image = _frame(source_window(LENS, sigma_px, direction, angular_radius_rad, _even))
+    image = _frame(source_window(LENS, Core(sigma_px), direction, angular_radius_rad, _even))
     expected = 1.0e5 * direction[2] * 0.5 * (1.0 + np.cos(angular_radius_rad))
     assert image.sum() == pytest.approx(expected, rel=1e-6)
     assert _centroid(image) == pytest.approx(place, abs=1e-7 + np.exp(-2.0 * np.pi**2 * sigma_px**2) / np.pi)
@@ -65,7 +66,7 @@ def test_a_partly_hidden_source_is_where_its_visible_part_is(place: tuple[float,
     pixels = LENS.project(rays)
     right = pixels[:, 0] > place[0]
     assert right.mean() == pytest.approx(0.5, abs=0.01)
-    image = _frame(source_window(LENS, 0.7, direction, 0.02, _even, rays[right]))
+    image = _frame(source_window(LENS, Core(0.7), direction, 0.02, _even, rays[right]))
     weight = rays[right, 2]
     assert image.sum() == pytest.approx(1.0e5 * weight.mean(), rel=1e-9)
     assert _centroid(image) == pytest.approx(
@@ -74,25 +75,25 @@ def test_a_partly_hidden_source_is_where_its_visible_part_is(place: tuple[float,
     if place[0] < 400.0:
         radius_px = 480.0 * np.tan(0.02)
         assert _centroid(image)[0] - place[0] == pytest.approx(4.0 * radius_px / (3.0 * np.pi), rel=0.006)
-    whole = _frame(source_window(LENS, 0.7, direction, 0.02, _even, rays))
-    exact = _frame(source_window(LENS, 0.7, direction, 0.02, _even))
+    whole = _frame(source_window(LENS, Core(0.7), direction, 0.02, _even, rays))
+    exact = _frame(source_window(LENS, Core(0.7), direction, 0.02, _even))
     # At the rim the rays' grain shows: half a ray's power, of which a pixel takes 0.2756 at most.
     np.testing.assert_allclose(whole / whole.sum(), exact / exact.sum(), atol=0.5 / 4096 * 0.2756)
 
 
 def test_a_point_is_a_gaussian_integrated_over_pixels() -> None:
     """σ = 0.7 px on a pixel's centre: that pixel holds erf(0.5/(0.7 √2))² = 0.27557 of the light."""
-    image = _frame(source_window(LENS, 0.7, _direction(100.0, 80.0), 0.0, np.ones_like))
+    image = _frame(source_window(LENS, Core(0.7), _direction(100.0, 80.0), 0.0, np.ones_like))
     assert image[80, 100] == pytest.approx(0.275572, abs=2e-6)
     assert image[80, 101] == pytest.approx(0.116257, abs=2e-6)
 
 
 def test_an_image_is_cut_at_the_sensor_edge_where_the_light_is() -> None:
     """A point on the outer edge of the corner pixel leaves a quarter of its light on the sensor."""
-    image = _frame(source_window(LENS, 0.7, _direction(-0.5, -0.5), 0.0, np.ones_like))
+    image = _frame(source_window(LENS, Core(0.7), _direction(-0.5, -0.5), 0.0, np.ones_like))
     assert image.sum() == pytest.approx(0.25, abs=1e-6)
-    assert source_window(LENS, 0.7, _direction(-30.0, 50.0), 0.0, np.ones_like).values.size == 0
-    assert source_window(LENS, 0.7, np.array([0.0, 0.0, -1.0]), 0.0, np.ones_like).values.size == 0
+    assert source_window(LENS, Core(0.7), _direction(-30.0, 50.0), 0.0, np.ones_like).values.size == 0
+    assert source_window(LENS, Core(0.7), np.array([0.0, 0.0, -1.0]), 0.0, np.ones_like).values.size == 0
 
 
 @pytest.mark.parametrize("angular_radius_rad", [0.0, 0.0005, 0.01, 0.04])
@@ -108,7 +109,7 @@ def test_two_independent_models_of_the_image_agree(
         response_angle_rad=np.array([0.0, 1.5]), response_relative=np.ones(2), range_constant_dn_m2_per_s=1.0,
         range_constant_paper_dn_m2_per_s=1.0, source_radius_m=0.01, wavelength_m=940e-9,
     )  # fmt: skip
-    ours = source_window(LENS, 0.7, _direction(*place), angular_radius_rad, _even)
+    ours = source_window(LENS, Core(0.7), _direction(*place), angular_radius_rad, _even)
     window = FlareWindow(ours.row, ours.column, *ours.values.shape)
     theirs = flare_image(*place, angular_radius_rad, window, calibration)
     np.testing.assert_allclose(ours.values / ours.values.sum(), theirs.fraction, atol=1e-5)

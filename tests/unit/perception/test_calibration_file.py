@@ -20,7 +20,10 @@ FULL = calibration(
         "position_body_m": 1e-3,
         "rotation_body_camera": 2e-3,
         "saturation_dn": 0.5,
+        "distortion": 1e-4,
     },
+    lens_model="brown_conrady",
+    distortion=(-0.1, 0.01, 1e-3, -1.0 / 3.0, 0.0),
 )
 
 
@@ -35,6 +38,14 @@ def test_round_trip_through_text() -> None:
     for name in ARRAYS[1:]:
         assert np.array_equal(getattr(back, name), getattr(FULL, name)), name
     np.testing.assert_allclose(back.rotation_body_camera, FULL.rotation_body_camera, atol=1e-15)
+
+
+def test_a_file_without_a_lens_model_is_of_a_rectilinear_lens() -> None:
+    document = calibration_document([calibration()])
+    for name in ("lens_model", "distortion"):
+        del document["cameras"]["r1.front"][name]
+    back = parse_calibration_document(document)["r1.front"]
+    assert (back.lens_model, back.distortion) == ("rectilinear", ())
 
 
 def test_layout() -> None:
@@ -62,6 +73,11 @@ def test_layout() -> None:
         ("response_angle_rad", [0.0, 0.2, 0.1], "increase"),
         ("response_angle_rad", [0.0, 0.2], "2 numbers"),
         ("read_noise_e", -3.0, "0 or more"),
+        ("lens_model", "pinhole", "Known are rectilinear, brown_conrady, fisheye"),
+        ("lens_model", "fisheye", "A fisheye lens takes 4 numbers in OpenCV's order"),
+        ("lens_model", "rectilinear", "A rectilinear lens takes 0 numbers"),
+        ("distortion", [0.1] * 12, "A brown_conrady lens takes 4 or 5 or 8 numbers"),
+        ("distortion", [0.1, 0.0, "0", 0.0], "finite number"),
     ],
 )
 def test_bad_entries_name_camera_and_field(field: str, value: Any, text: str) -> None:

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perception.sensor import check_frame, clip_level_e, electrons, noise_floor_e2
+from perception.sensor import at_gain, check_frame, clip_level_e, electrons, noise_floor_e2, saturation_dn
 from perception.types import RawFrame
 from tests.unit.perception.simulation import calibration
 
@@ -30,6 +30,19 @@ def test_noise_floor_and_clip_level() -> None:
         calibration(read_noise_e=2.0, system_gain_dn_per_e=0.25), gain=2.0
     ) == pytest.approx(4 + 4 / 12)
     assert clip_level_e(CAMERA, 64.0, 2.0) == pytest.approx(4031 / 1.48)
+
+
+def test_the_well_clips_at_more_counts_with_gain_up_to_full_scale() -> None:
+    """A well that clips at 2 064 DN, 2 000 above black: at gain 1.5 at 3 064 DN, at gain 3 the ADC is first."""
+    camera = calibration(saturation_dn=2064)
+    assert [saturation_dn(camera, gain) for gain in (1.0, 1.5, 3.0)] == [2064, 3064, 4095]
+    assert [saturation_dn(CAMERA, gain) for gain in (1.0, 1.5, 64.0)] == [4095] * 3
+    assert clip_level_e(camera, 64.0, 1.5) == pytest.approx(2000 / 0.74)
+    assert clip_level_e(camera, 64.0, 3.0) == pytest.approx(4031 / 3.0 / 0.74)
+    for_good = at_gain(camera, 1.5)
+    assert for_good.saturation_dn == 3064
+    assert for_good.system_gain_dn_per_e == pytest.approx(1.11)
+    assert clip_level_e(for_good, 64.0) == pytest.approx(2000 / 0.74)
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,18 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({f"{FRONT}.sensor.bit_depth": "10.5 bit"}, "10.5 is not a whole number of bits"),
     ({f"{FRONT}.sensor.full_well": "-5 e"}, f"{FRONT}.sensor.full_well: input should be greater than 0"),
     ({f"{FRONT}.sensor.quantum_efficiency": 1.5}, "a quantum efficiency is at most 1"),
-    ({f"{FRONT}.sensor.system_gain": "0.1 DN/e"}, "only to 614 of 4095 DN; check system_gain"),
+    ({f"{FRONT}.sensor.saturation_capacity": "-5 e"}, f"{FRONT}.sensor.saturation_capacity: input should be greater"),
+    ({f"{FRONT}.sensor.quantum_efficiency": {"points": [["800 nm", 0.5], ["1000 nm", 1.1]]}}, "at most 1"),
+    ({f"{FRONT}.sensor.system_gain": "0.1 DN/e"}, "only to 639 of 4095 DN, so full scale is never reached; it takes 0.701"),
+    ({f"{FRONT}.sensor.system_gain": "0.75 DN/e"}, "takes the ADC to full scale at 5374.7 e, before the 5748.3 e at which"),
+    ({f"{FRONT}.sensor": {"preset": "mt9m031", "saturation_capacity": None}}, "one of 'saturation_capacity'"),
+    ({f"{FRONT}.sensor.read_noise": "700 e"}, "read_noise 700 e leaves less than ten steps of noise"),
+    ({f"{FRONT}.sensor.nonlinearity": {"loss": "20 %", "exponent": 4}}, "makes brighter pixels read darker"),
+    ({f"{FRONT}.sensor.prnu": "30 %"}, f"{FRONT}.sensor.prnu.pixel: input should be less than or equal to"),
+    ({f"{FRONT}.sensor.dsnu": 4}, "dsnu.pixel: 4 is a bare number; write it with its unit, such as '5500 e'"),
+    ({f"{FRONT}.sensor.dark_current": "20 e"}, "dark_current: '20 e' is a number of electrons; wanted a dark current"),
+    ({f"{FRONT}.sensor.blooming": 1.5}, f"{FRONT}.sensor.blooming: input should be less than or equal to 1"),
+    ({f"{FRONT}.sensor.defects": {"dead": "60 %"}}, f"{FRONT}.sensor.defects.dead: input should be less than"),
     ({f"{FRONT}.sensor.black_level": "5000 DN"}, "not below full scale"),
     (
         {f"{FRONT}.sensor.quantum_efficiency": {"points": [["400 nm", 0.5], ["900 nm", 0.1]]}},
@@ -254,7 +265,7 @@ def test_presets_and_curves_may_be_files_beside_the_scene(tmp_path: Path) -> Non
     )
     sensor = load_scene(_write(tmp_path, text)).document.robots["a"].rig.cameras["front"].sensor
     assert sensor.read_noise_e == 3.0
-    assert sensor.full_well_e == 5500.0
+    assert sensor.saturation_capacity_e == 5500.0
     assert np.array(sensor.quantum_efficiency.points) == pytest.approx(
         np.array([[800e-9, 0.3], [940e-9, 0.1], [1100e-9, 0.02]])
     )
@@ -264,7 +275,7 @@ def test_an_override_inside_a_preset_changes_that_part_only(scene: Scene) -> Non
     changed = scene.with_({f"{FRONT}.sensor.read_noise": "5 e"})
     cameras = changed.document.robots["r1"].rig.cameras
     assert cameras["front"].sensor.read_noise_e == 5.0
-    assert cameras["front"].sensor.full_well_e == 5500.0
+    assert cameras["front"].sensor.saturation_capacity_e == 5500.0
     assert cameras["left"].sensor.read_noise_e == 10.0
     assert scene.document.robots["r1"].rig.cameras["front"].sensor.read_noise_e == 10.0
 

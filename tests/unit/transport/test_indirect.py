@@ -274,6 +274,7 @@ def test_a_mirror_shows_the_source_behind_it_where_no_table_holds_ghosts(scene: 
 
 
 LED = "robots.r2.rig.sources.s"
+LENS = "robots.r1.rig.cameras.c.lens"
 
 
 @pytest.mark.parametrize(
@@ -285,6 +286,8 @@ LED = "robots.r2.rig.sources.s"
             "the sun in a scene",
         ),
         ({f"{LED}.pattern": {"points": [["0 deg", 1], ["180 deg", 0]]}}, "emission patterns in a scene"),
+        ({f"{LENS}.model": "fisheye", f"{LENS}.distortion": [0, 0, 0, 0]}, "a fisheye lens in a scene"),
+        ({f"{LENS}.principal_point": "[3, 4] px"}, "a principal point off the sensor's middle in a scene"),
     ],
 )
 def test_what_it_cannot_render_is_refused(scene: Scene, changes: dict[str, Any], said: str) -> None:

@@ -15,7 +15,7 @@ from nir_render import DirectTable, Indirect, Light, Scene, load_scene
 from nir_render.camera.enlarge import Enlargement, without_edges
 from nir_render.camera.lens import aperture_area_m2
 from nir_render.transport.light import Edges
-from nir_render.transport.noise import flare_blocks, flare_pixels, samples_map, settled_exposure_s
+from nir_render.transport.noise import flare_blocks, flare_pixels, planned_exposure_s, samples_map
 
 FILM = (480, 640)
 RADIANCE, EXPOSURE_S = 1e-2, 1e-3
@@ -222,12 +222,27 @@ def test_pixels_rendered_one_by_one_count_in_the_sum(scene: Scene) -> None:
 
 
 def test_an_automatic_exposure_is_that_of_the_brightest_pixel(scene: Scene) -> None:
-    """Target 0.7 of the range up to saturation, within the limits."""
+    """Target 0.7 of the range up to saturation, within the limits; of a bracket the longest."""
     auto = {"target": 0.7, "shortest": "20 us", "longest": "2 ms"}
-    camera = scene.with_({"robots.r1.rig.cameras.front.auto_exposure": auto}).camera("r1.front")[1]
-    range_e = (4095.0 - 64.0) / 0.74  # this ADC clips before the well is full
-    assert settled_exposure_s(camera, 1e7) == pytest.approx(0.7 * range_e / 1e7)
-    assert settled_exposure_s(camera, 1e12) == pytest.approx(20e-6)
-    assert settled_exposure_s(camera, 0.0) == pytest.approx(2e-3)
+    front = "robots.r1.rig.cameras.front"
+    # This ADC clips before the well is full.
+    sensor = {"preset": "mt9m031", "full_well": "6000 e", "system_gain": "0.74 DN/e"}
+    scene = scene.with_({f"{front}.sensor": sensor})
+    camera = scene.with_({f"{front}.auto_exposure": auto}).camera("r1.front")[1]
+    range_e = (4095.0 - 64.0) / 0.74
+    assert planned_exposure_s(camera, 1e7) == pytest.approx(0.7 * range_e / 1e7)
+    assert planned_exposure_s(camera, 1e12) == pytest.approx(20e-6)
+    assert planned_exposure_s(camera, 0.0) == pytest.approx(2e-3)
     fixed = scene.camera("r1.front")[1]
-    assert settled_exposure_s(fixed, 1e6) == fixed.exposure_s
+    assert planned_exposure_s(fixed, 1e6) == fixed.exposure_s
+    bracket = scene.with_({f"{front}.bracket": ["50 us", "0.8 ms", "0.2 ms"]}).camera("r1.front")[1]
+    assert planned_exposure_s(bracket, 1e6) == pytest.approx(8e-4)
+
+
+def test_a_plan_is_for_sources_that_are_fully_lit(scene: Scene) -> None:
+    """One of two sources is dark at the light's time, and for good: the counts are those of both lit."""
+    blinking = {"bits": {"pattern": "0", "rate": "1 Hz", "start": "-0.5 s", "repeat": "forever"}}
+    dark = scene.with_({"robots.r2.rig.sources.top.drive": blinking})
+    lit, unlit = (_counts(one, _even_need(scene, 60.0), 0.05) for one in (scene, dark))
+    np.testing.assert_array_equal(unlit, lit)
+    assert lit.max() == 64
