@@ -26,7 +26,7 @@ from nir_render.randomness import FrameKey, generator
 
 RUNS = 15
 CAMERA = "r1.front"
-BLOCK = 32768
+BLOCK = 131072
 
 
 def main() -> None:

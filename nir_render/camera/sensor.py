@@ -23,7 +23,8 @@ from nir_render.scene.sensor import Sensor
 Floats = NDArray[np.float32]
 
 _READ_NOISE_MARGIN = 4.0
-_BLOCK_PIXELS = 32768  # drawn at once: what fits into a core's own cache; bits follow from it
+# Drawn at once: small enough for a core's cache, large enough that workers do not wait for the interpreter.
+_BLOCK_PIXELS = 131072
 
 
 def read_out(

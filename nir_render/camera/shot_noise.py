@@ -5,6 +5,8 @@ variate by the asymptotic expansion of the Poisson quantile; where it is small, 
 probabilities.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ Words = NDArray[np.uint32]
 # From this mean on the expansion holds: it shifts 1.1e-5 of the probability, and less beyond.
 EXPANSION_MEAN = 16.0
 _FEW = 0.25
+_RARE = 1.0 - 2.0**-12
 
 
 def normal(words: Words) -> Floats:
@@ -67,13 +70,22 @@ def large_poisson(mean: Floats, z: Floats) -> Floats:
 def small_poisson(mean: Floats, words: Words) -> Floats:
     """Return Poisson variates of means below `EXPANSION_MEAN`, by adding up probabilities from 0 on.
 
-    Exact for the uniform variates, of 32 bits; nothing rarer than 2⁻³³ happens.
+    In float32, which misplaces 1e-6 of the probability; the uppermost 2⁻¹² of the words, where that would
+    show, in float64. Nothing rarer than 2⁻³³ happens.
     """
-    uniform = (words + 0.5) * 2.0**-32
-    rate = mean.astype(np.float64)
+    uniform = words.astype(np.float32)
+    uniform *= np.float32(2.0**-32)
+    rare = np.flatnonzero(words >= np.uint32(_RARE * 2.0**32))
+    drawn = _counted(mean, np.minimum(uniform, np.float32(_RARE), out=uniform))
+    drawn[rare] = _counted(mean[rare].astype(np.float64), (words[rare] + 0.5) * 2.0**-32)
+    return drawn.astype(np.float32)
+
+
+def _counted(rate: NDArray[Any], uniform: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the smallest counts whose cumulated probability reaches the uniform variates, shape (n,)."""
     probability = np.exp(-rate)
     total = probability.copy()
-    drawn = np.zeros(mean.shape, dtype=np.float32)
+    drawn = np.zeros(rate.shape, dtype=np.uint8)
     left: NDArray[np.int64] | None = None  # of the few that are not done; all until then
     count = 0
     while True:
@@ -87,11 +99,11 @@ def small_poisson(mean: Floats, words: Words) -> Floats:
             uniform, rate, probability, total = uniform[keep], rate[keep], probability[keep], total[keep]
         count += 1
         if left is None:
-            drawn += above
+            drawn += above.view(np.uint8)
         else:
             drawn[left] = count
         probability *= rate
-        probability *= 1.0 / count
+        probability *= rate.dtype.type(1.0 / count)
         total += probability
 
 
