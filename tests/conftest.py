@@ -6,10 +6,18 @@ import pytest
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip, by name, what needs Mitsuba where it has no wheel."""
-    if importlib.util.find_spec("mitsuba") is not None:
+    """Skip, by name, what needs Mitsuba where it has no wheel, or a vectorised variant where there is none."""
+    if importlib.util.find_spec("mitsuba") is None:
+        _skip(items, "mitsuba", "needs Mitsuba, which is not installed")
         return
-    skip = pytest.mark.skip(reason="needs Mitsuba, which is not installed")
+    if any(item.get_closest_marker("vectorised") for item in items):
+        from nir_render.transport.backend import backend
+
+        if not backend().vectorised:
+            _skip(items, "vectorised", "needs an LLVM or CUDA variant")
+
+
+def _skip(items: list[pytest.Item], marker: str, reason: str) -> None:
     for item in items:
-        if item.get_closest_marker("mitsuba") is not None:
-            item.add_marker(skip)
+        if item.get_closest_marker(marker) is not None:
+            item.add_marker(pytest.mark.skip(reason=reason))

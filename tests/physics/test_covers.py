@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from nir_render.transport.backend import backend
 from tests.physics.conftest import Loader
 from tests.physics.documents import (
     camera_document,
@@ -18,7 +17,7 @@ from tests.physics.documents import (
 
 pytestmark = [
     pytest.mark.mitsuba,
-    pytest.mark.skipif(not backend().vectorised, reason="needs an LLVM or CUDA variant"),
+    pytest.mark.vectorised,
 ]
 
 REFLECTANCE = 0.6

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nir_render.transport.backend import backend
 from nir_render.transport.kernel import scatter
 from tests.physics.conftest import Loader
 from tests.physics.documents import (
@@ -22,7 +21,7 @@ from tests.physics.fog_forms import henyey_greenstein, single_scatter_per_w
 
 pytestmark = [
     pytest.mark.mitsuba,
-    pytest.mark.skipif(not backend().vectorised, reason="needs an LLVM or CUDA variant"),
+    pytest.mark.vectorised,
 ]
 
 Array = NDArray[np.float64]

@@ -22,15 +22,9 @@ from tests.physics.documents import (
 from tests.physics.fog_forms import PhaseFunction, henyey_greenstein, single_scatter_per_w, tabulated
 from tests.physics.stock import stock_radiance
 
-pytestmark = pytest.mark.mitsuba
+pytestmark = [pytest.mark.mitsuba, pytest.mark.vectorised]
 
 Array = NDArray[np.float64]
-
-
-@pytest.fixture(autouse=True)
-def _needs_llvm() -> None:
-    if not backend().vectorised:
-        pytest.skip("without LLVM light groups are rendered by Mitsuba's own path tracer")
 
 
 WALL_M, REFLECTANCE = 3.0, 0.6

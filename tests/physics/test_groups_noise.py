@@ -12,19 +12,12 @@ from numpy.typing import NDArray
 
 from nir_render import Scene, load_scene, render
 from nir_render.expected import diffuse_image, fluxes
-from nir_render.transport.backend import backend
 from tests.physics.documents import rectangle_document
 from tests.physics.rooms import ROOMS, plain
 
-pytestmark = pytest.mark.mitsuba
+pytestmark = [pytest.mark.mitsuba, pytest.mark.vectorised]
 
 Array = NDArray[np.float64]
-
-
-@pytest.fixture(autouse=True)
-def _needs_llvm() -> None:
-    if not backend().vectorised:
-        pytest.skip("without LLVM light groups are rendered by Mitsuba's own path tracer")
 
 
 SEEDS, SETS = 64, 3

@@ -21,19 +21,12 @@ from nir_render import Light, Scene, load_scene, render
 from nir_render.compare import compare_batches
 from nir_render.expected import diffuse_image, expected, flare_apertures, fluxes
 from nir_render.render_noise import aperture_variances_e2, render_noise, render_variance_e2
-from nir_render.transport.backend import backend
 from tests.physics.rooms import plain
 
-pytestmark = pytest.mark.mitsuba
+pytestmark = [pytest.mark.mitsuba, pytest.mark.vectorised]
 
 SEEDS = 16
 Array = NDArray[np.float64]
-
-
-@pytest.fixture(autouse=True)
-def _needs_llvm() -> None:
-    if not backend().vectorised:
-        pytest.skip("without LLVM a target for the noise is not known")
 
 
 @dataclass(frozen=True)

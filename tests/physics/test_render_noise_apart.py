@@ -11,13 +11,12 @@ import nir_render as nr
 from nir_render.expected import expected
 from nir_render.noise_facts import noise_facts, noise_warning
 from nir_render.render_noise import render_noise
-from nir_render.transport.backend import backend
 from tests.physics.documents import rectangle_document, scene_document, source_document
 
 pytestmark = [
     pytest.mark.mitsuba,
     pytest.mark.verify,
-    pytest.mark.skipif(not backend().vectorised, reason="needs a vectorised Mitsuba variant"),
+    pytest.mark.vectorised,
 ]
 
 RENDERS = 16

@@ -27,7 +27,7 @@ from tests.physics.stock import stock_radiance
 
 pytestmark = [
     pytest.mark.mitsuba,
-    pytest.mark.skipif(not backend().vectorised, reason="needs an LLVM or CUDA variant"),
+    pytest.mark.vectorised,
 ]
 
 Array = NDArray[np.float64]

@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from nir_render import expected_electrons, expose, render
-from nir_render.transport.backend import backend
 from tests.physics.conftest import Loader
 from tests.physics.documents import (
     camera_document,
@@ -22,7 +21,7 @@ from tests.physics.documents import (
 
 pytestmark = [
     pytest.mark.mitsuba,
-    pytest.mark.skipif(not backend().vectorised, reason="needs an LLVM or CUDA variant"),
+    pytest.mark.vectorised,
 ]
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from nir_render.transport.kernel.tables import upload_guide, upload_lights
 
 pytestmark = [
     pytest.mark.mitsuba,
-    pytest.mark.skipif(not backend().vectorised, reason="needs an LLVM or CUDA variant"),
+    pytest.mark.vectorised,
 ]
 
 ROOM = """
