@@ -5,7 +5,7 @@
 Frames of 1280 × 960 pixels of the arena's front camera, with its own exposure, on all processors: seven light
 groups. `expose_ms` is one frame of a light whose rates are known (indirect light enlarged, weighted with the
 response and blurred: `rates_ms`, once per light); in `expose_driven_ms` every source blinks on its own.
-`mean_ms` is the frame without noise, `read_out_ms` all noise and the converter; `poisson_one_ms` is the shot
+`mean_ms` is the frame without noise, `read_out_ms` all noise and the converter; `poisson_ms` is the shot
 noise alone, `numpy_poisson_ms` the same by numpy's own generator, both on one processor.
 """
 
@@ -54,8 +54,8 @@ def main() -> None:
 
     blocks = [slice(first, first + BLOCK) for first in range(0, flat.size, BLOCK)]
 
-    def frame_of(rates_of: nr.Scene, number: int) -> None:
-        nr.expose(light, rates_of, exposure_s=exposure_s, index=number)
+    def frame_of(taken: nr.Scene, number: int) -> None:
+        nr.expose(light, taken, exposure_s=exposure_s, index=number)
 
     parts: dict[str, Callable[[], object]] = {
         "expose_ms": lambda: frame_of(scene, 1),
@@ -63,7 +63,7 @@ def main() -> None:
         "mean_driven_ms": lambda: exposed(of_blinking, exposure_s, 0.01),
         "read_out_ms": lambda: read_out(mean.electrons, device, exposure_s, key),
         "read_out_one_ms": lambda: read_out(mean.electrons, device, exposure_s, key, threads=1),
-        "poisson_one_ms": lambda: [shot(part, number) for number, part in enumerate(blocks)],
+        "poisson_ms": lambda: [shot(part, number) for number, part in enumerate(blocks)],
         "numpy_poisson_ms": lambda: generator(1, "read_out", CAMERA, 0).poisson(mean.electrons),
         "rates_ms": lambda: rates(light, scene),
     }
@@ -92,7 +92,7 @@ def main() -> None:
                 "runs": RUNS,
                 "expose_driven_ms": round(statistics.median(driven_ms), 2),
                 **medians,
-                "poisson_gain": round(medians["numpy_poisson_ms"] / medians["poisson_one_ms"], 2),
+                "poisson_gain": round(medians["numpy_poisson_ms"] / medians["poisson_ms"], 2),
             }
         )
     )

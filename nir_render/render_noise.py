@@ -3,8 +3,8 @@
 Both are variances in e² per pixel: that of the render as it measured it itself, from batches, and the
 temporal variance of the sensor, shot plus read noise. The lens's blur is left out where a pixel is spoken of:
 it moves render noise to neighbours, and by averaging only lowers it; `share_behind_lens` has it. Pixels that
-saturate count with the shot noise that they would have without. Sources count as they are driven in the
-frame, over all its rows.
+saturate count with the shot noise that they would have without. Sources count as each row of pixels sees
+them driven.
 
 What a render says of itself is its own estimate: paths so rare that no sample found them are not in it.
 """
@@ -20,7 +20,7 @@ from nir_render.camera.apertures import Aperture, aperture_weights
 from nir_render.camera.enlarge import enlarge, enlarge_variance, without_edges
 from nir_render.camera.exposure import blur, diffuse_electrons
 from nir_render.camera.sensor import dark_variance_e2
-from nir_render.expected import Expected, by_spectrum, flare_apertures, fluxes
+from nir_render.expected import Expected, Rates, by_spectrum, flare_apertures, fluxes
 from nir_render.randomness import generator
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
@@ -75,52 +75,62 @@ def render_noise(mean: Expected, scene: Scene) -> RenderNoise:
     if mean.light.indirect is None:
         return RenderNoise()
     apertures = flare_apertures(mean.light, camera)
-    per_s2 = _variance_per_s2(mean.light, scene, tuple(mean.levels.tolist()))
-    square_s2 = mean.exposure_s**2  # light is linear in the exposure
-    noise_e2 = per_s2.of_pixels_e2 * square_s2
+    per_s2 = _variance_per_s2(mean.rates)
+    # Light is linear in the exposure, and in what the row of pixels collects of each drive.
+    squares_s2 = (mean.profiles * mean.exposure_s) ** 2
+    noise_e2 = np.einsum("dr,drc->rc", squares_s2, per_s2.of_pixels_e2)
     sensor_e2 = temporal_variance_e2(mean, camera)
     reached = noise_e2 > 0.0
     if not reached.any():
         return RenderNoise()
     share = noise_e2[reached] / sensor_e2[reached]
     of_apertures = [
-        noise * square_s2 / one.sum(sensor_e2)
-        for noise, one in zip(per_s2.of_apertures_e2, apertures, strict=True)
+        float(_over_rows(one, squares_s2) @ noise) / one.sum(sensor_e2)
+        for noise, one in zip(per_s2.of_apertures_e2.T, apertures, strict=True)
     ]
     return RenderNoise(
         median_share=float(np.median(share)),
         mean_share=float(noise_e2[reached].sum() / sensor_e2[reached].sum()),
-        share_behind_lens=per_s2.behind_lens_e2 * square_s2 / float(sensor_e2.mean()),
+        share_behind_lens=float((squares_s2 * per_s2.behind_lens_e2).sum() / sensor_e2.sum()),
         share_of_99_percent=float(np.quantile(share, _NEARLY_ALL)),
         largest_share=float(share.max()),
-        aperture_share=float(max(of_apertures, default=0.0)),
+        aperture_share=max(of_apertures, default=0.0),
         reached=float(reached.mean()),
     )
 
 
+def _over_rows(aperture: Aperture, of_rows: Array) -> Array:
+    """Return means over an aperture's pixels of what rows have, shape (drives, rows); shape (drives,)."""
+    return np.asarray(np.average(of_rows[:, aperture.rows], axis=1, weights=aperture.inside.sum(axis=1)))
+
+
 @dataclass(frozen=True, eq=False)
 class _Variance:
-    """What rendering adds to an exposure of one second: to each pixel, to apertures, to the mean pixel."""
+    """What rendering adds to an exposure of one second of each drive, fully lit.
 
-    of_pixels_e2: Array
+    To each pixel, shape (drives, rows, columns); to the sums over apertures, shape (drives, apertures);
+    behind the lens to the sums of the squares over rows of pixels, shape (drives, rows).
+    """
+
+    of_pixels_e2: NDArray[np.float32]
     of_apertures_e2: Array
-    behind_lens_e2: float
+    behind_lens_e2: Array
 
 
-@lru_cache(maxsize=8)
-def _variance_per_s2(light: Light, scene: Scene, levels: tuple[float, ...]) -> _Variance:
-    _, camera = scene.camera(light.camera)
-    driven = np.array(levels)
-    apertures = flare_apertures(light, camera)
+@lru_cache(maxsize=4)
+def _variance_per_s2(rates: Rates) -> _Variance:
+    light, scene = rates.light, rates.scene
+    apertures = flare_apertures(light, rates.camera)
+    levels = [np.where(rates.drive == number, 1.0, 0.0) for number in range(len(rates.drives))]
     return _Variance(
-        of_pixels_e2=render_variance_e2(light, scene, 1.0, driven),
-        of_apertures_e2=aperture_variances_e2(light, scene, 1.0, apertures, driven),
-        behind_lens_e2=variance_behind_lens_e2(light, scene, 1.0, driven),
+        np.stack([render_variance_e2(light, scene, 1.0, of_drive).astype(np.float32) for of_drive in levels]),
+        np.stack([aperture_variances_e2(light, scene, 1.0, apertures, of_drive) for of_drive in levels]),
+        np.stack([_behind_lens_e2(light, scene, of_drive) for of_drive in levels]),
     )
 
 
-def variance_behind_lens_e2(light: Light, scene: Scene, exposure_s: float, levels: Array) -> float:
-    """Return the variance that rendering adds to a frame behind the lens's blur, the mean over its pixels.
+def _behind_lens_e2(light: Light, scene: Scene, levels: Array) -> Array:
+    """Return the variance per s² behind the lens's blur, summed over each row of pixels, shape (rows,).
 
     Noise of the variance that the render states is drawn, block by block, and goes the way of light: it is
     enlarged, weighted with the response, blurred. Its mean square has the expectation of that variance,
@@ -132,14 +142,14 @@ def variance_behind_lens_e2(light: Light, scene: Scene, exposure_s: float, level
     how = None if edges is None else edges.enlargement
     draws = int(np.clip(np.ceil(_PIXELS_DRAWN / (rows * columns)), 1, _MOST_DRAWS))
     random = generator(light.seed, "render_noise", light.camera, 0)
-    total_e2 = 0.0
+    total_e2 = np.zeros(rows)
     for _ in range(draws):
         noise_e = np.zeros((rows, columns))
-        for factor, variance, patch in _variances(light, scene, exposure_s, levels):
+        for factor, variance, patch in _variances(light, scene, 1.0, levels):
             of_blocks = np.sqrt(variance) * random.standard_normal(variance.shape)
             of_patch = None if patch is None else np.sqrt(patch) * random.standard_normal(patch.shape)
             noise_e += factor * enlarge(of_blocks, rows, columns, how, of_patch)
-        total_e2 += float((blur(camera, noise_e) ** 2).mean())
+        total_e2 += (blur(camera, noise_e) ** 2).sum(axis=1)
     return total_e2 / draws
 
 

@@ -22,6 +22,7 @@ from nir_render.transport.light import Light
 from perception.types import RawFrame
 
 _SETTLING_STEPS = 8  # of at most 4: enough for a factor of 65 000
+_LIGHTS_KEPT = 8  # of `expose`: of cameras that are exposed by turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
                 states[name] = next_state(states[name], control, camera, frame)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=_LIGHTS_KEPT)
 def _last_rates(light: Light, scene: Scene) -> Rates:
     """Return the rates of a light, and keep them for its next exposure."""
     return rates(light, scene)

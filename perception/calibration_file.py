@@ -37,7 +37,9 @@ _REAL = (
     "range_constant_paper_dn_m2_per_s",
     "source_radius_m",
 )
+_FIXED_PATTERN = ("dsnu_e", "prnu")
 _QUATERNION = "quaternion_body_camera_xyzw"
+_NUMBERS = (*_WHOLE, *_POSITIVE, *_REAL, *_FIXED_PATTERN)
 _LISTS = (_QUATERNION, "position_body_m", "response_angle_rad", "response_relative", "distortion")
 
 
@@ -73,13 +75,12 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
         np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0.0
     ):
         raise ValueError(f"rotation_body_camera of {calibration.camera!r} is no rotation matrix")
-    record: dict[str, Any] = {name: getattr(calibration, name) for name in (*_WHOLE, *_POSITIVE, *_REAL)}
+    record: dict[str, Any] = {name: getattr(calibration, name) for name in _NUMBERS}
     if math.isnan(calibration.range_constant_paper_dn_m2_per_s):
         record["range_constant_paper_dn_m2_per_s"] = None  # its detector found too little to calibrate with
     record[_QUATERNION] = Rotation.from_matrix(matrix).as_quat(canonical=True).tolist()
     for name in ("position_body_m", "response_angle_rad", "response_relative"):
         record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
-    record["dsnu_e"], record["prnu"] = calibration.dsnu_e, calibration.prnu
     record["lens_model"] = calibration.lens_model
     record["distortion"] = [float(number) for number in calibration.distortion]
     for field, sigma in calibration.sigma.items():
@@ -131,8 +132,8 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
     if angles[0] != 0.0 or np.any(np.diff(angles) <= 0.0):
         raise place.error("does not increase from 0", "Sort the angles, the first is 0", "response_angle_rad")
     response = np.array(numbers(values, "response_relative", place, len(angles)))
-    values = {"dsnu_e": 0.0, "prnu": 0.0, **values}
-    for field in ("read_noise_e", "source_radius_m", "dsnu_e", "prnu"):
+    values = {**dict.fromkeys(_FIXED_PATTERN, 0.0), **values}
+    for field in ("read_noise_e", "source_radius_m", *_FIXED_PATTERN):
         if number(values, field, place) < 0.0:
             raise place.error(f"is {values[field]!r}", "Write a number, 0 or more", field)
 
@@ -190,7 +191,7 @@ def _lens(values: Mapping[str, Any], place: Place) -> tuple[str, tuple[float, ..
 def _split_sigmas(record: Mapping[str, Any], place: Place) -> tuple[dict[str, Any], dict[str, float]]:
     """Take {"value": v, "sigma": s} apart."""
     values, sigma = dict(record), {}
-    for name in (*_WHOLE, *_POSITIVE, *_REAL, *_LISTS):
+    for name in (*_NUMBERS, *_LISTS):
         entry = record.get(name)
         if not isinstance(entry, dict):
             continue

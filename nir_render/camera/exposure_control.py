@@ -4,7 +4,7 @@ The paper's camera adapts "to prevent pixel saturation from proximal robots or s
 the brightest pixel is that of the nearest robot, and all others get as much exposure as that one allows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from nir_render.scene.exposure import AutoExposure
 from perception.types import RawFrame
 
 _LARGEST_STEP = 4.0
+_SAME_LIGHT = 0.5  # a peak moves between a pixel's middle and its corner
 # A point's brightest pixel has a neighbour of 1/16 of it with any point spread of σ ≥ 0.32 px.
 _MOST_OVER_NEIGHBOURS = 16
 _AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
@@ -30,6 +31,18 @@ class Setting:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """What a frame, begun at `time_s`, has told of the light: electrons per second in the brightest pixel.
+
+    Where `clipped`, no less than these, and no later frame has told how many.
+    """
+
+    time_s: float
+    rate_e_per_s: float
+    clipped: bool = False
+
+
+@dataclass(frozen=True)
 class ExposureState:
     """What an automatic exposure knows before a frame.
 
@@ -38,11 +51,11 @@ class ExposureState:
     upcoming
         Settings of the frames to come, the next one's first, the newest choice last.
     seen
-        Start of, and electrons per second in the brightest pixel of, the frames that count still.
+        What the frames that count still have told.
     """
 
     upcoming: tuple[Setting, ...]
-    seen: tuple[tuple[float, float], ...] = ()
+    seen: tuple[Seen, ...] = ()
 
 
 def own_setting(camera: Camera, index: int) -> Setting:
@@ -60,19 +73,25 @@ def next_state(state: ExposureState, control: AutoExposure, camera: Camera, fram
     """Return the state after a frame that was taken with `state.upcoming[0]`.
 
     The choice is the setting at which the brightest pixel, of the frames that `control.hold_s` lets count,
-    would be at the target. One step is at most a factor of 4; a clipped pixel tells only that the exposure
-    was too long, and takes that whole step.
+    would be at the target. From this frame to the one that it is for, the level changes by at most a factor
+    of 4. A clipped pixel tells only that the exposure was too long, and takes that whole step: until a later
+    frame shows the same light unclipped, at half of what clipped or more. A darker frame does not: the light
+    may be off. From then on the frame that clipped counts as what it has shown, the level of clipping.
     """
     range_dn = saturation_dn(camera.sensor, frame.gain) - frame.black_level_dn
-    level = (brightest_dn(frame.data_dn) - frame.black_level_dn) / range_dn
-    level = max(level, control.target / _LARGEST_STEP)
-    if level >= 1.0:
-        level = _LARGEST_STEP * control.target
-    rate_e_per_s = level * _range_e(camera, frame.gain) / frame.exposure_s
-    held = tuple(one for one in state.seen if one[0] >= frame.time_s - control.hold_s)
-    seen = (*held, (frame.time_s, rate_e_per_s))
-    chosen = setting_for(camera, control, max(rate for _, rate in seen))
-    return ExposureState((*state.upcoming[1:], chosen), seen)
+    level = max((brightest_dn(frame.data_dn) - frame.black_level_dn) / range_dn, 0.0)
+    full_e_per_s = _range_e(camera, frame.gain) / frame.exposure_s
+    newest = Seen(frame.time_s, min(level, 1.0) * full_e_per_s, level >= 1.0)
+    held = [one for one in state.seen if one.time_s >= frame.time_s - control.hold_s]
+    if not newest.clipped:
+        shown_e_per_s = newest.rate_e_per_s / _SAME_LIGHT
+        held = [replace(one, clipped=one.clipped and one.rate_e_per_s > shown_e_per_s) for one in held]
+    seen = (*held, newest)
+    beyond = max(1.0, _LARGEST_STEP * control.target)
+    brightest = max(one.rate_e_per_s * (beyond if one.clipped else 1.0) for one in seen)
+    at_target = control.target * full_e_per_s
+    brightest = min(max(brightest, at_target / _LARGEST_STEP), at_target * _LARGEST_STEP)
+    return ExposureState((*state.upcoming[1:], setting_for(camera, control, brightest)), seen)
 
 
 def setting_for(camera: Camera, control: AutoExposure, brightest_e_per_s: float) -> Setting:

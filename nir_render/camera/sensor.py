@@ -23,6 +23,7 @@ from nir_render.scene.sensor import Sensor
 Floats = NDArray[np.float32]
 
 _READ_NOISE_MARGIN = 4.0
+_BRIGHTEST_E = 1e30  # beyond any well, and far from the end of float32
 # Drawn at once: small enough for a core's cache, large enough that workers do not wait for the interpreter.
 _BLOCK_PIXELS = 131072
 
@@ -105,7 +106,7 @@ def _charge(
     block: int,
 ) -> Floats:
     """Return the electrons that light and heat release in the pixels of a block of rows."""
-    mean = expected_e.astype(np.float32)
+    mean = np.minimum(expected_e, _BRIGHTEST_E).astype(np.float32)
     if pattern.response is not None:
         mean *= pattern.response[part]
     mean += np.float32(sensor.dark_rate_e_per_s * exposure_s)

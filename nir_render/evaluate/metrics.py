@@ -14,6 +14,7 @@ from nir_render.evaluate.match import countable, match
 from nir_render.evaluate.truth import SourceTruth
 from perception.bearing import direction_camera
 from perception.limits import flare_limit
+from perception.sensor import at_gain
 from perception.types import Calibration, Detection
 
 FrameKey = tuple[str, int]
@@ -122,13 +123,19 @@ def evaluate(
 def source_limits(truth: SourceTruth, calibration: Calibration) -> tuple[float, float]:
     """Return the Cramér–Rao bounds (1 σ) of a source's range from its flux, in metres, and of its bearing.
 
-    The bearing's, in degrees, is the root of the mean squared angle, both directions together. NaN without
-    light.
+    They are those of a camera that has the frame's gain for good, with the light of elsewhere and the dark
+    signal as background. The bearing's, in degrees, is the root of the mean squared angle, both directions
+    together. NaN without light.
     """
     if not truth.direct_e > 0.0:
         return math.nan, math.nan
     limit = flare_limit(
-        calibration, truth.u_px, truth.v_px, truth.range_m, truth.direct_e, truth.background_e
+        at_gain(calibration, truth.gain),
+        truth.u_px,
+        truth.v_px,
+        truth.range_m,
+        truth.direct_e,
+        truth.background_e + truth.dark_e,
     )
     steps_px = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
     left, right, above, below = direction_camera(steps_px + np.array([truth.u_px, truth.v_px]), calibration)

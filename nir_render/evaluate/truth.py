@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.drive import drive_of
 from nir_render.camera.lens import intrinsics_of
-from nir_render.camera.sensor import saturation_dn
+from nir_render.camera.sensor import dark_variance_e2, saturation_dn
 from nir_render.camera.shutter import on_fractions
 from nir_render.expected import Expected, place_of
 from nir_render.scene.devices import Camera
@@ -31,8 +31,9 @@ class SourceTruth:
     with the sources as they were driven: `direct_e` are the expected electrons that came straight, those
     beyond the sensor's edge included; `scattered_e` those of the source's own light that came by way of
     bodies or fog into the pixels of the flare. `background_e` is all light but the flare's, the source's own
-    scattered light included, as a mean per pixel there; `peak_snr` the flare's brightest pixel over the noise
-    there.
+    scattered light included, as a mean per pixel there; `dark_e` the mean dark current's, in every pixel.
+    `peak_snr` is the flare's brightest pixel over the temporal noise there, before the ADC: shot noise of
+    light and dark current, read noise. `gain` is the frame's, a factor on the calibrated system gain.
 
     A ghost, the image of a source in one flat smooth surface, has a row of its own: `ghost_of` is the name
     `robot.source` of whom it shows (None for a source itself), place and range are those of the image behind
@@ -60,6 +61,8 @@ class SourceTruth:
     saturated_px: int
     on_fraction: float
     ghost_of: str | None = None
+    gain: float = 1.0
+    dark_e: float = 0.0
 
     def record(self) -> dict[str, Any]:
         """Return the line of `truth.jsonl`."""
@@ -67,7 +70,15 @@ class SourceTruth:
 
 
 def parse_truth(record: Mapping[str, Any]) -> SourceTruth:
-    """Return the truth of a line of `truth.jsonl`; raise ValueError where a field is missing or unknown."""
+    """Return the truth of a line of `truth.jsonl`.
+
+    `gain` and `dark_e` may be missing: gain 1, no dark current.
+
+    Raises
+    ------
+    KeyError, TypeError
+        A field is missing or unknown.
+    """
     fields = {name: value for name, value in record.items() if name != "format"}
     for name in ("bearing_camera", "bearing_body", "position_body_m"):
         fields[name] = tuple(fields[name])
@@ -120,6 +131,8 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
             saturated_px=flare.saturated_px,
             on_fraction=float(on[mean.rates.centre_row[row]]),
             ghost_of=light.groups[group] if is_ghost else None,
+            gain=frame.gain,
+            dark_e=camera.sensor.dark_rate_e_per_s * mean.exposure_s,
         )
 
 
@@ -142,7 +155,7 @@ def _flare(camera: Camera, mean: Expected, frame: RawFrame, row: int) -> _Flare:
     place = place_of(window)
     all_e = mean.electrons[place]
     # A noiseless sensor has no noise where there is no light, and no signal either.
-    noise_e = np.sqrt(all_e + camera.sensor.read_noise_e**2)
+    noise_e = np.sqrt(all_e + dark_variance_e2(camera.sensor, mean.exposure_s))
     snr = np.divide(own, noise_e, out=np.zeros_like(own), where=noise_e > 0.0)
     pixels = own > 0.01 * own.max()
     clipped = (own > 0.5 * all_e) & (frame.data_dn[place] >= saturation_dn(camera.sensor, frame.gain))

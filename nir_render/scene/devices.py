@@ -46,7 +46,9 @@ class Source(PresetDocument):
 
 
 def _as_text(serial: Any) -> Any:
-    return str(serial) if isinstance(serial, int) else serial
+    if isinstance(serial, int | float):  # YAML reads 0012 as a number, in octal
+        raise ValueError(f"{serial!r} is a number; write the serial number in quotes, such as '0012345'")
+    return serial
 
 
 class Camera(PresetDocument):

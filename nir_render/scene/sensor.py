@@ -16,12 +16,18 @@ from nir_render.scene.units import (
     Electrons,
     Fraction,
     Length,
+    Quantity,
     SystemGain,
     Temperature,
+    Unit,
 )
 
 _LEAST_OF_FULL_SCALE = 0.9  # what the full well must reach: an ADC whose upper counts stay empty is a mistake
 _CLIP_SLACK = 1.002
+SENSOR_TEMPERATURE = Quantity("temperature", "K", "308 K")
+
+
+SensorTemperature = Annotated[float, Unit(SENSOR_TEMPERATURE), Field(ge=150, le=420)]
 
 
 class DarkPattern(Document):
@@ -116,9 +122,9 @@ class Sensor(PresetDocument):
     full_well_e: Annotated[Electrons, Positive] | None = None
     read_noise_e: Annotated[Electrons, NotNegative]
     dark_current_e_per_s: Annotated[DarkCurrent, NotNegative] = 0.0
-    dark_current_doubling_k: Annotated[Temperature, Positive] = 7.0
-    reference_temperature_k: Annotated[Temperature, Positive] = 298.15
-    temperature_k: Annotated[Temperature, Positive] = 298.15
+    dark_current_doubling_k: Annotated[Temperature, Field(ge=1, le=50)] = 7.0
+    reference_temperature_k: SensorTemperature = 298.15
+    temperature_k: SensorTemperature = 298.15
     dsnu: DarkPattern = DarkPattern()
     prnu: ResponsePattern = ResponsePattern()
     system_gain_dn_per_e: Annotated[SystemGain, Positive]
@@ -134,6 +140,8 @@ class Sensor(PresetDocument):
         values = [value for _, value in curve.points or ()]
         if max([curve.constant or 0.0, *values]) > 1:
             raise ValueError("a quantum efficiency is at most 1")
+        if curve.gaussian is None and max([curve.constant or 0.0, *values]) == 0:
+            raise ValueError("a quantum efficiency of 0 everywhere sees nothing")
         if curve.gaussian is not None:
             raise ValueError("wanted a number, 'points' or 'file'")
         return curve
@@ -161,10 +169,11 @@ class Sensor(PresetDocument):
                 f"black_level {self.black_level_dn:g} DN is not below full scale, {self.full_scale_dn} DN"
             )
         well_e = self.well_e
-        if well_e < 10.0 * self.read_noise_e:
+        noise_e = math.hypot(self.read_noise_e, self.dsnu.total_e)
+        if well_e < 10.0 * noise_e:
             raise ValueError(
-                f"read_noise {self.read_noise_e:g} e leaves less than ten steps of noise below the "
-                f"full well of {well_e:.5g} e"
+                f"read_noise {self.read_noise_e:g} e and dsnu {self.dsnu.total_e:g} e leave less than ten "
+                f"steps of noise below the full well of {well_e:.5g} e"
             )
         gain, black_dn = self.system_gain_dn_per_e, self.black_level_dn
         reached_dn = black_dn + gain * self.read_e(well_e)
@@ -179,10 +188,11 @@ class Sensor(PresetDocument):
         if self.saturation_capacity_e is not None and full_scale_e * _CLIP_SLACK < self.read_e(well_e):
             raise ValueError(
                 f"system_gain {gain:g} DN/e takes the ADC to full scale at {full_scale_e:.5g} e, before the "
-                f"{well_e:.5g} e at which pixels of a saturation_capacity of "
-                f"{self.saturation_capacity_e:g} e clip, so that capacity could not have been measured; take "
-                f"at most {(self.full_scale_dn - black_dn) / self.read_e(well_e):.3g} DN/e, or write "
-                "'full_well' in its place"
+                f"{self.read_e(well_e):.5g} e at which pixels of a saturation_capacity of "
+                f"{self.saturation_capacity_e:g} e clip (as prnu and nonlinearity have it), so that capacity "
+                "could not have been measured; take at most "
+                f"{(self.full_scale_dn - black_dn) / self.read_e(well_e):.3g} DN/e, or write 'full_well' in "
+                "its place"
             )
         return self
 

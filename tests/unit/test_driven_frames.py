@@ -228,6 +228,24 @@ def test_render_noise_is_that_of_the_frame_as_driven(base: Scene) -> None:
     assert render_noise(expected(light, dark, 0.05, 0.02), dark).reached == 0.0
 
 
+def test_render_noise_behind_a_rolling_shutter_goes_with_the_squares_of_rows(base: Scene) -> None:
+    """A square wave that few rows see: the variance of a row goes with its level's square, whose mean over the
+    rows is three times and more the square of the mean level.
+    """
+    flashes = {"square": {"frequency": "250 Hz", "duty": 0.1}}
+    scene = _with(base, {OWN: flashes, OTHER: flashes, f"{CAMERA}.shutter": ROLLING})
+    light = _light(irradiance=0.0)
+    mean = expected(light, scene, 1e-4, 0.0)
+    (levels,) = mean.profiles
+    assert (levels**2).mean() > 3.0 * levels.mean() ** 2
+    noise_e2 = render_variance_e2(light, scene, 1e-4) * levels[:, None] ** 2
+    sensor_e2 = temporal_variance_e2(mean, scene.camera("r1.front")[1])
+    noise = render_noise(mean, scene)
+    lit = noise_e2 > 0.0
+    assert noise.mean_share == pytest.approx(noise_e2[lit].sum() / sensor_e2[lit].sum(), rel=1e-6)
+    assert noise.largest_share == pytest.approx((noise_e2 / sensor_e2).max(), rel=1e-6)
+
+
 def test_thirty_exposures_of_one_light_show_the_bits(base: Scene) -> None:
     """0101101111 at 10 Hz from 0.012 s on, 30 frames per second of 20 ms each, counted in raw frames.
 

@@ -25,6 +25,17 @@ def test_parts_of_rows_columns_and_pixels_have_their_sizes(camera_with: CameraMa
     assert rest.std() == pytest.approx(4.0, rel=4.0 / np.sqrt(2 * rest.size))
 
 
+def test_parts_of_the_response_have_their_sizes(camera_with: CameraMaker) -> None:
+    """PRNU of 1 % pixels, 0.5 % rows, 0.8 % columns: means over rows and columns tell them apart."""
+    response = fixed_pattern(
+        sensor_with(camera_with, prnu={"pixel": "1 %", "row": "0.5 %", "column": "0.8 %"}), "a"
+    ).response
+    assert response is not None
+    rows, columns = response.mean(axis=1), response.mean(axis=0)
+    assert rows.std() == pytest.approx(np.sqrt(0.005**2 + 0.01**2 / 1280), rel=4.0 / np.sqrt(2 * 960))
+    assert columns.std() == pytest.approx(np.sqrt(0.008**2 + 0.01**2 / 960), rel=4.0 / np.sqrt(2 * 1280))
+
+
 def test_responses_have_mean_one_and_the_spread_of_the_sheet(camera_with: CameraMaker) -> None:
     response = fixed_pattern(sensor_with(camera_with, prnu="1 %"), "a").response
     assert response is not None
