@@ -141,11 +141,13 @@ class Distortion:
     def _tangential_fold(self, radial_rad: float) -> float:
         angle_rad = np.linspace(0.0, min(radial_rad, _WIDEST_RAD), _SCAN_ANGLES)[:, None]
         azimuth_rad = 2.0 * np.pi * np.arange(_SCAN_AZIMUTHS) / _SCAN_AZIMUTHS
-        xx, xy, yy = self._jacobian(
-            np.tan(angle_rad) * np.cos(azimuth_rad), np.tan(angle_rad) * np.sin(azimuth_rad)
-        )
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # the scan may end at a pole of g
+            xx, xy, yy = self._jacobian(
+                np.tan(angle_rad) * np.cos(azimuth_rad), np.tan(angle_rad) * np.sin(azimuth_rad)
+            )
+            area = xx * yy - xy**2
         # Both of its eigenvalues are above 0 as long as the image has not folded; they begin at 1.
-        folded = np.any((xx * yy - xy**2 <= 0.0) | (xx + yy <= 0.0), axis=1)
+        folded = np.any((area <= 0.0) | (xx + yy <= 0.0), axis=1)
         folded[-1:] &= radial_rad >= _RIGHT_ANGLE
         return float(angle_rad[np.argmax(folded) - 1, 0]) if folded.any() else radial_rad
 

@@ -20,6 +20,8 @@ COEFFICIENTS = {"rectilinear": (0,), "brown_conrady": (4, 5, 8), "fisheye": (4,)
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-10)
 _STEPS = 30
+_MISSED_PX = 0.01
+_LARGEST_TANGENT = 100.0
 _SMALL_RAD = 1e-4
 
 
@@ -30,13 +32,7 @@ def project(direction: NDArray[np.float64], calibration: Calibration) -> NDArray
     """
     a, b = direction[:, 0] / direction[:, 2], direction[:, 1] / direction[:, 2]
     if calibration.lens_model == "brown_conrady":
-        k1, k2, p1, p2, k3, k4, k5, k6 = (*calibration.distortion, 0.0, 0.0, 0.0, 0.0)[:8]
-        square = a**2 + b**2
-        radial = polyval(square, [1.0, k1, k2, k3]) / polyval(square, [1.0, k4, k5, k6])
-        a, b = (
-            a * radial + 2.0 * p1 * a * b + p2 * (square + 2.0 * a**2),
-            b * radial + p1 * (square + 2.0 * b**2) + 2.0 * p2 * a * b,
-        )
+        (a, b), _ = _bent(a, b, calibration.distortion)
     elif calibration.lens_model == "fisheye":
         tangent = np.hypot(a, b)
         angle = np.arctan(tangent)
@@ -51,18 +47,15 @@ def project(direction: NDArray[np.float64], calibration: Calibration) -> NDArray
 def unproject(points_px: NDArray[np.float64], calibration: Calibration) -> NDArray[np.float64]:
     """Return the unit directions in camera axes, shape (n, 3), of image points (u, v), shape (n, 2).
 
-    NaN beyond a fisheye's image circle, where the field angle would reach 90°.
+    NaN beyond a fisheye's image circle, where the field angle would reach 90°, and where a brown_conrady lens
+    images nothing that could be found: beyond its fold.
     """
     x = (points_px[:, 0] - calibration.cx_px) / calibration.fx_px
     y = (points_px[:, 1] - calibration.cy_px) / calibration.fy_px
     if calibration.lens_model == "fisheye":
         return _fisheye_direction(x, y, calibration.distortion)
     if calibration.lens_model == "brown_conrady" and len(x):
-        points = np.stack([x, y], axis=1)[:, None]
-        straight = cv2.undistortPoints(
-            points, np.eye(3), np.array(calibration.distortion), criteria=_CRITERIA
-        )
-        x, y = straight[:, 0].T
+        x, y = _straightened(x, y, calibration)
     direction = np.stack([x, y, np.ones_like(x)], axis=1)
     return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
@@ -87,6 +80,58 @@ def stretch(direction: NDArray[np.float64], calibration: Calibration) -> float:
     ahead[:, 2] = np.maximum(ahead[:, 2], 1e-9)
     places = project(ahead, calibration)
     return float(np.linalg.norm(places[::2] - places[1::2], ord=2)) / (2.0 * _SMALL_RAD)
+
+
+def _bent(
+    a: NDArray[np.float64], b: NDArray[np.float64], coefficients: tuple[float, ...]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float64], ...]]:
+    """Return the point (x, y) of brown_conrady at (a, b), and ∂x/∂a, ∂x/∂b = ∂y/∂a, ∂y/∂b there."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    square = a**2 + b**2
+    over, under = polyval(square, [1.0, k1, k2, k3]), polyval(square, [1.0, k4, k5, k6])
+    radial = over / under
+    slope = (
+        polyval(square, [k1, 2.0 * k2, 3.0 * k3]) - radial * polyval(square, [k4, 2.0 * k5, 3.0 * k6])
+    ) / under
+    x = a * radial + 2.0 * p1 * a * b + p2 * (square + 2.0 * a**2)
+    y = b * radial + p1 * (square + 2.0 * b**2) + 2.0 * p2 * a * b
+    xx = radial + 2.0 * a**2 * slope + 2.0 * p1 * b + 6.0 * p2 * a
+    xy = 2.0 * a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+    yy = radial + 2.0 * b**2 * slope + 6.0 * p1 * b + 2.0 * p2 * a
+    return (x, y), (xx, xy, yy)
+
+
+def _straightened(
+    x: NDArray[np.float64], y: NDArray[np.float64], calibration: Calibration
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (a, b) of points of a brown_conrady lens, by Newton's method.
+
+    It starts from OpenCV's fixed-point iteration, which creeps near a fold, and where that has left the
+    field, from the radial terms alone. NaN where it comes no nearer than 0.01 px, or beyond the fold.
+    """
+    points, coefficients = np.stack([x, y], axis=1)[:, None], calibration.distortion
+    straight = cv2.undistortPoints(points, np.eye(3), np.array(coefficients), criteria=_CRITERIA)[:, 0].T
+    height = np.hypot(x, y)
+    tangents, heights = _rising_images(coefficients)
+    scale = np.interp(height, heights, tangents) / np.where(height > 0.0, height, 1.0)
+    found_a, found_b = np.full_like(x, np.nan), np.full_like(y, np.nan)
+    for a, b in ((straight[0], straight[1]), (x * scale, y * scale)):
+        with np.errstate(all="ignore"):  # what runs away is not taken
+            for _ in range(_STEPS):
+                (u, v), (xx, xy, yy) = _bent(a, b, coefficients)
+                area = xx * yy - xy**2
+                step_a, step_b = (yy * (u - x) - xy * (v - y)) / area, (xx * (v - y) - xy * (u - x)) / area
+                a, b = a - step_a, b - step_b
+                if not (np.hypot(step_a, step_b) > 1e-13).any():
+                    break
+            (u, v), (xx, xy, yy) = _bent(a, b, coefficients)
+            missed_px = np.hypot((u - x) * calibration.fx_px, (v - y) * calibration.fy_px)
+            # Before the fold both eigenvalues of the Jacobian are above 0.
+            good = (missed_px <= _MISSED_PX) & (xx * yy - xy**2 > 0.0) & (xx + yy > 0.0)
+            good &= np.hypot(a, b) <= tangents[-1] * (1.0 + 1e-9)
+        new = good & np.isnan(found_a)
+        found_a, found_b = np.where(new, a, found_a), np.where(new, b, found_b)
+    return found_a, found_b
 
 
 def _fisheye_direction(
@@ -120,3 +165,17 @@ def _rising_heights(coefficients: tuple[float, ...]) -> tuple[NDArray[np.float64
     heights = angles * polyval(angles**2, [1.0, *coefficients])
     last = int(np.argmin(np.append(np.diff(heights) > 0.0, False)))
     return angles[: last + 1], heights[: last + 1]
+
+
+@lru_cache(maxsize=16)
+def _rising_images(coefficients: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return tan θ up to where a brown_conrady image turns back, or has a pole, and image heights there.
+
+    Those of the radial terms alone.
+    """
+    tangents = np.tan(np.linspace(0.0, np.arctan(_LARGEST_TANGENT), 4097))
+    radial = (*coefficients[:2], 0.0, 0.0, *coefficients[4:])
+    with np.errstate(all="ignore"):
+        (heights, _), _ = _bent(tangents, np.zeros_like(tangents), radial)
+    last = int(np.argmin(np.append(np.diff(heights) > 0.0, False)))
+    return tangents[: last + 1], heights[: last + 1]

@@ -53,11 +53,9 @@ def beam_window(camera: Camera, beam: Beam, exposure_s: float) -> Window:
         angle_rad = np.arccos(np.clip(cos_angle, -1.0, 1.0))
         return np.asarray(collected_j * cos_angle * beam.response(angle_rad))
 
-    # A rectilinear lens focuses planes, a fisheye about spheres.
-    depth_m = beam.distance_m * (1.0 if camera.lens.model == "fisheye" else max(beam.direction[2], 0.0))
     window = source_window(
         intrinsics_of(camera),
-        core_of(camera, depth_m),
+        core_of(camera, _focal_distance_m(camera, beam)),
         beam.direction,
         beam.angular_radius_rad,
         electrons,
@@ -65,6 +63,16 @@ def beam_window(camera: Camera, beam: Beam, exposure_s: float) -> Window:
     )
     share = camera.point_spread.core_share
     return window if share == 1.0 else replace(window, values=share * window.values)
+
+
+def _focal_distance_m(camera: Camera, beam: Beam) -> float:
+    """Return the distance that focus goes by: a rectilinear lens focuses planes, a fisheye spheres.
+
+    The sun at 90° from the axis is still infinitely far.
+    """
+    if camera.lens.model == "fisheye" or math.isinf(beam.distance_m):
+        return beam.distance_m
+    return beam.distance_m * max(float(beam.direction[2]), 0.0)
 
 
 def diffuse_electrons(

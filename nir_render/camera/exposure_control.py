@@ -4,19 +4,21 @@ The paper's camera adapts "to prevent pixel saturation from proximal robots or s
 the brightest pixel is that of the nearest robot, and all others get as much exposure as that one allows.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.sensor import saturation_dn
+from nir_render.camera.sensor import dark_variance_e2, saturation_dn
 from nir_render.scene.devices import Camera
 from nir_render.scene.exposure import AutoExposure
 from perception.types import RawFrame
 
 _LARGEST_STEP = 4.0
 _SAME_LIGHT = 0.5  # a peak moves between a pixel's middle and its corner
+_ABOVE_NOISE = 10.0
 # A point's brightest pixel has a neighbour of 1/16 of it with any point spread of σ ≥ 0.32 px.
 _MOST_OVER_NEIGHBOURS = 16
 _AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
@@ -76,22 +78,31 @@ def next_state(state: ExposureState, control: AutoExposure, camera: Camera, fram
     would be at the target. From this frame to the one that it is for, the level changes by at most a factor
     of 4. A clipped pixel tells only that the exposure was too long, and takes that whole step: until a later
     frame shows the same light unclipped, at half of what clipped or more. A darker frame does not: the light
-    may be off. From then on the frame that clipped counts as what it has shown, the level of clipping.
+    may be off. From then on the frame that clipped counts as what it has shown, the level of clipping. A
+    frame of less than ten times the dark noise is not held: much of its brightest pixel is noise.
     """
-    range_dn = saturation_dn(camera.sensor, frame.gain) - frame.black_level_dn
-    level = max((brightest_dn(frame.data_dn) - frame.black_level_dn) / range_dn, 0.0)
-    full_e_per_s = _range_e(camera, frame.gain) / frame.exposure_s
-    newest = Seen(frame.time_s, min(level, 1.0) * full_e_per_s, level >= 1.0)
+    newest = _seen(camera, frame)
     held = [one for one in state.seen if one.time_s >= frame.time_s - control.hold_s]
     if not newest.clipped:
         shown_e_per_s = newest.rate_e_per_s / _SAME_LIGHT
         held = [replace(one, clipped=one.clipped and one.rate_e_per_s > shown_e_per_s) for one in held]
-    seen = (*held, newest)
     beyond = max(1.0, _LARGEST_STEP * control.target)
-    brightest = max(one.rate_e_per_s * (beyond if one.clipped else 1.0) for one in seen)
-    at_target = control.target * full_e_per_s
-    brightest = min(max(brightest, at_target / _LARGEST_STEP), at_target * _LARGEST_STEP)
-    return ExposureState((*state.upcoming[1:], setting_for(camera, control, brightest)), seen)
+    brightest = max(one.rate_e_per_s * (beyond if one.clipped else 1.0) for one in (*held, newest))
+    at_target = control.target * _range_e(camera, frame.gain) / frame.exposure_s
+    within_a_step = min(max(brightest, at_target / _LARGEST_STEP), at_target * _LARGEST_STEP)
+    chosen = setting_for(camera, control, within_a_step)
+    dark_e2 = dark_variance_e2(camera.sensor, frame.exposure_s) + camera.sensor.dsnu.total_e**2
+    if newest.clipped or newest.rate_e_per_s * frame.exposure_s >= _ABOVE_NOISE * math.sqrt(dark_e2):
+        held.append(newest)
+    return ExposureState((*state.upcoming[1:], chosen), tuple(held))
+
+
+def _seen(camera: Camera, frame: RawFrame) -> Seen:
+    """Return what a frame tells of its brightest pixel."""
+    range_dn = saturation_dn(camera.sensor, frame.gain) - frame.black_level_dn
+    level = max((brightest_dn(frame.data_dn) - frame.black_level_dn) / range_dn, 0.0)
+    full_e_per_s = _range_e(camera, frame.gain) / frame.exposure_s
+    return Seen(frame.time_s, min(level, 1.0) * full_e_per_s, level >= 1.0)
 
 
 def setting_for(camera: Camera, control: AutoExposure, brightest_e_per_s: float) -> Setting:

@@ -4,7 +4,8 @@ A sphere of uniform radiance fills a cone of directions evenly. The power that t
 each is weighted cos θ · response(θ) · dΩ. The cone is represented by quadrature nodes in *direction*, so any
 projection serves; each node is a point. Its image under a Gaussian is integrated over pixels exactly, by
 error functions; nothing is truncated but the tail beyond 8 sigma (1e-15 of the light). Under any other core
-it is made from the core's transfer function, which loses no light and moves none (`camera/waves.py`).
+it is made from the core's transfer function, which loses no light and moves none (`camera/waves.py`). Discs
+that would need too many nodes are split into inside and edge (`camera/large_disc.py`).
 """
 
 import math
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from nir_render.camera.large_disc import Disc, image_of_large_disc
 from nir_render.camera.lens import Intrinsics
 from nir_render.camera.otf import Core
 from nir_render.camera.waves import image_of_points
@@ -22,6 +24,8 @@ from nir_render.geometry import cone_directions, cone_versine
 
 _TAIL_SIGMAS = 8.0
 _WAVES_PER_SIGMA = 0.84
+_MOST_RINGS = 128
+_SMALL_PX = 40.0  # a disc of which most would be edge
 
 
 def cone_nodes(
@@ -86,18 +90,24 @@ def source_window(
         sigma apart, in images of a radius above 1.8 sigma √(n/π).
     """
     directions, shares = direction[None, :], np.ones(1)
+    is_large = False
     if seen is not None:
         directions, shares = seen, np.full(len(seen), 1.0 / len(seen))
     elif angular_radius_rad > 0.0:
-        rings = _rings(intrinsics, _finest_px(core), direction, angular_radius_rad)
-        directions, shares = cone_nodes(direction, angular_radius_rad, rings)
+        radius_px = intrinsics.image_radius_px(direction, angular_radius_rad)
+        rings = _rings(radius_px, _finest_px(core))
+        is_large = rings > _MOST_RINGS and radius_px > _SMALL_PX
+        directions, shares = cone_nodes(direction, angular_radius_rad, _MOST_RINGS if is_large else rings)
     in_front = directions[:, 2] > 1e-6
     if not in_front.any():
         return Window(np.empty((0, 0)), 0, 0, 0.0)
     directions, shares = directions[in_front], shares[in_front]
     power = shares * power_at(directions[:, 2])
-    pixels = intrinsics.project(directions)
     total = float(power.sum())
+    if is_large:
+        disc = Disc(direction, angular_radius_rad, power_at, total, _finest_px(core))
+        return Window(*image_of_large_disc(intrinsics, core, disc), total)
+    pixels = intrinsics.project(directions)
     sigma_px = core.gaussian_px
     if sigma_px is None:
         values, row, column = image_of_points(core, pixels, power, intrinsics.height_px, intrinsics.width_px)
@@ -113,12 +123,9 @@ def _finest_px(core: Core) -> float:
     return _WAVES_PER_SIGMA / core.highest_frequency if sigma_px is None else sigma_px
 
 
-def _rings(
-    intrinsics: Intrinsics, sigma_px: float, direction: NDArray[np.float64], angular_radius_rad: float
-) -> int:
-    """Return how many rings resolve the disc's image against the blur: error below 1e-6 of the flux."""
-    radius_px = intrinsics.image_radius_px(direction, angular_radius_rad)
-    return min(6 + math.ceil(1.5 * radius_px / sigma_px), 128)
+def _rings(radius_px: float, sigma_px: float) -> int:
+    """Return how many rings resolve a disc's image against the blur: error below 1e-6 of the flux."""
+    return 6 + math.ceil(1.5 * radius_px / sigma_px)
 
 
 def _pixel_shares(

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.special import i0e
+from scipy.special import betainc, i0e
 
 from nir_render.camera.otf import Core, transfer
 
@@ -21,6 +21,9 @@ _TAPS = 8
 _STEPS_PER_WAVE = 4.0
 _BETA = math.pi * math.sqrt((_TAPS * 0.75) ** 2 - 0.8)
 _PERIOD_STEP_PX = 8
+_LEAST_KERNEL_PX = 64.0
+_SLOW = 0.33  # cycles per pixel
+_CHUNK = 1 << 17  # points at a time, to bound the memory
 
 
 def image_of_points(
@@ -69,6 +72,28 @@ def convolve(core: Core, image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(spread[2 * half : 2 * half + image.shape[0], 2 * half : 2 * half + image.shape[1]])
 
 
+def smooth_kernel(core: Core) -> NDArray[np.float64]:
+    """Return what turns samples, at pixels' middles, of light that varies slowly into its image.
+
+    It passes what core and pixel pass of waves longer than three pixels, and nothing of those shorter than
+    two, of which slow light has none, but its samples do; less and less between, so that it ends soon. Its
+    middle has the index size // 2 on both axes.
+    """
+    period = _period_px(max(2.0 * core.reach_px, _LEAST_KERNEL_PX))
+    passed = transfer(core, period)
+    given = passed.shape[1] - 1
+    count = min(given, period // 2 - 1)
+    spectrum = np.zeros((period, period // 2 + 1), dtype=complex)
+    spectrum[np.arange(-count, count + 1), : count + 1] = passed[
+        given - count : given + count + 1, : count + 1
+    ]
+    v, u = np.abs(np.fft.fftfreq(period)), np.fft.rfftfreq(period)
+    faded = (betainc(4, 4, np.clip((0.5 - f) / (0.5 - _SLOW), 0.0, 1.0)) for f in (v[:, None], u))
+    for factor in faded:
+        spectrum *= factor
+    return np.asarray(scipy.fft.fftshift(scipy.fft.irfft2(spectrum, (period, period))))
+
+
 def _period_px(least_px: float) -> int:
     """Return a period of which few exist, so that transfer functions are met again; quick to transform."""
     steps = math.ceil(least_px / _PERIOD_STEP_PX)
@@ -98,13 +123,16 @@ def _periodic_image(
 def _on_grid(places: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points, (u, v) in steps, spread over a grid, shape (v steps, u steps)."""
     first = np.ceil(places - 0.5 * _TAPS).astype(np.int64)
-    index = first[:, :, None] + np.arange(_TAPS)
-    window = _kaiser_bessel(index - places[:, :, None])
-    columns, rows = index.max(axis=(0, 2)) + 1
-    flat = index[:, 1, :, None] * columns + index[:, 0, None, :]
-    weight = (power[:, None] * window[:, 1])[:, :, None] * window[:, 0, None, :]
-    spread = np.bincount(flat.ravel(), weight.ravel(), minlength=int(rows * columns))
-    return np.asarray(spread.reshape(int(rows), int(columns)), dtype=np.float64)
+    columns, rows = (int(size) for size in first.max(axis=0) + _TAPS)
+    spread = np.zeros(rows * columns)
+    for start in range(0, len(power), _CHUNK):
+        here = slice(start, start + _CHUNK)
+        index = first[here, :, None] + np.arange(_TAPS)
+        window = _kaiser_bessel(index - places[here, :, None])
+        flat = index[:, 1, :, None] * columns + index[:, 0, None, :]
+        weight = (power[here, None] * window[:, 1])[:, :, None] * window[:, 0, None, :]
+        spread += np.bincount(flat.ravel(), weight.ravel(), minlength=rows * columns)
+    return spread.reshape(rows, columns)
 
 
 def _kaiser_bessel(steps: NDArray[np.float64]) -> NDArray[np.float64]:

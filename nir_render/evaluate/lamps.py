@@ -15,15 +15,16 @@ from nir_render.transport.rays import crossing
 from nir_render.transport.ways import ghosts, small_lights, straight
 from perception.types import Detection
 
-_EDGE_POINTS = 32
+_EDGE_POINTS = 128
 _MARGIN_PX = 5.0
+_NEAREST_M = 0.01  # along the axis
 
 
 def lamp_outlines_px(scene: Scene, camera: str, time_s: float) -> list[NDArray[np.float32]]:
     """Return the outline of each lamp that a camera sees from in front, as pixels (u, v), shape (n, 2).
 
-    The sun's disc follows, and its images in flat smooth surfaces. An outline is many points, of which those
-    in front of the lens are kept: a lamp that reaches behind the camera keeps the part that is seen. What
+    The sun's disc follows, and its images in flat smooth surfaces. An outline is a polygon of many points in
+    order, concave where the lens bends it so; a lamp that reaches behind the camera is cut off there. What
     hides a lamp is not looked at.
     """
     robot, device = scene.camera(camera)
@@ -34,17 +35,35 @@ def lamp_outlines_px(scene: Scene, camera: str, time_s: float) -> list[NDArray[n
         across, up, normal = rectangle_frame(lamp.normal, lamp.size_m, 0.0).T
         if float(normal @ (pose.position_m - np.array(lamp.center_m))) <= 0.0:
             continue
-        steps = np.linspace(-1.0, 1.0, _EDGE_POINTS)[:, None]
+        steps = np.linspace(-1.0, 1.0, _EDGE_POINTS, endpoint=False)[:, None]
         edges = np.concatenate(
             [steps * across - up, across + steps * up, -steps * across + up, -across - steps * up]
         )
-        local_m = pose.to_local(edges + np.array(lamp.center_m))
-        seen = local_m[local_m[:, 2] > 0.01]
-        if len(seen) >= 3:
+        seen = _in_front(pose.to_local(edges + np.array(lamp.center_m)))
+        if len(seen):
             outlines.append(lens.project(seen).astype(np.float32))
     if scene.document.sun is not None:
         outlines += [lens.project(edge).astype(np.float32) for edge in _suns(scene, pose, time_s)]
     return outlines
+
+
+def _in_front(outline_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the part of a convex outline in camera axes, points in order, that is in front of the lens.
+
+    Where it is cut, it goes on along the cut, in many points, for a lens may bend that too.
+    """
+    ahead = outline_m[:, 2] > _NEAREST_M
+    if ahead.all() or not ahead.any():
+        return outline_m[ahead]
+    last = int(np.flatnonzero(ahead & ~np.roll(ahead, -1))[0])
+    turned = np.roll(outline_m, -1 - last, axis=0)  # those behind come first, those in front after them
+    behind, seen = turned[: int((~ahead).sum())], turned[int((~ahead).sum()) :]
+    start_m, end_m = (
+        inner + (inner[2] - _NEAREST_M) / (inner[2] - outer[2]) * (outer - inner)
+        for inner, outer in ((seen[-1], behind[0]), (seen[0], behind[-1]))
+    )
+    steps = np.linspace(0.0, 1.0, _EDGE_POINTS)[:, None]
+    return np.concatenate([seen, start_m + steps * (end_m - start_m)])
 
 
 def _suns(scene: Scene, pose: Pose, time_s: float) -> list[NDArray[np.float64]]:
@@ -71,6 +90,5 @@ def on_a_lamp(detection: Detection, outlines_px: Sequence[NDArray[np.float32]]) 
     """Tell whether a detection lies on a lamp, or within 5 px of one."""
     place = (detection.u_px, detection.v_px)
     return any(
-        cv2.pointPolygonTest(cv2.convexHull(outline), place, measureDist=True) >= -_MARGIN_PX
-        for outline in outlines_px
+        cv2.pointPolygonTest(outline, place, measureDist=True) >= -_MARGIN_PX for outline in outlines_px
     )

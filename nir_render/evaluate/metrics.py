@@ -123,9 +123,9 @@ def evaluate(
 def source_limits(truth: SourceTruth, calibration: Calibration) -> tuple[float, float]:
     """Return the Cramér–Rao bounds (1 σ) of a source's range from its flux, in metres, and of its bearing.
 
-    They are those of a camera that has the frame's gain for good, with the light of elsewhere and the dark
-    signal as background. The bearing's, in degrees, is the root of the mean squared angle, both directions
-    together. NaN without light.
+    They are those of a camera that has the frame's gain for good, of the light that is in the flare, with the
+    light of elsewhere and the dark signal as background. The bearing's, in degrees, is the root of the mean
+    squared angle, both directions together. NaN without light.
     """
     if not truth.direct_e > 0.0:
         return math.nan, math.nan
@@ -134,7 +134,7 @@ def source_limits(truth: SourceTruth, calibration: Calibration) -> tuple[float, 
         truth.u_px,
         truth.v_px,
         truth.range_m,
-        truth.direct_e,
+        truth.flare_share * truth.direct_e,
         truth.background_e + truth.dark_e,
     )
     steps_px = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])

@@ -12,6 +12,7 @@ from nir_render.camera.lens import intrinsics_of
 from nir_render.camera.sensor import dark_variance_e2, saturation_dn
 from nir_render.camera.shutter import on_fractions
 from nir_render.expected import Expected, place_of
+from nir_render.flare_spread import flare_spread
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
 from nir_render.scene.motion import camera_pose_on_robot
@@ -31,9 +32,11 @@ class SourceTruth:
     with the sources as they were driven: `direct_e` are the expected electrons that came straight, those
     beyond the sensor's edge included; `scattered_e` those of the source's own light that came by way of
     bodies or fog into the pixels of the flare. `background_e` is all light but the flare's, the source's own
-    scattered light included, as a mean per pixel there; `dark_e` the mean dark current's, in every pixel.
-    `peak_snr` is the flare's brightest pixel over the temporal noise there, before the ADC: shot noise of
-    light and dark current, read noise. `gain` is the frame's, a factor on the calibrated system gain.
+    scattered light and the glare and lens ghosts of its light included, as a mean per pixel there; `dark_e`
+    the mean dark current's, in every pixel. `peak_snr` is the flare's brightest pixel over the temporal noise
+    there, before the ADC: shot noise of light and dark current, read noise. `flare_share` is the share of
+    `direct_e` that is in the flare as perception knows it: 1 under a Gaussian point spread, less with glare,
+    ghosts and diffraction. `gain` is the frame's, a factor on the calibrated system gain.
 
     A ghost, the image of a source in one flat smooth surface, has a row of its own: `ghost_of` is the name
     `robot.source` of whom it shows (None for a source itself), place and range are those of the image behind
@@ -63,6 +66,7 @@ class SourceTruth:
     ghost_of: str | None = None
     gain: float = 1.0
     dark_e: float = 0.0
+    flare_share: float = 1.0
 
     def record(self) -> dict[str, Any]:
         """Return the line of `truth.jsonl`."""
@@ -72,7 +76,7 @@ class SourceTruth:
 def parse_truth(record: Mapping[str, Any]) -> SourceTruth:
     """Return the truth of a line of `truth.jsonl`.
 
-    `gain` and `dark_e` may be missing: gain 1, no dark current.
+    `gain`, `dark_e` and `flare_share` may be missing: gain 1, no dark current, all light in the flare.
 
     Raises
     ------
@@ -96,7 +100,7 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
     mount = camera_pose_on_robot(camera)
     table = light.direct
     pixels = intrinsics.project(table.direction)
-    emitters = scene.emitters()
+    emitters, sources = scene.emitters(), scene.sources()
     for row, window in enumerate(mean.windows):
         u_px, v_px = pixels[row]
         lit = float(window.values.sum()) >= 1.0
@@ -133,6 +137,7 @@ def truth_of(scene: Scene, mean: Expected, frame: RawFrame) -> Iterator[SourceTr
             ghost_of=light.groups[group] if is_ghost else None,
             gain=frame.gain,
             dark_e=camera.sensor.dark_rate_e_per_s * mean.exposure_s,
+            flare_share=flare_spread(camera, sources[light.groups[group]][1]).share,
         )
 
 

@@ -1,16 +1,19 @@
-"""What no single field can tell: cameras inside solids, spectra that a sensor's data do not cover."""
+"""What no single field can tell: cameras inside solids, exposures longer than the clock leaves, ..."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.emission import emission_spectrum
 from nir_render.camera.response import efficiency_of
+from nir_render.camera.shutter import row_delay_s
+from nir_render.scene.devices import Camera
 from nir_render.scene.document import SceneDocument
 from nir_render.scene.motion import camera_pose, rotation_of
 from nir_render.scene.world import Box, Cylinder, Dielectric, Pane, Rectangle, ShapeDocument, Sphere
 
 _BAND_M = 940e-9
 _SLACK_M = 1e-15  # what float64 rounds away
+_SLACK = 1e-9
 
 
 def check(document: SceneDocument) -> list[str]:
@@ -20,21 +23,31 @@ def check(document: SceneDocument) -> list[str]:
         *_sheets_and_solids(document),
         *_fog_up_to_the_sun(document),
         *_indivisible_sensors(document),
+        *_exposures_beyond_the_clock(document),
         *_uncovered_curves(document),
         *_cameras_inside_solids(document),
     ]
 
 
 def _indivisible_sensors(document: SceneDocument) -> list[str]:
-    names = dict.fromkeys(name for selector in document.observe for name in document.cameras_of(selector))
-    problems = [indivisible_sensor(document, name) for name in names]
+    problems = [indivisible_sensor(document, name) for name in _observing(document)]
     return [problem for problem in problems if problem is not None]
+
+
+def _observing(document: SceneDocument) -> dict[str, Camera]:
+    """Return the cameras that take frames, by `robot.camera`."""
+    names = dict.fromkeys(name for selector in document.observe for name in document.cameras_of(selector))
+    return {name: _camera_of(document, name) for name in names}
+
+
+def _camera_of(document: SceneDocument, name: str) -> Camera:
+    robot, camera = name.split(".")
+    return document.robots[robot].rig.cameras[camera]
 
 
 def indivisible_sensor(document: SceneDocument, name: str) -> str | None:
     """Return what is wrong where the pixels of the indirect light do not fit the sensor of `robot.camera`."""
-    robot, camera = name.split(".")
-    sensor = document.robots[robot].rig.cameras[camera].sensor
+    sensor = _camera_of(document, name).sensor
     scale = document.render.indirect.scale
     if not document.has_indirect_light() or not (sensor.columns % scale or sensor.rows % scale):
         return None
@@ -42,6 +55,49 @@ def indivisible_sensor(document: SceneDocument, name: str) -> str | None:
         f"render.indirect.scale: {scale} does not divide the sensor of {name}, {sensor.columns} × "
         f"{sensor.rows} pixels; take a divisor of both"
     )
+
+
+def _exposures_beyond_the_clock(document: SceneDocument) -> list[str]:
+    """Tell of rows that would begin before they have ended, and of choices by frames that have not ended."""
+    if document.clock.frames == 1:
+        return []
+    problems = []
+    period_s = (1.0 + _SLACK) / document.clock.frame_rate_hz
+    period = f"{1e3 / document.clock.frame_rate_hz:.4g} ms"
+    mend = "shorten it, or lower clock.frame_rate"
+    for name, camera in _observing(document).items():
+        robot, camera_name = name.split(".")
+        place = f"robots.{robot}.rig.cameras.{camera_name}"
+        rows, auto = camera.sensor.rows, camera.auto_exposure
+        read_out_s = rows * row_delay_s(camera)
+        read_out = f"the read-out of {rows} rows, {1e3 * read_out_s:.4g} ms,"
+        if read_out_s > period_s:
+            problems.append(
+                f"{place}.shutter.line_time: {read_out} lasts longer than the {period} from one frame to the "
+                f"next; {mend}"
+            )
+        for field, exposure_s in _longest_exposures_s(camera).items():
+            exposure = f"{place}.{field}: {1e3 * exposure_s:.4g} ms"
+            if exposure_s > period_s:
+                problems.append(
+                    f"{exposure} is longer than the {period} from one frame to the next: a frame would begin "
+                    f"before the one before has ended; {mend}"
+                )
+            elif auto is not None and exposure_s + read_out_s > auto.latency * period_s:
+                problems.append(
+                    f"{exposure} and {read_out} are longer than {auto.latency} × {period}: an exposure would "
+                    f"be chosen by a frame that has not ended; {mend}, or raise auto_exposure.latency"
+                )
+    return problems
+
+
+def _longest_exposures_s(camera: Camera) -> dict[str, float]:
+    """Return the longest exposure that each field lets a camera take."""
+    if camera.bracket is not None:
+        return {"bracket": max(camera.bracket)}
+    if camera.auto_exposure is not None:
+        return {"exposure": camera.exposure_s, "auto_exposure.longest": camera.auto_exposure.longest_s}
+    return {"exposure": camera.exposure_s}
 
 
 def _flat_cylinders(document: SceneDocument) -> list[str]:

@@ -10,7 +10,7 @@ from nir_render.scene.curves import CurveDocument
 from nir_render.scene.drive import FULL_DRIVE, Drive
 from nir_render.scene.exposure import AutoExposure, Bracket, Gain
 from nir_render.scene.fields import Name, Orientation, Positive
-from nir_render.scene.lens import Lens, check_field
+from nir_render.scene.lens import Lens, check_field, check_focus
 from nir_render.scene.pattern import PatternDocument
 from nir_render.scene.point_spread import PointSpread
 from nir_render.scene.sensor import Sensor
@@ -88,8 +88,9 @@ class Camera(PresetDocument):
         return self
 
     @model_validator(mode="after")
-    def _lens_reaches_the_corners(self) -> Self:
+    def _lens_fits_the_sensor(self) -> Self:
         check_field(self.lens, self.sensor)
+        check_focus(self.lens, self.sensor)
         return self
 
 

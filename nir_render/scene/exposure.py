@@ -20,7 +20,8 @@ class AutoExposure(Document):
     Pixels that stand out alone, hot or stuck ones, do not count. A choice takes effect `latency` frames after
     the frame that it follows from; 1 is the next one. With `most_gain`, gain rises above the camera's own
     where the longest exposure is too short. The brightest frame of the time `hold` counts, not only the last:
-    for sources that blink it should be as long as their dark runs.
+    for sources that blink it should be as long as their dark runs. A step is at most a factor of 4; it is a
+    whole one after a frame that clipped.
     """
 
     target: Annotated[Fraction, Field(gt=0, lt=1)] = 0.7

@@ -31,6 +31,7 @@ _VIGNETTING_SCHEMA = {
 }
 _BORDER_POINTS = 33  # on each side
 _ANGLE_SLACK_RAD = 1e-9
+_LARGEST_BLUR_PX = 100.0
 
 
 class Lens(PresetDocument):
@@ -54,6 +55,16 @@ class Lens(PresetDocument):
     vignetting: Annotated[Points, WithJsonSchema(_VIGNETTING_SCHEMA)] | None = None
     focus_distance_m: Annotated[Length, Positive] | None = None
     thermal_focus_shift_m_per_k: FocusShift = 0.0
+
+    @field_validator("distortion", mode="before")
+    @classmethod
+    def _distortion_is_a_list(cls, numbers: Any) -> Any:
+        if isinstance(numbers, str | int | float):
+            raise ValueError(
+                f"{numbers!r} is no list; write the numbers in brackets and without quotes, "
+                "such as distortion: [-0.1, 0.01, 0, 0]"
+            )
+        return numbers
 
     @field_validator("vignetting", mode="before")
     @classmethod
@@ -114,8 +125,33 @@ def principal_point_px(lens: Lens, sensor: Sensor) -> tuple[float, float]:
     return middle_px if lens.principal_point_px is None else lens.principal_point_px
 
 
+def check_focus(lens: Lens, sensor: Sensor) -> None:
+    """Raise ValueError where what is infinitely far becomes a huge disc: f² / (N (d_f − f)) wide."""
+    if lens.focus_distance_m is None:
+        return
+    beyond_m = lens.focus_distance_m - lens.focal_length_m
+    blur_px = lens.focal_length_m**2 / (lens.f_number * beyond_m * sensor.pixel_pitch_m)
+    if blur_px > _LARGEST_BLUR_PX:
+        least_m = lens.focal_length_m + beyond_m * blur_px / _LARGEST_BLUR_PX
+        raise ValueError(
+            f"lens.focus_distance: focused at {lens.focus_distance_m:g} m, the lens makes of what is far "
+            f"away a disc of {blur_px:.0f} px; wanted at most {_LARGEST_BLUR_PX:.0f} px, which is at "
+            f"{least_m:.3g} m: give a focus_distance from there on, and check its unit"
+        )
+
+
 def check_field(lens: Lens, sensor: Sensor) -> None:
-    """Raise ValueError where what is known of a lens does not reach to the corners of a sensor."""
+    """Raise ValueError where what is known of a lens does not reach to the corners of a sensor.
+
+    Or where its axis lies more than a frame's width or height beside the sensor.
+    """
+    size_px = (sensor.columns, sensor.rows)
+    for axis_px, pixels in zip(principal_point_px(lens, sensor), size_px, strict=True):
+        if not -pixels <= axis_px <= 2 * pixels:
+            raise ValueError(
+                f"lens.principal_point: {axis_px:g} px lies more than a frame, {pixels} px, beside the "
+                "sensor, where no lens has its axis; give (u, v) from the middle of the top left pixel"
+            )
     distortion = Distortion(lens.model, lens.distortion)
     focal_px = lens.focal_length_m / sensor.pixel_pitch_m
     points = _border(lens, sensor) / focal_px

@@ -85,12 +85,20 @@ def _contrast_at_the_limit(grid: NDArray[np.float64]) -> float:
 
 def _read_grid(path: Path) -> list[str]:
     """Return the rows of a CSV file of numbers, as a document writes them; lines with # are comments."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
-    try:
-        return [format_vector(tuple(float(cell) for cell in row), FRACTION) for row in rows]
-    except ValueError as error:
-        raise ValueError(f"{path}: wanted rows of numbers, with no header ({error})") from None
+    rows = []
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+        try:
+            text = line.decode("utf-8-sig").strip()
+            if not text or text.startswith("#"):
+                continue
+            cells = next(csv.reader([text]))
+            rows.append(format_vector(tuple(float(cell) for cell in cells), FRACTION))
+        except ValueError as error:
+            raise ValueError(
+                f"{path}, line {number}: wanted rows of numbers, with no header, one comma between two "
+                f"numbers and none at the end, such as 0, 0.5, 0; written in UTF-8 ({error})"
+            ) from None
+    return rows
 
 
 class Glare(Document):
@@ -151,8 +159,12 @@ class PointSpread(Document):
     @model_validator(mode="before")
     @classmethod
     def _no_ghosts(cls, data: Any) -> Any:
-        if isinstance(data, Mapping) and data.get("ghosts", ()) is None:
+        if not isinstance(data, Mapping):
+            return data
+        if data.get("ghosts", ()) is None:
             return {key: value for key, value in data.items() if key != "ghosts"}
+        if isinstance(data.get("ghosts"), Mapping | str):
+            raise ValueError(f"ghosts: wanted a list, even of one; write ghosts: [{LensGhost.example}]")
         return data
 
     @model_validator(mode="after")

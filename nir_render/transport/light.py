@@ -1,7 +1,10 @@
-"""The product of transport: how one watt of each light group reaches a camera. Plain numpy."""
+"""The product of transport: how one watt of each light group reaches a camera. Plain numpy, read-only.
+
+What follows from a light is kept by its identity, so that its arrays must not change.
+"""
 
 import html
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +12,18 @@ from numpy.typing import NDArray
 from nir_render.camera.enlarge import Enlargement
 
 
+class _ReadOnly:
+    """Makes the arrays of a dataclass read-only."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            array = getattr(self, field.name)
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+
+
 @dataclass(frozen=True, eq=False)
-class DirectTable:
+class DirectTable(_ReadOnly):
     """The light of small sources, the sun among them, that is seen straight or in one flat smooth surface.
 
     One row per source in front of the camera, hidden or not, then one per ghost of which a part is seen: the
@@ -54,7 +67,7 @@ class DirectTable:
 
 
 @dataclass(frozen=True, eq=False)
-class Edges:
+class Edges(_ReadOnly):
     """What keeps the edges of light that was rendered in blocks sharp.
 
     `radiance_per_w` and `variance`, shape (group, node, pixel), are those of the pixels
@@ -67,7 +80,7 @@ class Edges:
 
 
 @dataclass(frozen=True, eq=False)
-class Indirect:
+class Indirect(_ReadOnly):
     """All other light: off walls and floor, mirrored more than once, through glass, from lamps, off fog.
 
     Attributes

@@ -1,6 +1,7 @@
 """Frames of sources that blink, made from lights by hand: levels, stripes, parasitic light, truth, noise."""
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from nir_render import InputError, Scene, expose, load_scene
 from nir_render.camera.exposure import blur
 from nir_render.evaluate.truth import SourceTruth, truth_of
 from nir_render.expected import (
+    Rates,
     diffuse_image,
     expected,
     expected_electrons,
@@ -314,6 +316,27 @@ def test_frames_say_how_they_were_taken(base: Scene) -> None:
         expose(light, base, time_s=float("nan"))
 
 
+def test_cameras_that_are_exposed_by_turns_keep_their_rates(
+    base: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are kept by the light itself: so its arrays cannot be changed."""
+    lights, computed = [_light() for _ in range(4)], []
+
+    def counted(light: Light, scene: Scene) -> Rates:
+        computed.append(light)
+        return rates(light, scene)
+
+    monkeypatch.setattr(sys.modules["nir_render.simulate"], "rates", counted)
+    for index in range(3):
+        for light in lights:
+            expose(light, base, index=index)
+    assert computed == lights
+    assert lights[0].indirect is not None
+    for array in (lights[0].indirect.radiance_per_w, lights[0].direct.distance_m):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0.0
+
+
 def test_gain_multiplies_counts_above_black(base: Scene) -> None:
     """Gain 4 and 1 of the same light, 40 frames each: mean counts of the dim ground are as 4 to 1, to 1 %."""
     light, sums = dataclasses.replace(_light()), []
@@ -327,7 +350,9 @@ def test_gain_multiplies_counts_above_black(base: Scene) -> None:
 def test_lights_that_are_not_finite_are_refused(base: Scene) -> None:
     light = _light()
     assert light.indirect is not None
-    light.indirect.radiance_per_w[0, 0, 3, 3] = np.nan
+    radiance = light.indirect.radiance_per_w.copy()
+    radiance[0, 0, 3, 3] = np.nan
+    light = dataclasses.replace(light, indirect=dataclasses.replace(light.indirect, radiance_per_w=radiance))
     with pytest.raises(InputError, match="is not finite"):
         rates(light, base)
 

@@ -101,7 +101,7 @@ def test_photometry(shot: tuple[RawFrame, SourceTruth]) -> None:
         0.0,
     )
     peak_e = _image_e(SOURCE_M, 0.2, EXPOSURE_S).max()
-    assert truth.peak_snr == pytest.approx(peak_e / math.sqrt(peak_e + 100.0 + 20.0 * EXPOSURE_S), rel=1e-3)
+    assert truth.peak_snr == pytest.approx(peak_e / math.sqrt(peak_e + 100.0 + 20.0 * EXPOSURE_S), rel=3e-4)
     assert truth.dark_e == pytest.approx(20.0 * EXPOSURE_S, rel=1e-9)
     assert (truth.gain, frame.time_s, frame.exposure_s) == (1.0, 0.0, EXPOSURE_S)
 
@@ -122,9 +122,9 @@ def test_light_of_another_source_is_background(scene: Scene) -> None:
     own_e, other_e = (_image_e(place_m, 2e-3, EXPOSURE_S) for place_m in (SOURCE_M, other_m))
     background_e = other_e[own_e > 0.01 * own_e.max()].mean()
     assert background_e > 10.0
-    assert truth.background_e == pytest.approx(background_e, rel=2e-3)
+    assert truth.background_e == pytest.approx(background_e, rel=1e-4)
     snr = (own_e / np.sqrt(own_e + other_e + 100.0 + 20.0 * EXPOSURE_S)).max()
-    assert truth.peak_snr == pytest.approx(snr, rel=1e-3)
+    assert truth.peak_snr == pytest.approx(snr, rel=3e-4)
 
 
 def test_a_hot_sensor_lowers_the_peak_and_the_limit(scene: Scene) -> None:
@@ -147,7 +147,7 @@ def test_a_hot_sensor_lowers_the_peak_and_the_limit(scene: Scene) -> None:
         assert truth.dark_e == pytest.approx(dark_e, rel=1e-9)
         assert truth.gain == 2.0
         peak_e = _image_e(SOURCE_M, 4e-7, 0.01).max()
-        assert truth.peak_snr == pytest.approx(peak_e / math.sqrt(peak_e + 100.0 + dark_e), rel=1e-3)
+        assert truth.peak_snr == pytest.approx(peak_e / math.sqrt(peak_e + 100.0 + dark_e), rel=3e-4)
         limits_m.append(source_limits(truth, scene.calibration("r1.left"))[0])
     assert limits_m[1] / limits_m[0] == pytest.approx(1.178, rel=2e-3)
 

@@ -8,7 +8,7 @@ import pytest
 
 from nir_render import Scene, load_scene
 from nir_render.camera.veil import veil
-from nir_render.expected import expected, flare_apertures
+from nir_render.expected import expected
 from nir_render.transport.light import DirectTable, Indirect, Light
 
 SPREAD = "robots.r1.rig.cameras.front.point_spread"
@@ -80,28 +80,3 @@ def test_what_is_out_of_focus_is_so_by_its_own_distance(scene: Scene) -> None:
     assert moments[1][1] == pytest.approx(moments[0][1], rel=1e-6)
     assert moments[1][0] - moments[0][0] == pytest.approx(circle_px**2 / 16.0, rel=2e-3)
     assert circle_px > 1.0
-
-
-def test_perception_is_told_the_light_that_its_apertures_hold(scene: Scene) -> None:
-    """K is that of a flare: without glare and ghosts, 0.94 of it; with diffraction, what an aperture still holds.
-
-    That is measured here on frames: a source 6 m away, the sum over its aperture with diffraction, over that
-    without it. The Gaussian most like Airy at f/2 with σ = 0.7 px was fitted apart from this program: 0.758 px.
-    """
-    light = dataclasses.replace(_light(), indirect=None)
-    plain = scene.calibration("r1.front")
-    glare = {"share": "5 %", "core_radius": "12 px", "exponent": 1.5}
-    ghosts = [{"share": "1 %", "radius": "30 px"}]
-    veiled = scene.with_({f"{SPREAD}.glare": glare, f"{SPREAD}.ghosts": ghosts}).calibration("r1.front")
-    ratio = veiled.range_constant_dn_m2_per_s / plain.range_constant_dn_m2_per_s
-    assert (ratio, veiled.psf_sigma_px) == pytest.approx((0.94, 0.7), rel=1e-12)
-    airy = scene.with_({f"{SPREAD}.diffraction": "940 nm"})
-    told = airy.calibration("r1.front")
-    sums = []
-    for one in (scene, airy):
-        frame = expected(light, one, 1e-3)
-        sums.append(flare_apertures(light, one.camera("r1.front")[1])[1].sum(frame.electrons))
-    ratio = told.range_constant_dn_m2_per_s / plain.range_constant_dn_m2_per_s
-    assert ratio == pytest.approx(sums[1] / sums[0], rel=0.004)
-    assert ratio < 0.97
-    assert told.psf_sigma_px == pytest.approx(0.758, abs=0.002)

@@ -1,5 +1,6 @@
 """Adaptive exposure and brackets on frames whose brightest pixel is known."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,115 @@ def test_a_blinking_source_is_held(camera_with: CameraMaker) -> None:
         assert exposures_ms[30] == pytest.approx(after_dark_ms, rel=1e-3)
         assert exposures_ms[39] == pytest.approx(5.0)
         assert len(state.seen) <= 31
+
+
+def test_after_the_hold_the_dark_opens_the_shutter_by_steps_of_four(camera_with: CameraMaker) -> None:
+    """What is short of the noise is not held: 1.41 ms, then at 4, 16 times, then the longest, 50 ms."""
+    camera = _camera(camera_with, hold="1 s", longest="50 ms")
+    levels, exposures_ms = _levels(camera, [2e6] + [0.0] * 40)
+    lit_ms = 0.7 * RANGE_DN / 2000.0
+    assert levels[0] == pytest.approx(2000.0 / RANGE_DN, rel=1e-3)
+    np.testing.assert_allclose(exposures_ms[1:32], lit_ms, rtol=1e-3)
+    np.testing.assert_allclose(exposures_ms[32:35], [4.0 * lit_ms, 16.0 * lit_ms, 50.0], rtol=1e-3)
+
+
+def _levels(camera: Camera, dn_per_s: Sequence[float]) -> tuple[list[float], list[float]]:
+    """Levels of the range, and exposures in ms, of frames at 30 Hz to light of counts per second at gain 1."""
+    state, levels, exposures_ms = first_state(camera, _control(camera)), [], []
+    for index, of_light in enumerate(dn_per_s):
+        setting = state.upcoming[0]
+        exposures_ms.append(1e3 * setting.exposure_s)
+        levels.append(of_light * setting.exposure_s / RANGE_DN)
+        frame = _frame(min(64.0 + RANGE_DN * levels[-1], 4095.0), setting, index, index / 30.0)
+        state = next_state(state, _control(camera), camera, frame)
+    return levels, exposures_ms
+
+
+@pytest.mark.parametrize("hold", ["0 s", "1 s"])
+def test_what_a_clipped_frame_let_guess_is_not_held_once_its_light_is_seen(
+    camera_with: CameraMaker, hold: str
+) -> None:
+    """A source becomes 1.5 times as bright: level 1.05 clips, a quarter of it tells how bright, 0.7 it is."""
+    camera = _camera(camera_with, hold=hold)
+    dim = 0.7 * RANGE_DN / 1e-3
+    levels, _ = _levels(camera, [dim] * 3 + [1.5 * dim] * 60)
+    np.testing.assert_allclose(levels[:5], [0.7, 0.7, 0.7, 1.05, 0.2625], rtol=1e-3)
+    np.testing.assert_allclose(levels[5:], 0.7, rtol=1e-3)
+
+
+def test_the_dark_after_a_clipped_frame_tells_nothing_of_its_light(camera_with: CameraMaker) -> None:
+    """Lit in every other frame, at 1 ms ten times the range: each lit frame is a step nearer, no dark one back.
+
+    Dark is 4 % of lit. At a target of 0.1, of which four times are less than the range that clipped, the dark
+    frame gets what the clipped one has shown, 0.1 ms.
+    """
+    camera = _camera(camera_with, hold="1 s")
+    bright = 10.0 * RANGE_DN / 1e-3
+    _, exposures_ms = _levels(camera, [bright, 0.04 * bright] * 6)
+    np.testing.assert_allclose(exposures_ms, [1.0, 0.25, 0.25, 0.0625, 0.0625] + [0.07] * 7, rtol=2e-3)
+    camera = _camera(camera_with, hold="1 s", target=0.1)
+    assert _levels(camera, [bright, 0.0, 0.0])[1] == pytest.approx([1.0, 0.25, 0.1], rel=2e-3)
+
+
+def test_a_frame_that_clipped_still_counts_as_what_it_has_shown(camera_with: CameraMaker) -> None:
+    """It clipped at 1 ms: light of 0.6 of that after it does not bring the exposure beyond 0.7 ms."""
+    camera = _camera(camera_with, hold="1 s")
+    one = RANGE_DN / 1e-3
+    _, exposures_ms = _levels(camera, [2.0 * one] + [0.6 * one] * 29 + [0.6 * one] * 5)
+    np.testing.assert_allclose(exposures_ms[:4], [1.0, 0.25, 0.7, 0.7], rtol=2e-3)
+    assert exposures_ms[30] == pytest.approx(0.7, rel=2e-3)
+    assert exposures_ms[32:] == pytest.approx([0.7 / 0.6] * 3, rel=2e-3)
+
+
+@pytest.mark.parametrize("hold", ["0 s", "1 s"])
+@pytest.mark.parametrize("latency", [1, 3])
+@pytest.mark.parametrize("start", ["1 us", "50 us", "1 ms", "9 ms", "30 ms"])
+def test_a_still_scene_settles_from_any_exposure(
+    camera_with: CameraMaker, start: str, latency: int, hold: str
+) -> None:
+    """With noise, in eight steps, the 0.68 ms that bring the flare to the target: to 10 %, three widths of noise.
+
+    At 1 µs there are 4 electrons of signal beneath 10 of noise.
+    """
+    control = {**CONTROL, "shortest": "1 us", "longest": "30 ms", "hold": hold, "latency": latency}
+    camera = camera_with(sensor=SENSOR, exposure=start, auto_exposure=control)
+    state = first_state(camera, _control(camera))
+    shape = (_flare_dn(10_000.0, 0.7, 30.3, 20.1) - 64.0) / 10_000.0
+    wanted_s = 0.7 * RANGE_DN / (0.74 * 5.6e6)
+    exposures_s = []
+    for index in range(8 * latency + 5):
+        setting = state.upcoming[0]
+        exposures_s.append(setting.exposure_s)
+        key = FrameKey(5, "read_out", "r1.front", index)
+        data_dn = read_out(5.6e6 * setting.exposure_s * shape, camera, setting.exposure_s, key)
+        frame = RawFrame("r1.front", index, index / 30.0, setting.exposure_s, data_dn, 64.0)
+        state = next_state(state, _control(camera), camera, frame)
+    np.testing.assert_allclose(exposures_s[8 * latency :], wanted_s, rtol=0.1)
+
+
+@pytest.mark.parametrize("hold", ["0 s", "1 s"])
+@pytest.mark.parametrize("target", [0.02, 0.1, 0.24, 0.25, 0.26, 0.7, 0.95])
+def test_a_brighter_frame_never_gets_a_longer_exposure_nor_a_step_above_four(
+    camera_with: CameraMaker, target: float, hold: str
+) -> None:
+    """One frame of each level on one at a tenth of the range before it; 4095 DN are clipped."""
+    camera = _camera(camera_with, target=target, hold=hold, shortest="1 ns", longest="20 ms")
+    setting = Setting(1e-3, 1.0)
+    state = ExposureState((setting,))
+    state = next_state(state, _control(camera), camera, _frame(64 + 0.1 * RANGE_DN, setting))
+    levels = np.concatenate([[0.0, 1e-3, 0.01], np.linspace(0.02, 0.999, 60), [1.0]])
+    chosen_ms = []
+    for level in levels:
+        frame = _frame(64 + level * RANGE_DN, setting, 1, 1.0 / 30.0)
+        after = next_state(ExposureState((setting,), state.seen), _control(camera), camera, frame)
+        chosen_ms.append(1e3 * after.upcoming[0].exposure_s)
+    assert (np.diff(chosen_ms) <= 1e-12).all()
+    brightest = np.maximum(levels, 0.1 if hold == "1 s" else 0.0)
+    expected_ms = np.clip(target / np.maximum(brightest, 1e-9), 0.25, 4.0)
+    expected_ms[-1] = 0.25
+    np.testing.assert_allclose(chosen_ms[2:], expected_ms[2:], rtol=0.03)
+    assert min(chosen_ms) == pytest.approx(0.25, rel=1e-9)
+    assert max(chosen_ms) <= 4.0 * (1.0 + 1e-9)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (4, 3), (48, 64)])

@@ -265,3 +265,11 @@ def test_the_principal_point_moves_the_image(camera_with: CameraMaker) -> None:
     lens = intrinsics_of(camera_with(lens={"principal_point": "[650.25, 470.5] px"}))
     np.testing.assert_allclose(lens.project(np.array([0.0, 0.0, 1.0])), [650.25, 470.5])
     assert lens.corner_angle_rad == pytest.approx(np.arctan(np.hypot(650.75, 489.0) / 480.0), rel=1e-12)
+
+
+def test_a_pole_with_tangential_terms_makes_no_warning() -> None:
+    """1/(1 − r²) has its pole at 45°: the scan for a fold of the tangential terms ends there, in numbers."""
+    model = Distortion("brown_conrady", (0.0, 0.0, 1e-4, -2e-4, 0.0, -1.0, 0.0, 0.0))
+    with np.errstate(all="raise"):
+        assert 0.0 < model.fold_rad <= np.pi / 4.0 + 1e-12
+    assert np.degrees(model.fold_rad) == pytest.approx(45.0, abs=0.1)

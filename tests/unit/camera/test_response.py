@@ -1,11 +1,14 @@
 """C(θ), the one factor into which everything spectral folds."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from nir_render import InputError
 from nir_render.camera import response as response_module
-from nir_render.camera.response import response
+from nir_render.camera.lens import intrinsics_of
+from nir_render.camera.response import incidence, response
 from nir_render.scene.devices import Source
 from tests.unit.camera.conftest import CameraMaker
 
@@ -69,3 +72,30 @@ def test_a_quantum_efficiency_curve_is_weighted_by_what_passes_the_filter(
     flat_c = response(camera_with(filter=in_front), source)(0.0)
     sloped_c = response(camera_with(filter=in_front, sensor={"quantum_efficiency": sloped}), source)(0.0)
     assert sloped_c == pytest.approx(float(flat_c), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("lens", "height"),
+    [
+        ({}, np.tan),
+        ({"focal_length": "2.4 mm", "model": "brown_conrady", "distortion": [-0.06, 0, 0, 0]}, lambda a: np.tan(a) * (1 - 0.06 * np.tan(a) ** 2)),
+        ({"focal_length": "2.4 mm", "model": "fisheye", "distortion": [0.02, 0, 0, 0]}, lambda a: a * (1 + 0.02 * a**2)),
+    ],
+)  # fmt: skip
+def test_the_chief_ray_follows_the_distorted_image_height(
+    camera_with: CameraMaker, lens: dict[str, Any], height: Any
+) -> None:
+    """Behind the lens the chief ray meets the filter at CRA · h(θ)/h(corner), h the height of the image as bent.
+
+    The mean of tan² of all rays of a cone is tan² of the chief ray plus half the square of the pupil's radius,
+    1/(2N); so the chief ray comes back from the rays, to 1e-9. A straight tan θ would miss by some percent.
+    """
+    camera = camera_with(lens=lens)
+    assert camera.filter is not None
+    corner_rad = intrinsics_of(camera).corner_angle_rad
+    for angle_rad in (0.2, 0.5, 0.8 * corner_rad):
+        cosines, weights = incidence(camera, np.array([angle_rad]))
+        mean = float(weights @ (cosines[0] ** -2.0 - 1.0))
+        chief_rad = np.arctan(np.sqrt(mean - 0.5 / (2.0 * camera.lens.f_number) ** 2))
+        expected = camera.filter.chief_ray_angle_at_corner_rad * height(angle_rad) / height(corner_rad)
+        assert chief_rad == pytest.approx(expected, rel=1e-9)

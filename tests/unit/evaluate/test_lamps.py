@@ -1,12 +1,17 @@
 """Where a lamp stands in a frame, worked out by hand."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from nir_render import Scene, load_scene
-from nir_render.evaluate.lamps import lamp_outlines_px
+from nir_render.camera.lens import intrinsics_of
+from nir_render.evaluate.lamps import lamp_outlines_px, on_a_lamp
+from nir_render.scene.motion import camera_pose
+from perception.types import Detection
 
 
 @pytest.fixture
@@ -60,3 +65,39 @@ def test_the_sun_and_its_image_in_the_floor(scene: Scene) -> None:
     far = near.with_({"shapes.floor.center": "[6, 0, 0] m"})
     assert len(lamp_outlines_px(far, "r1.front", 0.0)) == 1
     assert lamp_outlines_px(sunny, "r1.back", 0.0) == []
+
+
+def _under(scene: Scene, place_m: list[float], outlines: list[Any]) -> bool:
+    """Tell whether what the front camera sees of a place in the world would count as on a lamp."""
+    robot, device = scene.camera("r1.front")
+    local_m = camera_pose(robot, device, 0.0).to_local(np.array([place_m]))
+    u_px, v_px = (float(value) for value in intrinsics_of(device).project(local_m)[0])
+    # on_a_lamp looks at the place alone.
+    return on_a_lamp(cast(Detection, SimpleNamespace(u_px=u_px, v_px=v_px)), outlines)
+
+
+@pytest.mark.parametrize(("from_x", "to_x"), [(0.9, 1.1), (-1.5, 0.7)])
+def test_a_long_lamp_over_a_fisheye_is_a_bow(scene: Scene, from_x: float, to_x: float) -> None:
+    """8 m across the way, 1 m above the camera at x = 0.06 m: what is on the lamp is on it, right up to its edges;
+    what is under the bow, above the line between its ends, is not. The second lamp reaches behind the camera."""
+    change = {
+        "center": f"[{0.5 * (from_x + to_x)}, 0, 1.2] m", "size": f"[{to_x - from_x}, 8] m", "normal": [0, 0, -1],
+    }  # fmt: skip
+    lens = {"model": "fisheye", "distortion": [0, 0, 0, 0], "focal_length": "1.6 mm"}
+    bent = scene.with_(
+        {f"lamps.one.{key}": value for key, value in change.items()}
+        | {f"robots.r1.rig.cameras.front.lens.{key}": value for key, value in lens.items()}
+    )
+    outlines = lamp_outlines_px(bent, "r1.front", 0.0)
+    for x in np.linspace(max(from_x, 0.1) + 0.01, to_x - 0.01, 5):
+        for y in (-3.9, -2.0, 0.3, 1.0, 3.9):
+            assert _under(bent, [x, y, 1.2], outlines), (x, y)
+    for y in (-1.5, 0.0, 1.0):
+        # Over 0.3 m farther ahead at the same height: 30 px below the lamp's far edge, and above its ends.
+        assert not _under(bent, [to_x + 0.3, y, 1.2], outlines)
+    far_end_px = min(outlines[0][:, 1].max(), 479.0)
+    robot, device = bent.camera("r1.front")
+    middle = intrinsics_of(device).project(
+        camera_pose(robot, device, 0.0).to_local(np.array([[to_x + 0.3, 0.0, 1.2]]))
+    )[0]
+    assert middle[1] < far_end_px

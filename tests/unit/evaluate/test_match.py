@@ -158,6 +158,14 @@ def test_truth_reads_back_as_it_was_written() -> None:
     ghost = _truth(100.0, ghost_of="r2.top")
     assert parse_truth(ghost.record()) == ghost
     assert ghost.record()["ghost_of"] == "r2.top"
+    amplified = _truth(100.0, gain=16.0, dark_e=45.7, flare_share=0.9)
+    assert parse_truth(amplified.record()) == amplified
+
+
+def test_truth_without_gain_and_dark_current_reads_as_of_a_cold_camera_at_gain_1() -> None:
+    record = _truth(100.0, gain=16.0, dark_e=45.7, flare_share=0.9).record()
+    del record["gain"], record["dark_e"], record["flare_share"]
+    assert parse_truth(record) == _truth(100.0, gain=1.0, dark_e=0.0, flare_share=1.0)
 
 
 def test_what_is_found_on_a_lamp_is_counted_apart() -> None:

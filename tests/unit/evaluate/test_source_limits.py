@@ -1,5 +1,6 @@
 """The limits that a source's errors are held against."""
 
+import dataclasses
 import math
 
 import pytest
@@ -35,6 +36,34 @@ def test_light_from_elsewhere_costs_accuracy() -> None:
     dark, bright = (source_limits(truth(background_e=e), CAMERA) for e in (0.0, 400.0))
     assert bright[0] > 1.3 * dark[0]
     assert bright[1] > 1.3 * dark[1]
+
+
+def test_a_frame_at_another_gain_has_the_limit_of_a_camera_that_has_it_for_good() -> None:
+    """A flare of 10 000 e, a fifth of it in its brightest pixel: at 16 DN/e pixels clip at 4031/16 = 252 e.
+
+    At the calibrated 1 DN/e, where none clips, its limit is far lower.
+    """
+    for_good = dataclasses.replace(CAMERA, system_gain_dn_per_e=16.0)  # it clips at the ADC's full scale
+    row = truth(gain=16.0, background_e=30.0)
+    assert source_limits(row, CAMERA) == source_limits(truth(background_e=30.0), for_good)
+    assert source_limits(row, CAMERA)[0] > 3.0 * source_limits(truth(background_e=30.0), CAMERA)[0]
+
+
+def test_dark_current_is_background_that_clips_and_makes_noise() -> None:
+    """It is as good as light from elsewhere; a faint flare's limit rises with the noise of a dark pixel."""
+    assert source_limits(truth(background_e=70.0, dark_e=50.0), CAMERA) == source_limits(
+        truth(background_e=120.0), CAMERA
+    )
+    cold, hot = (source_limits(truth(direct_e=1.0, dark_e=e), CAMERA)[0] for e in (0.0, 45.7))
+    assert hot / cold == pytest.approx(math.sqrt(145.783 / 100.083), rel=2e-3)
+    assert source_limits(truth(dark_e=4100.0), CAMERA)[0] == math.inf
+
+
+def test_light_that_glare_takes_tells_nothing() -> None:
+    """Of 10 000 e half are in the flare: its limits are those of 5 000 e, √2 times as large by shot noise alone."""
+    row = truth(direct_e=1e4, flare_share=0.5, background_e=20.0)
+    assert source_limits(row, CAMERA) == source_limits(truth(direct_e=5e3, background_e=20.0), CAMERA)
+    assert source_limits(row, CAMERA)[0] > 1.4 * source_limits(truth(background_e=20.0), CAMERA)[0]
 
 
 def test_without_light_there_is_no_limit_and_the_summary_leaves_it_out() -> None:

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,11 @@ FULL = calibration(
         "rotation_body_camera": 2e-3,
         "saturation_dn": 0.5,
         "distortion": 1e-4,
+        "dsnu_e": 0.1,
+        "prnu": 2e-4,
     },
+    dsnu_e=4.0 + 1.0 / 3.0,
+    prnu=0.009,
     lens_model="brown_conrady",
     distortion=(-0.1, 0.01, 1e-3, -1.0 / 3.0, 0.0),
 )
@@ -46,6 +51,24 @@ def test_a_file_without_a_lens_model_is_of_a_rectilinear_lens() -> None:
         del document["cameras"]["r1.front"][name]
     back = parse_calibration_document(document)["r1.front"]
     assert (back.lens_model, back.distortion) == ("rectilinear", ())
+
+
+def test_every_number_of_a_calibration_can_have_a_sigma() -> None:
+    """What is written with a σ reads back with it, whichever entry it is of."""
+    names = {*FULL.__dataclass_fields__} - {"camera", "sigma", "lens_model"}
+    sigma = {name: 0.01 * number for number, name in enumerate(sorted(names), 1)}
+    document = json.loads(json.dumps(calibration_document([replace(FULL, sigma=sigma)])))
+    back = parse_calibration_document(document)["r1.front"]
+    assert back.sigma == sigma
+    assert (back.dsnu_e, back.prnu) == (FULL.dsnu_e, FULL.prnu)
+
+
+def test_a_file_without_fixed_patterns_is_of_a_camera_that_has_none() -> None:
+    document = calibration_document([calibration(dsnu_e=4.0, prnu=0.01)])
+    for name in ("dsnu_e", "prnu"):
+        del document["cameras"]["r1.front"][name]
+    back = parse_calibration_document(document)["r1.front"]
+    assert (back.dsnu_e, back.prnu) == (0.0, 0.0)
 
 
 def test_layout() -> None:
@@ -73,6 +96,10 @@ def test_layout() -> None:
         ("response_angle_rad", [0.0, 0.2, 0.1], "increase"),
         ("response_angle_rad", [0.0, 0.2], "2 numbers"),
         ("read_noise_e", -3.0, "0 or more"),
+        ("dsnu_e", -3.0, "0 or more"),
+        ("prnu", {"value": -0.01, "sigma": 1e-3}, "0 or more"),
+        ("prnu", {"value": 0.01, "sigma": -1e-3}, "0 or more"),
+        ("prnu", {"value": 0.01}, "sigma"),
         ("lens_model", "pinhole", "Known are rectilinear, brown_conrady, fisheye"),
         ("lens_model", "fisheye", "A fisheye lens takes 4 numbers in OpenCV's order"),
         ("lens_model", "rectilinear", "A rectilinear lens takes 0 numbers"),

@@ -99,3 +99,29 @@ def test_beyond_the_image_circle_there_is_no_direction() -> None:
     assert has_image(639.5, 479.5, 0.1, camera)
     assert not has_image(0.0, 0.0, 0.0, camera)
     assert flare_limit(camera, 0.0, 0.0, 2.0, 1e4, 1.0).range_sigma_m == np.inf
+
+
+FOLDING = (0.3517, -0.0085, 0.0008, -0.0013, -0.0581)
+
+
+def test_bearings_near_a_fold() -> None:
+    """A lens that folds right beyond the corners: all over the sensor, rim included, back to 1e-6 px."""
+    camera = calibration(lens_model="brown_conrady", distortion=FOLDING)
+    u, v = np.meshgrid(np.linspace(-0.5, 1279.5, 161), np.linspace(-0.5, 959.5, 121))
+    pixel = np.stack([u.ravel(), v.ravel()], axis=1)
+    direction = direction_camera(pixel, camera)
+    np.testing.assert_allclose(project(direction, camera), pixel, atol=1e-6)
+    # The image height grows from the middle to the corner on one branch: no field angle jumps.
+    along = direction_camera(np.linspace([639.5, 479.5], [1279.5, 959.5], 400), camera)
+    angle_rad = np.arccos(along[:, 2])
+    assert (np.diff(angle_rad) > 0.0).all()
+    assert np.diff(angle_rad).max() < 0.02
+
+
+def test_beyond_a_fold_there_is_no_direction() -> None:
+    """r − 0.3 r³ turns back at r = 1/√0.9, where the image is 2/3 of that high: 337.3 px from the middle."""
+    camera = calibration(lens_model="brown_conrady", distortion=(-0.3, 0.0, 0.0, 0.0))
+    inside, outside = direction_camera([[639.5 + 337.2, 479.5], [639.5 + 337.5, 479.5]], camera)
+    assert np.hypot(*project(inside[None], camera)[0] - [639.5 + 337.2, 479.5]) < 1e-6
+    assert inside[0] / inside[2] < 0.9**-0.5
+    assert np.isnan(outside).all()

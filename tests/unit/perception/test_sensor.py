@@ -3,7 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perception.sensor import at_gain, check_frame, clip_level_e, electrons, noise_floor_e2, saturation_dn
+from perception.sensor import (
+    at_gain,
+    check_frame,
+    clip_level_e,
+    electrons,
+    noise_floor_e2,
+    pixel_variance_e2,
+    saturation_dn,
+)
 from perception.types import RawFrame
 from tests.unit.perception.simulation import calibration
 
@@ -30,6 +38,20 @@ def test_noise_floor_and_clip_level() -> None:
         calibration(read_noise_e=2.0, system_gain_dn_per_e=0.25), gain=2.0
     ) == pytest.approx(4 + 4 / 12)
     assert clip_level_e(CAMERA, 64.0, 2.0) == pytest.approx(4031 / 1.48)
+
+
+def test_fixed_offsets_add_their_variance_to_a_dark_pixel_at_any_gain() -> None:
+    """3² + 4² e², and rounding, which alone depends on the gain: 16/12 e² at 1/4 DN/e, 4/12 e² at 1/2."""
+    camera = calibration(read_noise_e=3.0, dsnu_e=4.0, system_gain_dn_per_e=0.25)
+    assert noise_floor_e2(camera) == pytest.approx(25.0 + 16.0 / 12.0, rel=1e-12)
+    assert noise_floor_e2(camera, gain=2.0) == pytest.approx(25.0 + 4.0 / 12.0, rel=1e-12)
+    assert noise_floor_e2(at_gain(camera, 2.0)) == pytest.approx(25.0 + 4.0 / 12.0, rel=1e-12)
+
+
+def test_the_spread_of_responses_grows_with_the_light_and_needs_some() -> None:
+    """2 %: of 10 000 e it is 200 e, four times the shot noise's variance; below black level there is neither."""
+    variance_e2 = pixel_variance_e2(np.array([-50.0, 0.0, 100.0, 1e4]), 25.0, 0.02)
+    np.testing.assert_allclose(variance_e2, [25.0, 25.0, 25.0 + 100.0 + 4.0, 25.0 + 1e4 + 4e4], rtol=1e-12)
 
 
 def test_the_well_clips_at_more_counts_with_gain_up_to_full_scale() -> None:

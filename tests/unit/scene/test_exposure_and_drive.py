@@ -142,6 +142,66 @@ def test_a_bracket_and_an_automatic_exposure_exclude_each_other(scene: Scene) ->
         scene.with_({"robots.r1.rig": {"cameras": {"front": both}}})
 
 
+ROLLING = {"type": "rolling", "line_time": "25 us"}  # 960 rows are read in 24 ms
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (
+            {"exposure": "33.4 ms"},
+            r"front\.exposure: 33\.4 ms is longer than the 33\.33 ms.*shorten it, or lower",
+        ),
+        ({"bracket": ["1 ms", "40 ms"]}, r"front\.bracket: 40 ms is longer than the 33\.33 ms"),
+        (
+            {"auto_exposure": {"shortest": "20 us", "longest": "34 ms"}},
+            r"longest: 34 ms is longer than the 33",
+        ),
+        (
+            {"exposure": "34 ms", "auto_exposure": {"shortest": "20 us", "longest": "1 ms"}},
+            r"front\.exposure: 34",
+        ),
+        (
+            {"shutter": {"type": "rolling", "line_time": "35 us"}},
+            r"line_time: the read-out of 960 rows, 33\.6 ms, lasts longer than the 33\.33 ms.*lower clock.frame_r",
+        ),
+        (
+            {"shutter": ROLLING, "auto_exposure": {"shortest": "20 us", "longest": "9.4 ms"}},
+            r"longest: 9\.4 ms and the read-out of 960 rows, 24 ms, are longer than 1 × 33\.33 ms.*raise auto_exp",
+        ),
+    ],
+)
+def test_exposures_end_before_the_next_frame_begins(
+    scene: Scene, change: dict[str, Any], reason: str
+) -> None:
+    """At 30 Hz; a single frame may last as long as it likes, and so may those of a camera that takes none."""
+    changes = {f"{CAMERA}.{key}": value for key, value in change.items()}
+    assert scene.with_({**changes, "clock.frames": 1, "clock.frame_rate": "30 Hz"})
+    with pytest.raises(InputError, match=reason):
+        scene.with_({**changes, "clock.frame_rate": "30 Hz"})
+    idle = {key.replace("robots.r1", "robots.r3"): value for key, value in changes.items()}
+    assert scene.with_({"robots.r3": {"rig": "infra_swarm"}, **idle, "clock.frame_rate": "30 Hz"})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"exposure": "33.3 ms"},
+        {"exposure": "0.03333333333333333 s"},
+        {"exposure": "33 ms", "shutter": ROLLING},  # each row ends before its own next exposure
+        {"exposure": "50 ms", "bracket": ["1 ms", "2 ms"]},  # which takes the place of the exposure
+        {"shutter": ROLLING, "auto_exposure": {"shortest": "20 us", "longest": "9.3 ms"}},
+        {"shutter": ROLLING, "auto_exposure": {"shortest": "20 us", "longest": "33 ms", "latency": 2}},
+        {
+            "exposure": "30 ms",
+            "shutter": {"type": "global", "line_time": "30 us"},
+        },  # the next is exposed then
+    ],
+)
+def test_exposures_that_fit_the_clock_are_taken(scene: Scene, change: dict[str, Any]) -> None:
+    assert scene.with_({"clock.frame_rate": "30 Hz", **{f"{CAMERA}.{key}": change[key] for key in change}})
+
+
 def test_a_resolved_scene_keeps_drive_shutter_and_bracket(scene: Scene, tmp_path: Path) -> None:
     changed = scene.with_(
         {

@@ -78,6 +78,9 @@ def test_the_schema_takes_a_lens() -> None:
         ({"model": "pinhole"}, "rectilinear"),
         ({"principal_point": "640 px"}, "not a vector with a unit"),
         ({"focus_distance": "1 mm"}, "not beyond the focal length"),
+        # f²/(N (d_f − f)) = 3.24 mm²/(2 · 0.2 mm) is 2160 px of 3.75 µm; 100 px are at 1.8 + 4.32 mm.
+        ({"focus_distance": "2 mm"}, r"lens\.focus_distance: .*a disc of 2160 px; .*100 px.* at 0\.00612 m"),
+        ({"model": "fisheye", "distortion": "[0.1, 0, 0, 0]"}, r"in brackets and without quotes, such as distortion: \["),
         ({"thermal_focus_shift": "3 um/K"}, "without 'focus_distance' all is in focus"),
         ({"focus_distance": "1 m", "thermal_focus_shift": "3 um"}, "is a length; wanted a focus shift"),
         (
@@ -89,3 +92,7 @@ def test_the_schema_takes_a_lens() -> None:
 def test_what_makes_no_lens_is_refused(scene: Scene, lens: dict[str, Any], reason: str) -> None:
     with pytest.raises(InputError, match=reason):
         _with(scene, lens)
+
+
+def test_a_focus_as_near_as_the_blur_allows_is_read(scene: Scene) -> None:
+    assert _lens(_with(scene, {"focus_distance": "6.13 mm"})).focus_distance_m == pytest.approx(0.00613)

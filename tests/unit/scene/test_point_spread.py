@@ -65,6 +65,7 @@ _GHOST = {"share": "0.1 %", "radius": "40 px"}
         ({"sigma": "1 px", "glare": {**_GLARE, "share": "45 %"}, "ghosts": [{**_GHOST, "share": "6 %"}]}, "51%"),
         ({"sigma": "1 px", "ghosts": [{**_GHOST, "magnification": 0.0}]}, "at least 0.02"),
         ({"sigma": "1 px", "ghosts": [{**_GHOST, "magnification": 11.0}]}, "a radius of 4 px times it"),
+        ({"sigma": "1 px", "ghosts": _GHOST}, r"ghosts: wanted a list, even of one; write ghosts: \[\{share: 0.1 %"),
         ({"kernel": {"pitch": "0.25 px"}}, "'values' and 'file'"),
         ({"kernel": {"pitch": "1.5 px", "values": _rows(_BELL)}}, "less than or equal to 1"),
         ({"kernel": {"pitch": "0.25 px", "values": ["[1, 2, 1]", "[2, 4]", "[1, 2, 1]"]}}, "of one length"),
@@ -85,3 +86,24 @@ def test_a_file_of_words_is_refused(tmp_path: Path) -> None:
     (tmp_path / "lens.csv").write_text("u,v\n1,2\n", encoding="utf-8")
     with pytest.raises(ValidationError, match="wanted rows of numbers, with no header"):
         _spread(tmp_path, kernel={"file": "lens.csv", "pitch": "0.25 px"})
+
+
+@pytest.mark.parametrize(
+    "line", [b"1, 2, 1,", b"1; 2; 1", b"1 2 1", b"1, , 1", b"# \xd6ffnung 2", b"\xd6, 1, 2"]
+)
+def test_a_file_of_other_numbers_is_refused_with_its_line(tmp_path: Path, line: bytes) -> None:
+    """A comma at the end, other separators, bytes of Latin-1: file, line, and how to write it."""
+    (tmp_path / "lens.csv").write_bytes(b"# at f/2\n1, 2, 1\n" + line + b"\n1, 2, 1\n")
+    with pytest.raises(
+        ValidationError, match=r"lens\.csv, line 3: wanted rows of numbers.*such as 0, 0\.5, 0; .*UTF-8"
+    ):
+        _spread(tmp_path, kernel={"file": "lens.csv", "pitch": "0.25 px"})
+
+
+def test_a_file_from_a_spreadsheet_is_read(tmp_path: Path) -> None:
+    """A byte order mark and Windows' ends of lines change nothing."""
+    text = "\r\n".join(",".join(repr(float(value)) for value in row) for row in _BELL)
+    (tmp_path / "lens.csv").write_bytes(b"\xef\xbb\xbf" + text.encode() + b"\r\n\r\n")
+    spread = _spread(tmp_path, kernel={"file": "lens.csv", "pitch": "0.25 px"})
+    assert spread.kernel is not None
+    np.testing.assert_array_equal(spread.kernel.values, _BELL)
