@@ -90,7 +90,8 @@ def image_of_large_disc(lens: Intrinsics, core: Core, disc: Disc) -> tuple[Array
     else:
         _add_gaussians(image, core.gaussian_px, places_px[seen], power[seen])
     _add_inside(image, core, inside, split)
-    return np.ascontiguousarray(image[top:bottom, left:right]), top, left
+    # Around the rim the inside's waves dip below 0, by some 1e-6 of its brightness.
+    return np.maximum(image[top:bottom, left:right], 0.0), top, left
 
 
 def _size(lens: Intrinsics) -> Array:
