@@ -65,7 +65,9 @@ def tally(scene: Scene, calibrations: dict[str, Calibration]) -> Tally:
             for draw in range(DRAWS):
                 seed = 1000 * render_seed + draw
                 key = FrameKey(seed, "read_out", name, 0)
-                data_dn = read_out(mean_e, camera, shot.frame.exposure_s, key, shot.frame.gain)
+                # Another camera of the same make for each draw: the limit counts fixed patterns as noise.
+                other = camera.model_copy(update={"serial": f"{name} {seed}"})
+                data_dn = read_out(mean_e, other, shot.frame.exposure_s, key, shot.frame.gain)
                 frame = dataclasses.replace(shot.frame, data_dn=data_dn)
                 found = detect(frame, calibrations[name], "robust")
                 pairing = match(shot.truth, found, calibrations[name])
