@@ -26,6 +26,7 @@ SPREADS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.verify
 @pytest.mark.parametrize("name", SPREADS)
 def test_ranges_are_right_within_what_is_claimed(name: str) -> None:
     """A source without noise, read by the sensor's own ADC, at 0.5 to 3 m and three places near the axis,
