@@ -7,11 +7,14 @@ is largest. Shot noise of some pixels is clipped before the mean reaches the cli
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import ndtr
+
+Real = TypeVar("Real", bound=np.floating)
 
 _PIXEL_NODES = 401  # over the pixels' unlike responses
 _CHARGE_NODES = 1601  # over shot noise, where the response is not linear
@@ -25,9 +28,9 @@ class Compression:
     loss: float
     exponent: float
 
-    def __call__(self, charge_e: NDArray[np.float64], full_well_e: float) -> NDArray[np.float64]:
-        """Return the electrons that are read of a charge, same shape."""
-        return np.asarray(charge_e * (1.0 - self.loss * (charge_e / full_well_e) ** self.exponent))
+    def __call__(self, charge_e: NDArray[Real], full_well_e: float) -> NDArray[Real]:
+        """Return the electrons that are read of a charge, same shape and type."""
+        return charge_e * (1.0 - self.loss * (charge_e / full_well_e) ** self.exponent)
 
 
 def temporal_variance_e2(

@@ -115,9 +115,7 @@ def setting_for(camera: Camera, control: AutoExposure, brightest_e_per_s: float)
     exposure_s = float(np.clip(wanted_s, control.shortest_s, control.longest_s))
     gain = camera.gain
     if control.most_gain is not None and wanted_s > control.longest_s:
-        sensor = camera.sensor
-        full_scale_e = (sensor.full_scale_dn - sensor.black_level_dn) / sensor.system_gain_dn_per_e
-        wanted = control.target * full_scale_e / (rate_e_per_s * exposure_s)
+        wanted = control.target * camera.sensor.full_scale_e / (rate_e_per_s * exposure_s)
         gain = float(np.clip(wanted, camera.gain, control.most_gain))
     return Setting(exposure_s, gain)
 

@@ -42,13 +42,6 @@ def _sinking(
 
 def read_from_well(charge_e: Floats, sensor: Sensor) -> Floats:
     """Return the electrons that are read of a charge, clipped at the full well, float32, same shape."""
-    full_well_e = np.float32(sensor.well_e)
-    charge: Floats = np.minimum(charge_e, full_well_e)
+    charge: Floats = np.minimum(charge_e, np.float32(sensor.well_e))
     compression = sensor.compression
-    if compression is None:
-        return charge
-    bent: Floats = np.power(charge / full_well_e, np.float32(compression.exponent), dtype=np.float32)
-    bent *= np.float32(-compression.loss)
-    bent += np.float32(1.0)
-    bent *= charge
-    return bent
+    return charge if compression is None else compression(charge, sensor.well_e)

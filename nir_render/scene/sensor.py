@@ -3,6 +3,7 @@
 import math
 from typing import Annotated, Any, ClassVar, Self
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from nir_render.saturation import Compression, full_well_e
@@ -184,7 +185,7 @@ class Sensor(PresetDocument):
                 f"{self.full_scale_dn} DN, so full scale is never reached; it takes {wanted:.3g} DN/e; "
                 "check system_gain, the full well and bit_depth"
             )
-        full_scale_e = (self.full_scale_dn - black_dn) / gain
+        full_scale_e = self.full_scale_e
         if self.saturation_capacity_e is not None and full_scale_e * _CLIP_SLACK < self.read_e(well_e):
             raise ValueError(
                 f"system_gain {gain:g} DN/e takes the ADC to full scale at {full_scale_e:.5g} e, before the "
@@ -200,6 +201,11 @@ class Sensor(PresetDocument):
     def full_scale_dn(self) -> int:
         """The largest count of the ADC."""
         return int(2**self.bit_depth_bit) - 1
+
+    @property
+    def full_scale_e(self) -> float:
+        """The electrons at which the ADC reaches its largest count, at gain 1."""
+        return (self.full_scale_dn - self.black_level_dn) / self.system_gain_dn_per_e
 
     @property
     def compression(self) -> Compression | None:
@@ -219,11 +225,7 @@ class Sensor(PresetDocument):
     def read_e(self, charge_e: float) -> float:
         """Return the electrons that are read of a charge: the soft non-linearity's own curve."""
         compression = self.compression
-        return (
-            charge_e
-            if compression is None
-            else charge_e * (1.0 - compression.loss * (charge_e / self.well_e) ** compression.exponent)
-        )
+        return charge_e if compression is None else float(compression(np.array(charge_e), self.well_e))
 
     @property
     def dark_rate_e_per_s(self) -> float:
