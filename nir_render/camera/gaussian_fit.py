@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.special import erf
 
+from nir_render.camera.gaussian import pixel_shares
 from nir_render.camera.otf import Core
 from nir_render.camera.waves import image_of_points
 
@@ -73,5 +73,5 @@ def _whole(core: Core, place_px: NDArray[np.float64], side: int) -> NDArray[np.f
 
 def _gaussian(place_px: NDArray[np.float64], sigma_px: float, side: int) -> NDArray[np.float64]:
     edges = np.arange(side + 1) - 0.5
-    u, v = (0.5 * np.diff(erf((edges - middle) / (np.sqrt(2.0) * sigma_px))) for middle in place_px)
+    u, v = (pixel_shares(edges - middle, sigma_px) for middle in place_px)
     return np.asarray(v[:, None] * u)

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
-from scipy.special import betainc, erf
+from scipy.special import betainc
 
+from nir_render.camera.gaussian import pixel_shares
 from nir_render.camera.lens import Intrinsics
 from nir_render.camera.otf import Core
 from nir_render.camera.waves import image_of_points, smooth_kernel
@@ -198,7 +199,7 @@ def _add_gaussians(image: Array, sigma_px: float, places_px: Array, power: Array
         place, light = places_px[start : start + count], power[start : start + count]
         first = np.rint(place).astype(np.int64) - half
         edges = first[..., None] + np.arange(width + 1) - 0.5 - place[..., None]
-        shares = np.diff(0.5 * erf(edges / (math.sqrt(2.0) * sigma_px)))
+        shares = pixel_shares(edges, sigma_px)
         u_shares, v_shares = shares[:, 0], shares[:, 1]
         weight = (light[:, None] * v_shares)[:, :, None] * u_shares[:, None, :]
         index = first[..., None] + 2 * half + np.arange(width)

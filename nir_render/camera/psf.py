@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
+from nir_render.camera.gaussian import pixel_shares
 from nir_render.camera.large_disc import Disc, image_of_large_disc
 from nir_render.camera.lens import Intrinsics
 from nir_render.camera.otf import Core
@@ -141,5 +141,4 @@ def _pixel_shares(
     if start >= stop:
         return np.empty((centre_px.size, 0)), 0
     edges = np.arange(start, stop + 1) - 0.5
-    cumulative = 0.5 * erf((edges - centre_px[:, None]) / (math.sqrt(2.0) * sigma_px))
-    return np.diff(cumulative, axis=1), start
+    return pixel_shares(edges - centre_px[:, None], sigma_px), start
