@@ -1,7 +1,7 @@
 """From a scene file to a Scene: read, include, override, validate, check."""
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,19 +14,15 @@ from nir_render.scene.base import merge, read_yaml, without_alternatives
 from nir_render.scene.checks import check
 from nir_render.scene.devices import Camera, Source
 from nir_render.scene.document import Robot, SceneDocument
-from nir_render.scene.units import format_in_unit_of
+from nir_render.scene.explain import explain
+from nir_render.scene.units import with_component
 from nir_render.scene.world import Lamp, Sun
 
 # Two ways to say how finely to sample; a change that writes one takes the other away.
 _RIVALS = ("render.noise", "render.indirect.samples")
 
 
-_BOUNDS = {
-    "greater_than": "greater than",
-    "greater_than_equal": "greater than or equal to",
-    "less_than": "less than",
-    "less_than_equal": "less than or equal to",
-}
+_COMPONENTS = {"x": 0, "y": 1, "z": 2, "0": 0, "1": 1, "2": 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +114,10 @@ def load_scene(path: str | Path, overrides: Mapping[str, Any] | None = None) -> 
 
 
 def apply_overrides(raw: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of a raw document with values set at dotted paths; numbers in a path index lists.
+    """Return a copy of a raw document with values set at dotted paths.
 
+    Numbers in a path index lists; x, y, z (or 0, 1, 2) at its end are components of a vector:
+    `robots.r2.position.x`.
     A preset's name on the way becomes the ground under the change: `...sensor.read_noise` on
     `sensor: mt9m031` gives `{preset: mt9m031, read_noise: ...}`.
     """
@@ -161,6 +159,13 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
         return [
             _set(item, keys[1:], value, path) if i == int(keys[0]) else item for i, item in enumerate(node)
         ]
+    if isinstance(node, str) and node.lstrip().startswith("["):
+        if len(keys) != 1 or keys[0] not in _COMPONENTS:
+            raise InputError(f"--set {path}: {keys[0]!r} is no component of {node!r}; take x, y or z")
+        try:
+            return with_component(node, _COMPONENTS[keys[0]], value)
+        except ValueError as error:
+            raise InputError(f"--set {path}: {error}") from None
     if node is None:
         node = {}
     elif isinstance(node, str):
@@ -197,77 +202,9 @@ def _build(raw: dict[str, Any], folder: Path, path: str, overrides: Iterable[str
     try:
         document = SceneDocument.model_validate(raw, context={"folder": folder})
     except ValidationError as error:
-        raise InputError(*_explain(error, raw, path, overrides)) from None
+        raise InputError(*explain(error, raw, path, overrides)) from None
     scene = Scene(document, raw, folder, path)
     problems = check(document)
     if problems:
         raise InputError(*[f"{path}: {problem}" for problem in problems])
     return scene
-
-
-def _explain(error: ValidationError, raw: Any, path: str, overrides: Iterable[str]) -> Iterable[str]:
-    """Yield one line per problem: file, line or override, field, and what is wrong."""
-    lines = _line_numbers(path)
-    for problem in error.errors():
-        keys = _document_keys(problem["loc"], raw)
-        line = next(
-            (lines[tuple(keys[:n])] for n in range(len(keys), 0, -1) if tuple(keys[:n]) in lines), None
-        )
-        where = f"{path}:{line}" if line else path
-        if keys and any(_meet(one.split("."), keys) for one in overrides):
-            where = f"{path} with --set"  # the file's line may hold another value
-        message = problem["msg"].removeprefix("Value error, ")
-        if problem["type"] == "missing":
-            message = "this key is missing"
-        elif problem["type"] in _BOUNDS:
-            message = _beyond(_BOUNDS[problem["type"]], problem["ctx"], problem["input"])
-        yield f"{where}: {'.'.join(keys)}: {message}" if keys else f"{where}: {message}"
-
-
-def _meet(way: Sequence[str], keys: Sequence[str]) -> bool:
-    """Tell whether one of two places in a document lies within the other."""
-    return all(one == other for one, other in zip(way, keys, strict=False))
-
-
-def _beyond(bound: str, context: Mapping[str, Any], written: Any) -> str:
-    """Say which bound a value is beyond, in the unit that it was written in."""
-    (limit,) = (context[key] for key in ("gt", "ge", "lt", "le") if key in context)
-    return f"input should be {bound} {format_in_unit_of(written, float(limit))}, not {written!r}"
-
-
-def _document_keys(location: tuple[int | str, ...], raw: Any) -> list[str]:
-    """Return a problem's place as keys of the document, without the tags of unions (`rectangle`, …)."""
-    keys: list[str] = []
-    node = raw
-    for part in location:
-        tag = isinstance(node, Mapping) and part not in node and node.get("type") == part
-        if tag:
-            continue
-        keys.append(str(part))
-        if isinstance(node, Mapping):
-            node = node.get(part)
-        elif isinstance(node, list) and isinstance(part, int) and part < len(node):
-            node = node[part]
-        else:
-            node = None
-    return keys
-
-
-def _line_numbers(path: str) -> dict[tuple[str, ...], int]:
-    """Return the line of each key of a YAML file, by its path of keys."""
-    lines: dict[tuple[str, ...], int] = {}
-
-    def walk(node: yaml.Node, keys: tuple[str, ...]) -> None:
-        if isinstance(node, yaml.MappingNode):
-            for key, value in node.value:
-                lines[(*keys, key.value)] = key.start_mark.line + 1
-                walk(value, (*keys, key.value))
-        elif isinstance(node, yaml.SequenceNode):
-            for index, value in enumerate(node.value):
-                lines[(*keys, str(index))] = value.start_mark.line + 1
-                walk(value, (*keys, str(index)))
-
-    root = yaml.compose(Path(path).read_text(encoding="utf-8"), yaml.SafeLoader)
-    if root is not None:
-        walk(root, ())
-    return lines

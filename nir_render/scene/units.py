@@ -215,6 +215,55 @@ def format_in_unit_of(text: object, value: float) -> str:
     return f"{value:g}"
 
 
+@dataclass(frozen=True)
+class Reading:
+    """A number as it was written: "1.5 ms" is 1.5, in SI units 0.0015, "ms", a time."""
+
+    number: float
+    value_si: float
+    unit: str
+    quantity: Quantity
+
+
+def read_quantity(text: object) -> Reading | None:
+    """Read a number with a unit of any quantity, or without one; None where the text is no such thing."""
+    match = None if isinstance(text, bool) else _NUMBER.fullmatch(str(text))
+    if match is None or not math.isfinite(float(match[1])):
+        return None
+    number, unit = float(match[1]), match[2]
+    for known in (FRACTION, *_KNOWN) if not unit else _KNOWN:
+        with contextlib.suppress(ValueError):
+            return Reading(number, number * _factor(unit, known), unit, known)
+    return None
+
+
+def with_component(vector: str, index: int, value: object) -> str:
+    """Return the vector "[1, 2, 0.3] m" with one of its numbers replaced by a value such as "3 m".
+
+    Raises
+    ------
+    ValueError
+        The text is no vector with a unit, has no such component, or the value is no such quantity.
+    """
+    match = _VECTOR.fullmatch(vector)
+    if match is None:
+        raise ValueError(f"{vector!r} is no vector")
+    parts = [part.strip() for part in match[1].split(",")]
+    if index >= len(parts):
+        raise ValueError(f"{vector!r} has {len(parts)} components")
+    for known in _KNOWN:
+        with contextlib.suppress(ValueError):
+            factor = _factor(match[2], known)
+            break
+    else:
+        raise ValueError(f"{vector!r} has no unit that is known")
+    # The same digits where the units are the same, as 4.3 m is not 4300 mm to the last bit.
+    given = read_quantity(value)
+    number = parse_quantity(value, known) / factor
+    parts[index] = repr(given.number if given is not None and given.unit == match[2] else number)
+    return f"[{', '.join(parts)}] {match[2]}"
+
+
 def format_vector(values: tuple[float, ...], quantity: Quantity) -> str:
     """Write a vector so that `parse_vector` reads the same bits."""
     return f"[{', '.join(repr(value) for value in values)}] {quantity.unit}".rstrip()
