@@ -1,19 +1,17 @@
 """`report.html`: a run on one page that opens from disk, with no network and no scripts."""
 
-import base64
-import importlib.resources
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from string import Template
 from typing import Any
 from urllib.parse import quote
 
 from nir_render.evaluate.metrics import Evaluation, FrameKey, Score
 from nir_render.report import style
 from nir_render.report.frames import cameras_of
-from nir_render.report.pictures import MOST_CAMERAS, close_up_figures, marker_svg, whole_figures
+from nir_render.report.parts import facts_table, mark, page, plot, table
+from nir_render.report.pictures import MOST_CAMERAS, close_up_figures, whole_figures
 from nir_render.report.plots import bearing_plot, pull_plot, range_error_plot
 from nir_render.report.samples import Samples, samples_of
 from nir_render.report.verdicts import RULES, Verdict, verdicts_of
@@ -75,29 +73,14 @@ def report_html(
         _facts(manifest),
         _files(files),
     ]
-    template = (
-        importlib.resources.files("nir_render.report").joinpath("page.html").read_text(encoding="utf-8")
-    )
-    return Template(template).substitute(
-        title=escape(title),
-        subtitle=escape(" · ".join(subtitle)),
-        body="\n".join(body),
-        ground=style.GROUND,
-        panel=style.PANEL,
-        line=style.LINE,
-        ink=style.INK,
-        faint=style.FAINT,
-        good=style.GOOD,
-        fair=style.FAIR,
-        bad=style.BAD,
-    )
+    return page(title, subtitle, body)
 
 
 def _verdicts(result: Evaluation, samples: Mapping[str, Samples]) -> str:
     parts = ["<h2>Verdicts</h2>"]
     for name, own in samples.items():
         cards = "".join(map(_card, verdicts_of(result.summary["estimators"][name], own)))
-        parts.append(f'<h3>{_mark(name, list(samples))} {escape(name)}</h3><div class="cards">{cards}</div>')
+        parts.append(f'<h3>{mark(name, list(samples))} {escape(name)}</h3><div class="cards">{cards}</div>')
     rules = "".join(f"<dt>{escape(about)}</dt><dd>{escape(rule)}</dd>" for about, rule in RULES.items())
     parts.append(f'<dl class="rules">{rules}</dl>')
     return "\n".join(parts)
@@ -144,7 +127,7 @@ def _table(result: Evaluation) -> str:
         degrees(bearing_limit),
     ]
     rows.append([f"<i>{limit}</i>" for limit in limits])
-    return "<h2>Numbers</h2>" + _rows_of(headings, rows)
+    return "<h2>Numbers</h2>" + table(headings, rows)
 
 
 def _pictures(
@@ -162,7 +145,7 @@ def _pictures(
     key = [
         f'<span><svg viewBox="0 0 16 16">{truth}</svg> truth (dashed: too faint or hidden to count)</span>'
     ]
-    key += [f"<span>{_mark(name, names)} {escape(name)}</span>" for name in names]
+    key += [f"<span>{mark(name, names)} {escape(name)}</span>" for name in names]
     if any(result.false_alarms.values()):
         key.append(
             f'<span><svg viewBox="0 0 16 16"><circle cx="8" cy="8" r="6" class="mark" stroke="{style.BAD}" '
@@ -195,7 +178,7 @@ def _plots(samples: Mapping[str, Samples]) -> str:
     )
     parts += [
         f"<p>{band}</p>",
-        _plot(range_error_plot(samples), "signed range error against true range, with the limit as a band"),
+        plot(range_error_plot(samples), "signed range error against true range, with the limit as a band"),
     ]
     if ranged:
         pulls = (
@@ -205,21 +188,15 @@ def _plots(samples: Mapping[str, Samples]) -> str:
         parts += [
             "<h2>Range error in units of the limit</h2>",
             f"<p>{pulls}</p>",
-            _plot(pull_plot(samples), "range error over limit, against range and as a histogram"),
+            plot(pull_plot(samples), "range error over limit, against range and as a histogram"),
         ]
     if found:
         parts += [
             "<h2>Bearing error</h2>",
             "<p>The angle between estimated and true direction in body axes.</p>",
-            _plot(bearing_plot(samples), "bearing error against true range, with its limit"),
+            plot(bearing_plot(samples), "bearing error against true range, with its limit"),
         ]
     return "\n".join(parts)
-
-
-def _plot(svg: str, said: str) -> str:
-    # As an image of its own: names within one SVG cannot clash with those of another.
-    data = base64.b64encode(svg.encode()).decode()
-    return f'<figure class="plot"><img alt="{escape(said)}" src="data:image/svg+xml;base64,{data}"></figure>'
 
 
 def _cameras(keys: Sequence[FrameKey], result: Evaluation) -> str:
@@ -241,7 +218,7 @@ def _cameras(keys: Sequence[FrameKey], result: Evaluation) -> str:
         rows.append([escape(camera), *map(str, counts)])
     more = len(frames) - MOST_CAMERAS
     said = f"<p>{counted(more, 'more camera')} not shown.</p>" if more > 0 else ""
-    return "<h2>Cameras</h2>" + _rows_of(headings, rows) + said
+    return "<h2>Cameras</h2>" + table(headings, rows) + said
 
 
 def _worst(result: Evaluation, samples: Mapping[str, Samples]) -> str:
@@ -257,8 +234,8 @@ def _worst(result: Evaluation, samples: Mapping[str, Samples]) -> str:
         rows += [_look_into(counting[index], own, index, name) for index in ranged[: _WORST - len(rows)]]
         headings = ["frame", "source", "true", "said", "error", "limit σ", "error / limit", "bearing off"]
         if rows:
-            table = _rows_of(headings, rows, text=(1,))
-            parts.append(f"<details><summary>{escape(name)}</summary>{table}</details>")
+            listed = table(headings, rows, text=(1,))
+            parts.append(f"<details><summary>{escape(name)}</summary>{listed}</details>")
     if not parts:
         return ""
     intro = "Of each estimator the nearest sources it missed, and the largest errors for their limit."
@@ -288,44 +265,12 @@ def _facts(manifest: Mapping[str, Any]) -> str:
     if not manifest:
         return "<h2>How it was made</h2><p>The folder has no manifest.json.</p>"
     shown = {key: value for key, value in manifest.items() if key not in ("format", "sha256")}
-    rows = [[escape(name), escape(value)] for name, value in _flat(shown)]
-    return "<h2>How it was made</h2>" + _rows_of([], rows, text=(1,))
-
-
-def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Name every leaf of nested facts: `seconds render`."""
-    leaves: list[tuple[str, str]] = []
-    for key, value in facts.items():
-        name = f"{prefix} {key}".strip().replace("_", " ")
-        if isinstance(value, Mapping):
-            leaves += _flat(value, name)
-        elif value not in ("", None):
-            leaves.append((name, str(value)))
-    return leaves
+    return "<h2>How it was made</h2>" + facts_table(shown)
 
 
 def _files(files: Sequence[str]) -> str:
     links = " · ".join(f'<a href="{quote(name)}">{escape(name)}</a>' for name in files)
     return f"<h2>Files</h2><p>{links}</p>" if links else ""
-
-
-def _rows_of(headings: Sequence[str], rows: Sequence[Sequence[str]], text: Sequence[int] = ()) -> str:
-    """Make a table; cells are HTML already, headings are not."""
-
-    def kind(column: int) -> str:
-        return ' class="text"' if column in text else ""
-
-    head = "".join(f"<th{kind(column)}>{escape(heading)}</th>" for column, heading in enumerate(headings))
-    lines = [
-        "<tr>" + "".join(f"<td{kind(column)}>{cell}</td>" for column, cell in enumerate(row)) + "</tr>"
-        for row in rows
-    ]
-    header = f"<thead><tr>{head}</tr></thead>" if head else ""
-    return f'<div class="scroll"><table>{header}<tbody>{"".join(lines)}</tbody></table></div>'
-
-
-def _mark(name: str, names: Sequence[str]) -> str:
-    return f'<svg viewBox="0 0 16 16" width="16" height="16">{marker_svg(name, names, 8, 8, 11)}</svg>'
 
 
 def _version_known(manifest: Mapping[str, Any]) -> bool:

@@ -1,21 +1,18 @@
 """The plots of a report, as SVG: errors against true range, with the limit drawn in."""
 
-import io
 from collections.abc import Mapping
-from typing import Literal
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
+from nir_render.report.drawing import legend, rounded_up, sheet, short, svg_of, symmetric_log
 from nir_render.report.samples import Samples, Values, limit_curve
 from nir_render.report.style import BAD, FAINT, LIMIT, MATPLOTLIB, look
 from nir_render.report.wording import metres
 
-_WIDTH_IN = 11.0
 _RASTER_BEYOND = 1500
 """More points than these become a bitmap within the SVG: it bounds the size of the page."""
 
@@ -26,7 +23,7 @@ def range_error_plot(samples: Mapping[str, Samples]) -> str:
     """Draw signed range errors against true range on a symmetric log scale, and below what was missed."""
     strip_in = 0.35 + 0.22 * len(samples)
     with mpl.rc_context(MATPLOTLIB):
-        figure = _figure(4.6 + strip_in)
+        figure = sheet(4.6 + strip_in)
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[4.6, strip_in])
         some = next(iter(samples.values()))
         x, limit_m = _band(some.range_m, some.range_limit_m)
@@ -37,12 +34,12 @@ def range_error_plot(samples: Mapping[str, Samples]) -> str:
         above.axhline(0.0, color=FAINT, linewidth=0.7)
         for name, own in samples.items():
             _scatter(above, own.range_m, own.error_m, name, list(samples))
-        linear_m = _rounded_up(float(limit_m.max())) if x.size and limit_m.max() > 0.0 else 0.1
+        linear_m = rounded_up(float(limit_m.max())) if x.size and limit_m.max() > 0.0 else 0.1
         ticks_m = linear_m * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-        _symmetric_log(above, linear_m, ticks_m, [own.error_m for own in samples.values()] + [limit_m])
+        symmetric_log(above, linear_m, ticks_m, [own.error_m for own in samples.values()] + [limit_m])
         above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _metres_tick(value)))
         above.set_ylabel("range error, estimated − true")
-        _legend(above)
+        legend(above)
         _found_strip(below, samples)
         below.set_xlabel("true range, m")
         return _svg(figure)
@@ -51,18 +48,18 @@ def range_error_plot(samples: Mapping[str, Samples]) -> str:
 def pull_plot(samples: Mapping[str, Samples]) -> str:
     """Draw range errors in units of their own limit: against true range, and as a histogram."""
     with mpl.rc_context(MATPLOTLIB):
-        figure = _figure(4.2)
+        figure = sheet(4.2)
         left, right = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
         for reach, alpha in ((2.0, 0.10), (1.0, 0.16)):
             left.axhspan(-reach, reach, color=LIMIT, alpha=alpha, linewidth=0)
         left.axhline(0.0, color=FAINT, linewidth=0.7)
         for name, own in samples.items():
             _scatter(left, own.range_m, own.pull, name, list(samples))
-        _symmetric_log(left, 3.0, np.arange(-3.0, 4.0), [own.pull for own in samples.values()])
+        symmetric_log(left, 3.0, np.arange(-3.0, 4.0), [own.pull for own in samples.values()])
         left.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
         left.set_ylabel("range error / limit σ")
         left.set_xlabel("true range, m")
-        _legend(left)
+        legend(left)
         _pull_histogram(right, samples)
         return _svg(figure)
 
@@ -70,7 +67,7 @@ def pull_plot(samples: Mapping[str, Samples]) -> str:
 def bearing_plot(samples: Mapping[str, Samples]) -> str:
     """Draw the angle between estimated and true bearing against true range, on a log scale."""
     with mpl.rc_context(MATPLOTLIB):
-        figure = _figure(3.8)
+        figure = sheet(3.8)
         axes = figure.subplots()
         some = next(iter(samples.values()))
         x, limit_deg = _band(some.range_m, some.bearing_limit_deg)
@@ -90,7 +87,7 @@ def bearing_plot(samples: Mapping[str, Samples]) -> str:
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel("angle between estimated and true bearing")
         axes.set_xlabel("true range, m")
-        _legend(axes)
+        legend(axes)
         return _svg(figure)
 
 
@@ -131,7 +128,7 @@ def _found_strip(axes: Axes, samples: Mapping[str, Samples]) -> None:
                 label="missed" if drawn is BAD and row == 0 else None,
             )  # fmt: skip
     axes.set_ylim(len(samples) - 0.4, -0.6)
-    labels = [f"{_short(name)}  {int(own.found.sum())}/{own.found.size}" for name, own in samples.items()]
+    labels = [f"{short(name)}  {int(own.found.sum())}/{own.found.size}" for name, own in samples.items()]
     axes.set_yticks(range(len(samples)), labels)
     axes.grid(visible=False)
     axes.set_title("found |  missed ×", fontsize=8, loc="right", color=FAINT, pad=3)
@@ -155,54 +152,14 @@ def _pull_histogram(axes: Axes, samples: Mapping[str, Samples]) -> None:
     axes.set_xlim(-_PULL_SHOWN, _PULL_SHOWN)
     top = max(axes.get_ylim()[1], 0.45)
     axes.set_ylim(0.0, top * (1.12 + 0.09 * len(samples)))
-    _legend(axes, loc="upper left")
-
-
-def _symmetric_log(axes: Axes, linear: float, ticks: Values, values: list[Values]) -> None:
-    """Scale y linearly within ±`linear`, by decades beyond, and reach as far as the values do."""
-    axes.set_yscale("symlog", linthresh=linear, linscale=1.2)
-    known = np.concatenate([value[np.isfinite(value)] for value in values])
-    low, high = (float(known.min()), float(known.max())) if known.size else (-linear, linear)
-    low, high = 1.6 * min(low, -linear), 1.6 * max(high, linear)
-    axes.set_ylim(low, high)
-    decades = 10.0 ** np.arange(np.floor(np.log10(linear)) + 1.0, np.log10(max(-low, high)) + 1.0)
-    beyond = np.concatenate([-decades, decades])
-    # Next to the linear part's own last tick a decade's would be written over it.
-    beyond = beyond[(abs(beyond) > 1.5 * linear) & (beyond >= low) & (beyond <= high)]
-    axes.set_yticks(np.sort(np.concatenate([ticks, beyond])))
-    axes.yaxis.set_minor_locator(NullLocator())
-
-
-def _rounded_up(value: float) -> float:
-    """Return the next number of 1, 2, 5, 10, 20, …."""
-    decade = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= value))
-
-
-def _legend(axes: Axes, loc: Literal["best", "upper left"] = "best") -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        shown = [_short(label, 60) for label in labels]
-        axes.legend(handles, shown, loc=loc, fontsize=8, frameon=True, framealpha=0.75, edgecolor="none")
+    legend(axes, loc="upper left")
 
 
 def _metres_tick(value: float) -> str:
     return "0" if value == 0.0 else metres(value, signed=True).replace(".00", "").replace(".0 ", " ")
 
 
-def _short(name: str, most: int = 18) -> str:
-    return name if len(name) <= most else name[: most - 1] + "…"
-
-
-def _figure(height_in: float) -> Figure:
-    figure = Figure((_WIDTH_IN, height_in), layout="constrained", dpi=130)
-    FigureCanvasSVG(figure)
-    return figure
-
-
 def _svg(figure: Figure) -> str:
     for axes in figure.axes:
         axes.xaxis.set_major_locator(MaxNLocator(nbins=12, steps=[1, 2, 5, 10]))
-    file = io.StringIO()
-    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    return file.getvalue()
+    return svg_of(figure)

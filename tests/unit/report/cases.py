@@ -1,7 +1,8 @@
-"""Scores worked out by hand: one camera, sources at chosen ranges, detections at chosen errors."""
+"""Scores worked out by hand: one camera, sources at chosen ranges, detections at chosen errors; a page read back."""
 
 import dataclasses
 from collections.abc import Mapping
+from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
@@ -54,3 +55,28 @@ def score(
     countable: bool = True,
 ) -> Score:
     return Score(truth(range_m=range_m), countable, limit_m, bearing_limit_deg, detections)
+
+
+class Page(HTMLParser):
+    """Collects tags, addresses and text, and holds that every tag is closed."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(html)
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("href", "src")]
+        if tag not in ("meta", "br", "img"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Sequence
-from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
@@ -13,34 +12,9 @@ from nir_render.evaluate.metrics import FrameKey, evaluate
 from nir_render.evaluate.truth import SourceTruth
 from nir_render.report.page import report_html
 from perception.types import Detection
-from tests.unit.report.cases import calibration, detection, frame, truth
+from tests.unit.report.cases import Page, calibration, detection, frame, truth
 
 HOSTILE = "<script>alert('$x$ & y')</script>"
-
-
-class _Page(HTMLParser):
-    """Collects tags, addresses and text, and holds that every tag is closed."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.addresses: list[str] = []
-        self.text = ""
-        self._open: list[str] = []
-        self.feed(html)
-        assert self._open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.addresses += [value or "" for name, value in attrs if name in ("href", "src")]
-        if tag not in ("meta", "br", "img"):
-            self._open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def _page(
@@ -48,13 +22,13 @@ def _page(
     rows: Sequence[SourceTruth],
     detections: dict[str, list[Detection]],
     manifest: dict[str, Any] | None = None,
-) -> tuple[_Page, str]:
+) -> tuple[Page, str]:
     cameras = {camera: calibration(camera) for camera, _ in keys}
     html = report_html(
         keys=keys, result=evaluate(keys, rows, cameras, detections), load=lambda key: frame(*key),
         calibrations=cameras, manifest=manifest or {}, folder_name="folder", files=["truth.jsonl", "a b<.json"],
     )  # fmt: skip
-    return _Page(html), html
+    return Page(html), html
 
 
 ONE = [("r1.front", 0)]
