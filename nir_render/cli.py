@@ -6,26 +6,27 @@ Exit status: 0 done, 1 the work failed or a check did not hold, 2 the input was 
 import dataclasses
 import json
 import math
+import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import yaml
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from nir_render.console import errors, escape, print_json, progress_bar, warn
 from nir_render.errors import InputError
 
 if TYPE_CHECKING:
     from nir_render.scene.load import Scene
     from nir_render.transport.cache import LightCache
     from perception import Estimator
+
+_MOST_WORKERS = 8  # by default: each takes a GiB or more
 
 app = typer.Typer(
     name="nir-render",
@@ -34,7 +35,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-_errors = Console(stderr=True, highlight=False)
 
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A scene file (YAML).")]
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")]
@@ -92,7 +92,7 @@ def main() -> None:
         app()
     except InputError as error:
         for problem in error.problems:
-            _errors.print(f"[bold red]error:[/] {_escape(problem)}", soft_wrap=True)
+            errors.print(f"[bold red]error:[/] {escape(problem)}", soft_wrap=True)
         sys.exit(2)
 
 
@@ -116,7 +116,7 @@ def run(
     chosen = _estimators(estimators)
     cache = _light_cache(light_cache, light_cache_gib)
     folder = _render(scene, output, settings, overwrite, seed, threads, keep_light, cache)
-    with _progress("perceive") as progress:
+    with progress_bar("perceive") as progress:
         perceive_run(folder, estimators=chosen, progress=progress)
     result = evaluate_run(folder)
     page = report_run(folder, result)
@@ -150,7 +150,7 @@ def render(
     folder = _render(scene, output, settings, overwrite, seed, threads, keep_light, cache)
     frames = len((folder / "frames.jsonl").read_text(encoding="utf-8").splitlines())
     if as_json:
-        _print_json({"folder": str(folder), "frames": frames})
+        print_json({"folder": str(folder), "frames": frames})
     else:
         typer.echo(f"{frames} frames in {folder}; next: nir-render perceive {folder}")
 
@@ -160,10 +160,10 @@ def perceive(folder: FolderArgument, estimators: Estimators = None, as_json: Jso
     """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
     from nir_render.run import perceive_run
 
-    with _progress("perceive") as progress:
+    with progress_bar("perceive") as progress:
         counts = perceive_run(folder, estimators=_estimators(estimators), progress=progress)
     if as_json:
-        _print_json({"folder": str(folder), "detections": counts})
+        print_json({"folder": str(folder), "detections": counts})
     else:
         for name, count in counts.items():
             typer.echo(f"{name}: {count} detections in {folder / f'detections.{name}.jsonl'}")
@@ -183,12 +183,12 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
     from nir_render.calibrate_run import FITTED_FILE, calibrate_run
     from nir_render.report.calibration_table import calibration_table
 
-    with _progress("calibrate") as progress:
+    with progress_bar("calibrate") as progress:
         cameras = calibrate_run(folder, progress)
     holds = not any(camera.faults for camera in cameras.values())
     if as_json:
         records = {name: camera.record() for name, camera in cameras.items()}
-        _print_json({"format": 1, "folder": str(folder), "holds": holds, "cameras": records})
+        print_json({"format": 1, "folder": str(folder), "holds": holds, "cameras": records})
     else:
         console = Console()
         for name, camera in cameras.items():
@@ -198,8 +198,8 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
     if not holds:
         for name, camera in cameras.items():
             for fault in camera.faults:
-                _errors.print(f"[bold red]check failed:[/] {name}: {_escape(fault)}", soft_wrap=True)
-        _errors.print(f"{folder / FITTED_FILE}: not written", soft_wrap=True)
+                errors.print(f"[bold red]check failed:[/] {name}: {escape(fault)}", soft_wrap=True)
+        errors.print(f"{folder / FITTED_FILE}: not written", soft_wrap=True)
         raise typer.Exit(1)
 
 
@@ -210,9 +210,82 @@ def report(folder: FolderArgument, as_json: Json = False) -> None:
 
     page = report_run(folder, evaluate_run(folder))
     if as_json:
-        _print_json({"folder": str(folder), "report": str(page)})
+        print_json({"folder": str(folder), "report": str(page)})
     else:
         typer.echo(f"open {page}")
+
+
+@app.command()
+def stress(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="A campaign file (YAML).")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Where it goes; outputs/NAME by default."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers", min=1, help="Processes to work in; by default as many as cores, at most 8."
+        ),
+    ] = None,
+    light_cache: LightFolder = None,
+    light_cache_gib: LightLimit = 4.0,
+    only_plan: Annotated[
+        bool, typer.Option("--plan", help="Only check the campaign, and say how many jobs it has.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Sweep a scene along axes, and show where estimators fail; goes on where it was stopped."""
+    from nir_render.report.campaign_words import verdict_lines
+    from nir_render.stress.campaign import load_campaign
+    from nir_render.stress.jobs import plan
+    from nir_render.stress.summary import summary_of
+    from nir_render.stress.sweep import StoppedError, done_before, sweep, write_report
+
+    known = load_campaign(campaign)
+    light_limit_bytes = _light_limit_bytes(light_cache_gib)
+    with progress_bar("check") as progress:
+        jobs = plan(known, progress)
+    folder = output if output is not None else Path("outputs") / known.name
+    if only_plan:
+        done = done_before(known, jobs, folder)
+        lights = len({job.light for job in jobs})
+        if as_json:
+            print_json({"campaign": known.name, "jobs": len(jobs), "done": done, "geometries": lights})
+        else:
+            typer.echo(f"{known.name}: {len(jobs)} jobs in {lights} geometries; {done} are done in {folder}")
+        return
+    count = workers if workers is not None else min(os.cpu_count() or 1, _MOST_WORKERS)
+    try:
+        with progress_bar("stress") as progress:
+            result = sweep(
+                known,
+                jobs,
+                folder,
+                workers=count,
+                progress=progress,
+                light=light_cache,
+                light_limit_bytes=light_limit_bytes,
+            )
+    except StoppedError as stopped:
+        again = escape(shlex.join(["nir-render", *sys.argv[1:]]))
+        errors.print(f"{stopped}; the same command goes on: {again}", soft_wrap=True)
+        raise typer.Exit(128 + signal.SIGINT) from None
+    for text in result.warnings:
+        warn(text)
+    page = write_report(result)
+    if as_json:
+        counts = {"jobs": len(jobs), "done_before": result.reused, "failed": len(result.failed)}
+        print_json({"format": 1, "folder": str(folder), **counts, **summary_of(known, result.table)})
+    else:
+        for line in verdict_lines(known, result.table):
+            typer.echo(line)
+        typer.echo(f"open {page}")
+    if result.failed:
+        for key, text in result.failed.items():
+            errors.print(f"[bold red]job {key[:8]} failed:[/] {escape(text)}", soft_wrap=True)
+        errors.print("the same command tries these again")
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -225,7 +298,7 @@ def new(
 
     files = new_examples(folder)
     if as_json:
-        _print_json({"folder": str(folder), "files": files})
+        print_json({"folder": str(folder), "files": files})
     else:
         typer.echo(f"{', '.join(files)} in {folder}")
         typer.echo(f"next: nir-render run {shlex.quote(str(folder / FIRST_SCENE))}")
@@ -233,22 +306,23 @@ def new(
 
 @app.command()
 def validate(
-    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene files.")],
+    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene and campaign files.")],
     as_json: Json = False,
 ) -> None:
-    """Check scene files: every error names file, line, field and what was wanted."""
+    """Check scene and campaign files: every error names file, line, field and what was wanted."""
     from nir_render.scene.load import load_scene
+    from nir_render.stress.campaign import is_campaign, load_campaign
 
     problems: list[str] = []
     valid: list[str] = []
     for path in scenes:
         try:
-            load_scene(path)
+            load_campaign(path) if is_campaign(path) else load_scene(path)
             valid.append(str(path))
         except InputError as error:
             problems += error.problems
     if as_json:
-        _print_json({"valid": valid, "errors": problems})
+        print_json({"valid": valid, "errors": problems})
     else:
         for name in valid:
             typer.echo(f"{name}: valid")
@@ -257,11 +331,14 @@ def validate(
 
 
 @app.command()
-def schema() -> None:
+def schema(
+    campaign: Annotated[bool, typer.Option("--campaign", help="That of campaigns instead.")] = False,
+) -> None:
     """Print the JSON Schema of scene files, for editors."""
     from nir_render.scene.schema import scene_schema
+    from nir_render.stress.schema import campaign_schema
 
-    typer.echo(json.dumps(scene_schema(), indent=2))
+    typer.echo(json.dumps(campaign_schema() if campaign else scene_schema(), indent=2))
 
 
 @app.command()
@@ -271,11 +348,11 @@ def doctor(as_json: Json = False) -> None:
 
     report = examine()
     if as_json:
-        _print_json(report)
+        print_json(report)
     else:
         table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
         for key, value in report.items():
-            table.add_row(key.replace("_", " "), _escape(str(value)))
+            table.add_row(key.replace("_", " "), escape(str(value)))
         Console().print(table)
     if not report["check_holds"]:
         raise typer.Exit(1)
@@ -299,7 +376,7 @@ def _say_what_is_lowered(scene: "Scene") -> None:
     asked = settings.indirect.samples
     wanted = "what the target for the noise needs" if asked is None else str(asked)
     if not backend().vectorised and used != asked:
-        _errors.print(
+        errors.print(
             f"no usable LLVM: indirect light with {used} samples per pixel instead of {wanted}; "
             "'nir-render doctor' says more",
             soft_wrap=True,
@@ -319,7 +396,7 @@ def _show_estimate(
         set_threads(threads)
     guess = estimate(scene)
     if as_json:
-        _print_json({**dataclasses.asdict(guess), "seconds": guess.seconds})
+        print_json({**dataclasses.asdict(guess), "seconds": guess.seconds})
         return
     typer.echo(
         f"about {guess.seconds:.0f} s: light for {guess.lights} views at {guess.seconds_per_light:.2f} s, "
@@ -347,25 +424,25 @@ def _render(
     check_free(folder, overwrite)
     if threads is not None:
         set_threads(threads)
-    with _progress("render") as progress:
+    with progress_bar("render") as progress:
         warnings = render_run(
             scene, folder, overwrite=overwrite, progress=progress, keep_light=keep_light, cache=cache
         )
     for text in warnings:
-        _warn(text)
+        warn(text)
     return folder
 
 
 def _light_cache(folder: Path | None, limit_gib: float) -> "LightCache":
     from nir_render.transport.cache import LightCache
 
+    return LightCache(folder, limit_bytes=_light_limit_bytes(limit_gib), say=warn)
+
+
+def _light_limit_bytes(limit_gib: float) -> int:
     if not (math.isfinite(limit_gib) and limit_gib > 0.0):
         raise InputError(f"--light-cache-gib {limit_gib:g}: wanted a size above 0, in GiB, such as 4")
-    return LightCache(folder, limit_bytes=int(limit_gib * 2**30), say=_warn)
-
-
-def _warn(text: str) -> None:
-    _errors.print(f"[bold yellow]warning:[/] {_escape(text)}", soft_wrap=True)
+    return int(limit_gib * 2**30)
 
 
 def _setting(text: str) -> tuple[str, Any]:
@@ -398,7 +475,7 @@ def _show_evaluation(result: Any, folder: Path, as_json: bool) -> None:
     from nir_render.report.tables import range_table, summary_table
 
     if as_json:
-        _print_json(result.summary)
+        print_json(result.summary)
         return
     console = Console()
     console.print(range_table(result))
@@ -408,24 +485,5 @@ def _show_evaluation(result: Any, folder: Path, as_json: bool) -> None:
     )
 
 
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on standard error; yield the function that moves it."""
-    columns = (TextColumn(f"{what:<9}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_errors, transient=not _errors.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
-
-        def move(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield move
-
-
-def _print_json(document: Any) -> None:
-    typer.echo(json.dumps(document, allow_nan=False))
-
-
-def _escape(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)
+if __name__ == "__main__":
+    main()

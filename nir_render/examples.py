@@ -10,6 +10,10 @@ FIRST_SCENE = "one_source.yaml"
 """The scene to run first: it takes a second."""
 
 _KINDS = (".yaml", ".json", ".py")
+_LEFT_OUT = {
+    "__pycache__",
+    "references",
+}  # references of the regression suite: made anew where they are wanted
 
 
 def examples_folder() -> Path:
@@ -42,7 +46,9 @@ def new_examples(folder: Path) -> list[str]:
         raise InputError(f"{folder}: holds files already; give a new or empty folder")
     source = examples_folder()
     files = sorted(
-        path for path in source.rglob("*") if path.suffix in _KINDS and "__pycache__" not in path.parts
+        path
+        for path in source.rglob("*")
+        if path.suffix in _KINDS and not _LEFT_OUT.intersection(path.relative_to(source).parts)
     )
     names = [path.relative_to(source).as_posix() for path in files]
     try:

@@ -11,8 +11,9 @@ SCENES = Path(__file__).parents[2] / "scenes"
 def test_a_new_folder_holds_the_examples_as_they_are(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()  # an empty folder is as good as none
     names = new_examples(tmp_path / "mine")
-    assert {FIRST_SCENE, "my_estimator.py", "scene.schema.json"} <= set(names)
-    assert set(names) == {path.name for path in SCENES.iterdir() if path.is_file()}
+    assert {FIRST_SCENE, "my_estimator.py", "scene.schema.json", "campaigns/saturation.yaml"} <= set(names)
+    shown = [path for folder in ("", "campaigns", "regression") for path in (SCENES / folder).glob("[a-z]*")]
+    assert set(names) == {path.relative_to(SCENES).as_posix() for path in shown if path.is_file()}
     for name in names:
         assert (tmp_path / "mine" / name).read_bytes() == (SCENES / name).read_bytes()
     assert load_scene(tmp_path / "mine" / FIRST_SCENE).document.name == "one_source"

@@ -1,0 +1,170 @@
+"""What a campaign's limits and figures say, in words."""
+
+import math
+from collections.abc import Sequence
+
+import pyarrow as pa
+
+from nir_render.report.wording import counted, degrees, metres, share, times
+from nir_render.scene.units import ANGLE, LENGTH
+from nir_render.stress.axes import Axis
+from nir_render.stress.campaign import Campaign
+from nir_render.stress.crossings import Edge, Span
+from nir_render.stress.figures import FIGURES, SHARES, Bound
+from nir_render.stress.limits import Limit, Verdict, corners_kept, limits_of
+from nir_render.stress.sums import job_sums
+
+_BEYOND = {"nothing there": "nothing to judge", "not defined": "no such figure"}
+_MOST_NAMED = 6
+
+
+def figure_text(name: str, value: float | None) -> str:
+    """Write the value of a figure as a person reads it."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    quantity = FIGURES[name].quantity
+    if quantity is LENGTH:
+        return metres(value, signed=name == "range_bias")
+    if quantity is ANGLE:
+        return degrees(math.degrees(value))
+    if name in SHARES or name == "range_rmse_share":
+        return share(value) if value <= 1.0 else f"{100.0 * value:.3g} %"
+    if name == "false_alarms":
+        return f"{value:.2g}"
+    return times(value)
+
+
+def marked_unit(name: str) -> float:
+    """Return the unit in which round values of a figure are marked at a scale: degrees, not radians."""
+    return math.pi / 180.0 if FIGURES[name].quantity is ANGLE else 1.0
+
+
+def tick_text(name: str, value: float) -> str:
+    """Write a value at a scale of a plot, as short as it goes."""
+    head, _, unit = figure_text(name, value).partition(" ")
+    if "." in head:
+        head = head.rstrip("0").rstrip(".")
+    return f"{head} {unit}".rstrip() if value else "0"
+
+
+def bound_text(bound: Bound) -> str:
+    """Write a bound: range RMSE ≤ 5 cm."""
+    figure = FIGURES[bound.figure]
+    title = f"|{figure.title}|" if bound.figure == "range_bias" else figure.title
+    sign = "≥" if figure.higher_is_better else "≤"
+    return f"{title} {sign} {bound.text or figure_text(bound.figure, bound.value)}"
+
+
+def number_text(axis: Axis, value: float) -> str:
+    """Write a place on an axis, with its unit."""
+    return f"{value:.3g} {axis.unit}".rstrip().replace("-", "−")
+
+
+def verdict_text(axis: Axis, verdict: Verdict) -> str:
+    """Say where along an axis a bound holds: up to 4.3 m (4.1–4.5)."""
+    if verdict.status == "nothing to judge":
+        return "nothing to judge"
+    if verdict.status == "nowhere":
+        return "nowhere" + _sure(verdict)
+    if verdict.status == "throughout":
+        return "throughout" + _sure(verdict)
+    if axis.numbers is None:
+        return _labels_text(axis, verdict)
+    if verdict.status == "wherever judged":
+        unjudged = [label for label, one in zip(axis.labels, verdict.holds, strict=True) if one is None]
+        return f"wherever there is something to judge (nothing at {_listed(unjudged)})"
+    if len(verdict.spans) > _MOST_NAMED:
+        return f"in {len(verdict.spans)} separate spans, the first {_span_text(axis, verdict.spans[0])}"
+    return " and ".join(_span_text(axis, span) for span in verdict.spans)
+
+
+def corner_text(axes: Sequence[Axis], corner: Sequence[int]) -> str:
+    """Name a combination of axes' values: visibility 20 m, lamp behind."""
+    return ", ".join(
+        f"{axis.title} {axis.labels[index]}" for axis, index in zip(axes, corner, strict=True) if index >= 0
+    )
+
+
+def sentence_of(axes: Sequence[Axis], limits: Sequence[Limit], corners: tuple[int, int]) -> str:
+    """Say how one estimator keeps one bound.
+
+    Parameters
+    ----------
+    limits
+        Those of that estimator and bound, along each axis.
+    corners
+        In how many combinations of all axes' values it is kept, and in how many there is something to judge.
+    """
+    kept, judged = corners
+    if not judged:
+        return "has nothing to be judged by."
+    if not kept:
+        return f"keeps it at none of {counted(judged, 'combination')} of values."
+    parts = [f"keeps it at {kept} of {counted(judged, 'combination')} of values"]
+    for limit in limits:
+        axis = axes[limit.axis]
+        text = f"along {axis.title} {verdict_text(axis, limit.pooled)}"
+        if limit.worst is not None and limit.pooled.status != "nowhere":
+            several = len(limit.worst.spans) > 1
+            worst = "only here and there" if several else verdict_text(axis, limit.worst)
+            text += f", in its worst corner {worst}"
+        parts.append(text)
+    return "; ".join(parts) + "."
+
+
+def _span_text(axis: Axis, span: Span) -> str:
+    start, end = span.start, span.end
+    if start.reason == "end" and end.reason == "end":
+        return "throughout"
+    if start.reason == "end":
+        return f"up to {_edge_text(axis, end, 'beyond')}"
+    if end.reason == "end":
+        return f"from {_edge_text(axis, start, 'below')} up"
+    if start.value == end.value:
+        return f"at {number_text(axis, start.value)} alone"
+    return f"from {_edge_text(axis, start, 'below')} to {_edge_text(axis, end, 'beyond')}"
+
+
+def _edge_text(axis: Axis, edge: Edge, where: str) -> str:
+    text = number_text(axis, edge.value)
+    if edge.reason in _BEYOND:
+        return f"{text} ({_BEYOND[edge.reason]} {where})"
+    if edge.low is None or edge.high is None or not edge.low <= edge.high:
+        return text
+    numbers = axis.numbers or (math.nan,)
+    low = f"{edge.low:.3g}" if math.isfinite(edge.low) else f"below {numbers[0]:.3g}"
+    high = f"{edge.high:.3g}" if math.isfinite(edge.high) else f"beyond {numbers[-1]:.3g}"
+    return f"{text} ({low}–{high})".replace("-", "−")
+
+
+def _labels_text(axis: Axis, verdict: Verdict) -> str:
+    named = [
+        (word, [label for label, one in zip(axis.labels, verdict.holds, strict=True) if one is value])
+        for word, value in (("at", True), ("not at", False), ("nothing to judge at", None))
+    ]
+    return ", ".join(f"{word} {_listed(labels)}" for word, labels in named if labels) + _sure(verdict)
+
+
+def _sure(verdict: Verdict) -> str:
+    if verdict.agree is None or verdict.agree >= 0.95:
+        return ""
+    return f" (narrowly: {100.0 * verdict.agree:.0f} of 100 repetitions agree)"
+
+
+def _listed(labels: Sequence[str]) -> str:
+    shown = list(labels[:_MOST_NAMED])
+    more = len(labels) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+def verdict_lines(campaign: Campaign, rows: pa.Table) -> list[str]:
+    """Say of each bound how each estimator keeps it, in lines for a terminal."""
+    sums = job_sums(campaign.axes, rows)
+    limits = limits_of(campaign.axes, campaign.bounds, sums, campaign.seeds[0])
+    lines = []
+    for bound in campaign.bounds:
+        lines.append(bound_text(bound))
+        for name in sums.estimators:
+            own = [limit for limit in limits if limit.bound == bound and limit.estimator == name]
+            lines.append(f"  {name} {sentence_of(campaign.axes, own, corners_kept(bound, name, sums))}")
+    return lines

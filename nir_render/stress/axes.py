@@ -1,0 +1,197 @@
+"""The axes of a campaign: what is changed in the scene, and through which values."""
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import yaml
+from pydantic import Field, model_validator
+
+from nir_render.scene.base import Document
+from nir_render.scene.units import Reading, read_quantity
+
+MOST_VALUES = 1000
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of a campaign.
+
+    Attributes
+    ----------
+    name
+        What the table's column is called after.
+    title
+        What to write beside it.
+    paths
+        The dotted paths that get its value.
+    values
+        What is set there, as a scene file would hold it, shape (n,).
+    labels
+        How each value is called, shape (n,).
+    unit
+        The unit that the values are written in; "" for plain numbers and for what is no number.
+    numbers
+        The values in that unit, shape (n,), increasing or decreasing; None where they are no numbers.
+    values_si
+        The same in SI units, which stand in the table.
+    log
+        Whether neighbours differ by ratios rather than by steps.
+    """
+
+    name: str
+    title: str
+    paths: tuple[str, ...]
+    values: tuple[Any, ...]
+    labels: tuple[str, ...]
+    unit: str = ""
+    numbers: tuple[float, ...] | None = None
+    values_si: tuple[float, ...] | None = None
+    log: bool = False
+
+    def settings(self, index: int) -> dict[str, Any]:
+        """Return what the value of this index sets, by dotted path."""
+        return dict.fromkeys(self.paths, self.values[index])
+
+
+class AxisDocument(Document):
+    """An axis as written: a list of values, or a range `from` … `to` of `count` values.
+
+    `path` is the dotted path, or several that get the same value; without it the axis's name is the path.
+    `labels` name the values, one for each.
+    """
+
+    example: ClassVar[str] = "{path: robots.r2.position.x, from: 1 m, to: 6 m, count: 6}"
+
+    path: str | Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    title: str | None = None
+    values: Annotated[tuple[Any, ...], Field(min_length=1, max_length=MOST_VALUES)] | None = None
+    labels: tuple[str, ...] | None = None
+    start: Annotated[Any, Field(alias="from")] = None
+    to: Any = None
+    count: Annotated[int, Field(ge=2, le=MOST_VALUES)] | None = None
+    spacing: Literal["linear", "log"] = "linear"
+
+    read_keys: ClassVar[tuple[str, ...]] = ("from",)
+
+    @classmethod
+    def check_keys(cls, data: Any) -> None:
+        """Look at the keys alone: values of an axis may be anything that a scene file holds."""
+        super().check_keys(dict.fromkeys(data) if isinstance(data, Mapping) else data)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_list_is_its_values(cls, data: Any) -> Any:
+        return {"values": data} if isinstance(data, list) else data
+
+    @model_validator(mode="after")
+    def _list_or_range(self) -> Self:
+        of_range = (self.start, self.to, self.count)
+        if (self.values is None) == all(part is None for part in of_range):
+            raise ValueError(f"write either 'values' or 'from', 'to' and 'count', such as {self.example}")
+        if self.values is None and any(part is None for part in of_range):
+            raise ValueError(f"a range needs 'from', 'to' and 'count', such as {self.example}")
+        if self.labels is not None and (self.values is None or len(self.labels) != len(self.values)):
+            raise ValueError("'labels' names each of the 'values': wanted as many of them")
+        if self.labels is not None and len(set(self.labels)) != len(self.labels):
+            raise ValueError("two of the 'labels' are the same")
+        return self
+
+    def axis(self, name: str) -> Axis:
+        """Return the axis.
+
+        Raises
+        ------
+        ValueError
+            A range whose ends are no numbers of one unit, or the same; a value that stands twice.
+        """
+        paths = self.path if isinstance(self.path, tuple) else (self.path or name,)
+        values = self._range() if self.values is None else self.values
+        read = [read_quantity(value) for value in values]
+        title = self.title or (name if self.path is not None else name.rpartition(".")[2].replace("_", " "))
+        known = [one for one in read if one is not None]
+        if self.labels is not None or None in read or len({one.quantity for one in known}) > 1:
+            labels = self.labels or tuple(_label(value) for value in values)
+            _refuse_repeats(labels)
+            return Axis(name, title, paths, values, labels)
+        unit = known[0].unit
+        si = tuple(one.value_si for one in known)
+        numbers = tuple(_in_unit(one, known[0]) for one in known)
+        labels = tuple(f"{number:.4g} {unit}".rstrip() for number in numbers)
+        _refuse_repeats(si)
+        if len(set(labels)) != len(labels):
+            labels = tuple(f"{number!r} {unit}".rstrip() for number in numbers)
+        order = sorted(range(len(si)), key=si.__getitem__)
+        return Axis(
+            name,
+            title,
+            paths,
+            tuple(values[i] for i in order),
+            tuple(labels[i] for i in order),
+            unit,
+            tuple(numbers[i] for i in order),
+            tuple(si[i] for i in order),
+            self._spaced_by_ratios(sorted(si)),
+        )
+
+    def _spaced_by_ratios(self, si: list[float]) -> bool:
+        if self.values is None:
+            return self.spacing == "log"
+        if len(si) < 3 or si[0] <= 0.0:
+            return False
+        steps = [later - earlier for earlier, later in itertools.pairwise(si)]
+        ratios = [math.log(later / earlier) for earlier, later in itertools.pairwise(si)]
+        return max(ratios) / min(ratios) < max(steps) / min(steps)
+
+    def _range(self) -> tuple[Any, ...]:
+        first, last = read_quantity(self.start), read_quantity(self.to)
+        if first is None or last is None:
+            wrong = self.start if first is None else self.to
+            raise ValueError(f"{wrong!r} is no number with a unit; a range goes such as {self.example}")
+        if first.quantity is not last.quantity:
+            raise ValueError(
+                f"{self.start!r} and {self.to!r} are a {first.quantity.name} and a {last.quantity.name}; "
+                "wanted two of one kind"
+            )
+        begin, end = first.number, _in_unit(last, first)
+        if begin == end:
+            raise ValueError("'from' and 'to' are the same")
+        count = self.count or 2
+        if self.spacing == "log" and min(begin, end) <= 0.0:
+            raise ValueError("a log range needs 'from' and 'to' above 0")
+        shares = [step / (count - 1) for step in range(count)]
+        if self.spacing == "log":
+            numbers = [begin * (end / begin) ** share for share in shares]
+        else:
+            numbers = [begin + (end - begin) * share for share in shares]
+        # Twelve digits: 0.1 + 2 · 0.1 is to be 0.3.
+        rounded = [float(f"{number:.12g}") for number in numbers]
+        whole = all(isinstance(end, int) for end in (self.start, self.to)) and all(
+            number.is_integer() for number in rounded
+        )
+        if not first.unit:
+            return tuple(int(number) for number in rounded) if whole else tuple(rounded)
+        return tuple(f"{number:.12g} {first.unit}" for number in rounded)
+
+
+def _in_unit(one: Reading, of: Reading) -> float:
+    """Return a number in the unit of another; in its own it keeps its digits."""
+    if one.unit == of.unit:
+        return one.number
+    unit = read_quantity(f"1 {of.unit}")
+    assert unit is not None  # noqa: S101 (it was read before)
+    return float(f"{one.value_si / unit.value_si:.12g}")
+
+
+def _refuse_repeats(values: tuple[Any, ...]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise ValueError(f"the value {value!r} stands twice")
+
+
+def _label(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return str(yaml.safe_dump(value, default_flow_style=True, width=1000)).removesuffix("...\n").strip()

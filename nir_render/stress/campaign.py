@@ -1,0 +1,190 @@
+"""A campaign document: which scene is swept along which axes, and what is to hold there."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, ValidationError, field_validator
+
+from nir_render.errors import InputError
+from nir_render.scene.base import Document, read_yaml
+from nir_render.scene.explain import explain
+from nir_render.scene.load import Scene, load_scene
+from nir_render.stress.axes import Axis, AxisDocument
+from nir_render.stress.figures import FIGURES, Bound, known_figure, parse_bound
+
+_MOST_SEEDS = 100_000
+_DEFAULT_FIGURES = ("range_rmse", "recall", "ranged", "false_alarms")
+
+
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """A campaign, read and checked, but for its combinations of values.
+
+    `scene` is the base scene with the campaign's own changes; `settings` are these, by dotted path.
+    `figures` are names of `FIGURES`; those with a bound are among them. `path` names the file in errors.
+    """
+
+    name: str
+    description: str
+    scene: Scene
+    settings: Mapping[str, Any]
+    axes: tuple[Axis, ...]
+    seeds: tuple[int, ...]
+    estimators: tuple[str, ...]
+    figures: tuple[str, ...]
+    bounds: tuple[Bound, ...]
+    path: str
+
+
+class CampaignDocument(Document):
+    """A campaign as written.
+
+    `scene` is a file beside the campaign, `set` what is changed in it throughout. Every combination of the
+    axes' values is rendered with every seed: a list, or how many, counted from 1.
+    """
+
+    format: Literal[1]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]*$")]
+    description: str = ""
+    scene: str
+    settings: Annotated[dict[str, Any], Field(alias="set")] = {}
+    axes: Annotated[dict[str, AxisDocument], Field(min_length=1)]
+    seeds: Annotated[int, Field(ge=1, le=_MOST_SEEDS)] | Annotated[tuple[int, ...], Field(min_length=1)] = (
+        1,
+    )
+    estimators: Annotated[tuple[str, ...], Field(min_length=1)] = ("paper", "robust")
+    figures: Annotated[tuple[str, ...], Field(min_length=1)] = _DEFAULT_FIGURES
+    bounds: dict[str, Any] = {}
+
+    read_keys: ClassVar[tuple[str, ...]] = ("set",)
+
+    @field_validator("seeds")
+    @classmethod
+    def _seeds_differ(cls, seeds: int | tuple[int, ...]) -> int | tuple[int, ...]:
+        if isinstance(seeds, tuple) and (min(seeds) < 0 or len(set(seeds)) != len(seeds)):
+            raise ValueError("wanted different whole numbers from 0 up, or how many seeds to take")
+        return seeds
+
+    @field_validator("figures")
+    @classmethod
+    def _figures_known(cls, figures: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(known_figure(name) for name in figures))
+
+
+def load_campaign(path: str | Path) -> Campaign:
+    """Read a campaign file and its scene.
+
+    Raises
+    ------
+    InputError
+        A line per problem. What only a combination of values does wrong is found by `jobs.plan`.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError(f"{file}: there is no such campaign file")
+    try:
+        raw = read_yaml(file)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    if isinstance(raw, Mapping) and "robots" in raw and "axes" not in raw:
+        raise InputError(f"{file}: is a scene; a campaign names one ('scene: …') and 'axes' to change in it")
+    try:
+        document = CampaignDocument.model_validate(raw)
+    except ValidationError as error:
+        raise InputError(*explain(error, raw, str(file))) from None
+    problems: list[str] = []
+    axes, bounds = [], []
+    for name, written in document.axes.items():
+        try:
+            axes.append(written.axis(name))
+        except ValueError as error:
+            problems.append(f"{file}: axes.{name}: {error}")
+    for name, value in document.bounds.items():
+        try:
+            bounds.append(parse_bound(name, value))
+        except ValueError as error:
+            problems.append(f"{file}: bounds.{name}: {error}")
+    problems += [f"{file}: {problem}" for problem in _clashes(axes, document.settings)]
+    if problems:
+        raise InputError(*problems)
+    scene = _base_scene(file, document)
+    _check_axes(file, scene, axes)
+    seeds = range(1, document.seeds + 1) if isinstance(document.seeds, int) else document.seeds
+    return Campaign(
+        document.name,
+        document.description,
+        scene,
+        document.settings,
+        tuple(axes),
+        tuple(seeds),
+        tuple(dict.fromkeys(_beside(file, name) for name in document.estimators)),
+        tuple(name for name in FIGURES if name in document.figures or name in document.bounds),
+        tuple(bounds),
+        str(file),
+    )
+
+
+def is_campaign(path: Path) -> bool:
+    """Tell whether a file is meant as a campaign: it has axes."""
+    try:
+        raw = read_yaml(path)
+    except (OSError, ValueError):
+        return False
+    return isinstance(raw, Mapping) and "axes" in raw
+
+
+def _base_scene(file: Path, document: CampaignDocument) -> Scene:
+    try:
+        return load_scene(os.path.normpath(file.parent / document.scene), document.settings)
+    except InputError as error:
+        raise InputError(*(f"{file}: scene: {_bare(problem)}" for problem in error.problems)) from None
+
+
+def _check_axes(file: Path, scene: Scene, axes: list[Axis]) -> None:
+    """Refuse an axis whose path is no part of the scene, or a value that is none for it."""
+    for axis in axes:
+        # Two axes may only make sense together.
+        others = {
+            path: value for other in axes if other is not axis for path, value in other.settings(0).items()
+        }
+        problems: list[str] = []
+        for index, label in enumerate(axis.labels):
+            alone = _problems(scene, axis.settings(index))
+            if alone and _problems(scene, {**others, **axis.settings(index)}):
+                problems += [f"{file}: axes.{axis.name}: {label}: {_bare(one)}" for one in alone]
+        if problems:
+            raise InputError(*problems)
+
+
+def _problems(scene: Scene, settings: Mapping[str, Any]) -> Sequence[str]:
+    try:
+        scene.with_(settings)
+    except InputError as error:
+        return error.problems
+    return ()
+
+
+def _clashes(axes: list[Axis], settings: Mapping[str, Any]) -> list[str]:
+    """Return what is set twice: by two axes, by an axis and `set`; and the seed, which has its own key."""
+    problems = []
+    owner: dict[str, str] = dict.fromkeys(settings, "'set'")
+    for axis in axes:
+        for path in axis.paths:
+            if path in owner:
+                problems.append(f"axes.{axis.name}: {path} is set by {owner[path]} too")
+            owner[path] = f"axes.{axis.name}"
+    problems += [f"{owner['seed']} sets the seed: write it under 'seeds'"] if "seed" in owner else []
+    return problems
+
+
+def _beside(file: Path, estimator: str) -> str:
+    """Return an estimator's name; one's own, `file.py:function`, counts from the campaign's folder."""
+    return str(file.parent / estimator) if ".py" in estimator else estimator
+
+
+def _bare(problem: str) -> str:
+    """Return a scene's problem without the words for the command line's option."""
+    return problem.removeprefix("--set ").replace(" with --set", "")

@@ -1,0 +1,154 @@
+"""Where a figure, known at the values of an axis, keeps its bound: spans between crossings, and how sure."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.stress.figures import Figure, Values
+
+Reason = Literal["crossing", "end", "nothing there", "not defined"]
+_LOW, _HIGH = 0.16, 0.84
+
+
+@dataclass(frozen=True)
+class Edge:
+    """One end of a span, in the axis's own unit.
+
+    `reason` says why it ends there: the figure crosses the bound (`value` is interpolated between the two
+    neighbours); the axis ends; or the next value has nothing to judge, or no figure, and `value` is the last
+    that holds. `low` and `high` hold 68 of 100 repetitions, infinite where such a repetition has no crossing
+    within the axis; None where nothing was repeated.
+    """
+
+    value: float
+    reason: Reason
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class Span:
+    """An interval of the axis in which the bound holds."""
+
+    start: Edge
+    end: Edge
+
+
+def spans(
+    x: Values,
+    log: bool,
+    figure: Figure,
+    bound: float,
+    value: Values,
+    asked: NDArray[np.bool_],
+    draws: Values | None,
+) -> tuple[Span, ...]:
+    """Return the intervals of an axis in which a figure keeps its bound, in order.
+
+    Between neighbours the figure is taken as a straight line, in the logarithm where it is an error above 0
+    and against the logarithm of the axis where `log`.
+
+    Parameters
+    ----------
+    x
+        The axis's values, increasing, shape (n,).
+    value
+        The figure there, shape (n,); NaN where it is not defined.
+    asked
+        Whether there was anything to judge, shape (n,).
+    draws
+        The figure in repetitions, shape (repetitions, n); None where there are none.
+    """
+    scaled = np.log(x) if log else x
+    holds = figure.holds(value, bound)
+    places = _crossings(scaled, figure, bound, value[None])[0]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
+    found = []
+    for first, after in zip(edges[::2], edges[1::2], strict=True):
+        start = _edge(x, log, first - 1, first, places, value, asked)
+        end = _edge(x, log, after - 1, after, places, value, asked)
+        if draws is not None:
+            again = _crossings(scaled, figure, bound, draws)
+            kept = figure.holds(draws, bound)
+            start = _with_interval(start, log, places, first - 1, again, kept, falls=False)
+            end = _with_interval(end, log, places, after - 1, again, kept, falls=True)
+        found.append(Span(start, end))
+    return tuple(found)
+
+
+def kept_length(x: Values, log: bool, figure: Figure, bound: float, value: Values) -> Values:
+    """Return over how much of an axis a figure keeps its bound, in x or its logarithm.
+
+    The sum of what `spans` gives, for many figures at once: `value` has the shape (…, n).
+    """
+    scaled = np.log(x) if log else x
+    holds = figure.holds(value, bound)
+    left, right = holds[..., :-1], holds[..., 1:]
+    place = _crossings(scaled, figure, bound, value)
+    part = np.where(left & right, np.diff(scaled), 0.0)
+    part = np.where(left & ~right, place - scaled[:-1], part)
+    part = np.where(~left & right, scaled[1:] - place, part)
+    length: Values = part.sum(axis=-1)
+    return length
+
+
+def interval(draws: Values) -> tuple[float, float]:
+    """Return what holds 68 of 100 draws, shape (draws,); infinite draws count, NaN do not."""
+    ordered = np.sort(draws[~np.isnan(draws)])
+    if ordered.size == 0:
+        return np.nan, np.nan
+    low, high = np.floor(_LOW * (ordered.size - 1)), np.ceil(_HIGH * (ordered.size - 1))
+    return float(ordered[int(low)]), float(ordered[int(high)])
+
+
+def _crossings(scaled: Values, figure: Figure, bound: float, value: Values) -> Values:
+    """Return where each gap between neighbours crosses the bound, shape (…, n − 1); NaN where it does not.
+
+    Beside a value that is not defined, the neighbour that holds is the last.
+    """
+    size = value if figure.higher_is_better else np.abs(value)
+    holds = figure.holds(value, bound)
+    left, right = size[..., :-1], size[..., 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (bound - left) / (right - left)
+        if not figure.higher_is_better and bound > 0.0:
+            by_ratio = (np.log(bound) - np.log(left)) / (np.log(right) - np.log(left))
+            share = np.where((left > 0.0) & (right > 0.0), by_ratio, share)
+    share = np.where(np.isfinite(left) & np.isfinite(right), share, np.where(holds[..., :-1], 0.0, 1.0))
+    place = scaled[:-1] + share * np.diff(scaled)
+    return np.where(holds[..., :-1] != holds[..., 1:], place, np.nan)
+
+
+def _edge(
+    x: Values, log: bool, left: int, right: int, places: Values, value: Values, asked: NDArray[np.bool_]
+) -> Edge:
+    if left < 0:
+        return Edge(float(x[0]), "end")
+    if right == x.size:
+        return Edge(float(x[-1]), "end")
+    place = float(np.exp(places[left]) if log else places[left])
+    for side, other in ((left, right), (right, left)):
+        if not np.isfinite(value[side]):
+            return Edge(float(x[other]), "not defined" if asked[side] else "nothing there")
+    return Edge(place, "crossing")
+
+
+def _with_interval(
+    edge: Edge, log: bool, places: Values, gap: int, again: Values, kept: NDArray[np.bool_], *, falls: bool
+) -> Edge:
+    """Find the same crossing in each repetition: the nearest in the same direction.
+
+    A repetition without one either keeps the bound beyond the axis's end, or never keeps it.
+    """
+    if edge.reason != "crossing":
+        return edge
+    same = kept[:, :-1] if falls else kept[:, 1:]
+    away = np.where(np.isfinite(again) & same, np.abs(again - places[gap]), np.inf)
+    nearest = np.argmin(away, axis=1)
+    rows = np.arange(len(again))
+    beyond = np.where(kept[:, -1] if falls else ~kept[:, 0], np.inf, -np.inf)
+    found = np.where(np.isfinite(away[rows, nearest]), again[rows, nearest], beyond)
+    low, high = interval(np.exp(found) if log else found)
+    return Edge(edge.value, edge.reason, -np.inf if log and low == 0.0 else low, high)

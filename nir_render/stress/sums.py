@@ -1,0 +1,146 @@
+"""A campaign's table as sums per job, of which every figure is made, for any part of the campaign."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from nir_render.stress.axes import Axis
+from nir_render.stress.figures import FIGURES, Figure, Values
+
+TOTAL, COUNT, ASKED, LIMIT, LIMITED = range(5)
+"""The sums of a figure: its terms; how many there are; of how many rows there could be; the limit's; its."""
+
+_COLUMNS = {
+    "source": (
+        *("found", "ranged", "true_range_m", "range_error_m", "range_limit_m", "bearing_error_deg"),
+        "bearing_limit_deg",
+    ),
+    "frame": ("frame_false_alarms",),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class JobSums:
+    """What each job adds to each figure of each estimator.
+
+    Attributes
+    ----------
+    jobs
+        Names of the jobs, shape (jobs,).
+    seeds
+        Their seeds, shape (jobs,).
+    place
+        Index into each axis's values, shape (jobs, axes).
+    estimators
+        In the order in which the table has them.
+    of
+        By estimator and figure: `TOTAL`, `COUNT`, `ASKED`, `LIMIT` and `LIMITED`, shape (5, jobs).
+    """
+
+    jobs: tuple[str, ...]
+    seeds: NDArray[np.int64]
+    place: NDArray[np.int64]
+    estimators: tuple[str, ...]
+    of: Mapping[tuple[str, str], Values]
+
+
+def job_sums(axes: Sequence[Axis], table: pa.Table) -> JobSums:
+    """Add up a campaign's table.
+
+    Raises
+    ------
+    ValueError
+        The table has a value that the axis has not.
+    """
+    job = pc.dictionary_encode(table["job"].combine_chunks())
+    jobs = tuple(job.dictionary.to_pylist())
+    index = job.indices.to_numpy(zero_copy_only=False).astype(np.int64)
+    _, first = np.unique(index, return_index=True)
+    of_job = table.select(["seed", *(f"axis.{axis.name}" for axis in axes)]).take(pa.array(first))
+    places = [_place(axis, of_job[f"axis.{axis.name}"].to_pylist()) for axis in axes]
+    estimators = tuple(pc.unique(table["estimator"]).to_pylist())
+    sums: dict[tuple[str, str], Values] = {}
+    for name in estimators:
+        for kind, columns in _COLUMNS.items():
+            chosen = pc.and_(pc.equal(table["estimator"], name), pc.equal(table["kind"], kind))
+            if kind == "source":
+                chosen = pc.and_(chosen, pc.fill_null(table["countable"], False))
+            mask = chosen.to_numpy()
+            rows = {column: _numbers(table[column]).compress(mask) for column in columns}
+            at = index[mask]
+            for figure in FIGURES.values():
+                if figure.kind == kind:
+                    sums[name, figure.name] = _sums(figure, rows, at, len(jobs))
+    place = np.stack(places, axis=1) if places else np.zeros((len(jobs), 0), dtype=np.int64)
+    return JobSums(jobs, of_job["seed"].to_numpy(), place, estimators, sums)
+
+
+def pooled(sums: Values, index: NDArray[np.int64], size: int) -> Values:
+    """Add sums of jobs up by where they belong.
+
+    Parameters
+    ----------
+    sums
+        Shape (…, jobs).
+    index
+        Where each job belongs, shape (jobs,).
+    size
+        How many places there are.
+
+    Returns
+    -------
+    Shape (…, size).
+    """
+    flat = sums.reshape(math.prod(sums.shape[:-1]), sums.shape[-1])
+    added: Values = np.stack([np.bincount(index, weights=row, minlength=size) for row in flat]).astype(
+        np.float64
+    )
+    return added.reshape(*sums.shape[:-1], size)
+
+
+def slices(place: NDArray[np.int64], axis: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the combinations of the other axes' values, and the one that each job belongs to.
+
+    Shapes (slices, axes − 1) and (jobs,).
+    """
+    others = np.delete(place, axis, axis=1)
+    if others.shape[1] == 0:
+        return np.zeros((min(1, len(place)), 0), dtype=np.int64), np.zeros(len(place), dtype=np.int64)
+    combinations, index = np.unique(others, axis=0, return_inverse=True)
+    return combinations, index.reshape(-1)
+
+
+def _sums(figure: Figure, rows: Mapping[str, NDArray[Any]], at: NDArray[np.int64], size: int) -> Values:
+    terms = figure.term(rows)
+    limits = figure.limit(rows) if figure.limit else np.full(terms.shape, np.nan)
+    known, limited = np.isfinite(terms), np.isfinite(limits)
+    parts = (
+        np.where(known, terms, 0.0),
+        known,
+        np.ones(terms.shape),
+        np.where(limited, limits, 0.0),
+        limited,
+    )
+    return pooled(np.stack([part.astype(np.float64) for part in parts]), at, size)
+
+
+def _place(axis: Axis, values: Sequence[Any]) -> NDArray[np.int64]:
+    known = {
+        value: index for index, value in enumerate(axis.labels if axis.values_si is None else axis.values_si)
+    }
+    for value in values:
+        if value not in known:
+            raise ValueError(f"the table has {value!r} on the axis {axis.name!r}, which the campaign has not")
+    return np.array([known[value] for value in values], dtype=np.int64)
+
+
+def _numbers(column: pa.ChunkedArray) -> NDArray[Any]:
+    if pa.types.is_boolean(column.type):
+        column = pc.fill_null(column, False)
+    return np.asarray(pc.cast(column, pa.float64()).to_numpy(), dtype=np.float64)

@@ -1,0 +1,230 @@
+"""A campaign from beginning to end: jobs that are not done yet are done, then the table and the page."""
+
+import os
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import yaml
+
+from nir_render.errors import InputError
+from nir_render.report.wording import counted
+from nir_render.run import versions
+from nir_render.run_folder import disk_error, read_json, write_file, write_json, write_lines
+from nir_render.stress.campaign import Campaign
+from nir_render.stress.jobs import Job
+from nir_render.stress.table import gathered, read_part, write_table
+from nir_render.stress.workers import Work, part_file, run_jobs
+from nir_render.transport.backend import backend
+
+MANIFEST = "campaign.json"
+TABLE, PAGE, JOBS = "table.parquet", "report.html", "jobs.jsonl"
+_PARTS, _LIGHT, _SCRATCH = "jobs", "light", ".workers"
+
+Progress = Callable[[int, int], None]
+
+
+class StoppedError(Exception):
+    """A sweep was stopped before its end, by Ctrl-C; what is done stays done."""
+
+    def __init__(self, done: int, total: int) -> None:
+        super().__init__(f"stopped with {done} of {total} jobs done")
+        self.done, self.total = done, total
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """A campaign that has ended.
+
+    `table` holds the rows of all jobs that are done; `failed` what went wrong with the others, by job's key;
+    `reused` how many had been done before; `warnings` what the reader of its figures should know.
+    """
+
+    campaign: Campaign
+    jobs: tuple[Job, ...]
+    table: pa.Table
+    failed: Mapping[str, str]
+    reused: int
+    folder: Path
+    warnings: tuple[str, ...]
+
+
+def sweep(
+    campaign: Campaign,
+    jobs: Sequence[Job],
+    folder: Path,
+    *,
+    workers: int,
+    progress: Progress,
+    light: Path | None = None,
+    light_limit_bytes: int = 4 * 2**30,
+) -> Sweep:
+    """Do the jobs of a campaign that the folder does not hold yet, and gather all into its table.
+
+    Parameters
+    ----------
+    jobs
+        As `jobs.plan` gives them.
+    folder
+        New, empty, or that of a campaign of the same name: what is done there is not done again.
+    workers
+        How many processes work; the machine's cores are shared among them.
+    light
+        Where light is kept for other jobs and campaigns; in the folder by default.
+    light_limit_bytes
+        How large that may grow.
+
+    Raises
+    ------
+    InputError
+        The folder is taken, the disk is full.
+    StoppedError
+        By Ctrl-C; what was done stays, and the same call goes on.
+    """
+    _claim(folder, campaign)
+    parts = folder / _PARTS
+    missing = [job for job in jobs if read_part(part_file(parts, job)) is None]
+    done, failed = len(jobs) - len(missing), dict[str, str]()
+    progress(done, len(jobs))
+    if missing:
+        threads = max((os.cpu_count() or 1) // workers, 1)
+        kept = folder / _LIGHT if light is None else light
+        work = Work(campaign.scene, campaign.estimators, parts, kept, light_limit_bytes, threads)
+        try:
+            with closing(run_jobs(work, missing, min(workers, len(missing)), folder / _SCRATCH)) as ending:
+                for one in ending:
+                    if one.error is not None:
+                        failed[one.job.key] = one.error
+                    done += 1
+                    progress(done, len(jobs))
+        except KeyboardInterrupt:
+            raise StoppedError(done - len(failed), len(jobs)) from None
+    for place in (folder, parts, folder / _LIGHT):
+        _remove_abandoned(place)
+    return _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
+
+
+def done_before(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> int:
+    """Return how many jobs of a campaign a folder holds already; errors as `sweep`."""
+    if not folder.exists():
+        return 0
+    check_folder(folder, campaign)
+    return sum(read_part(part_file(folder / _PARTS, job)) is not None for job in jobs)
+
+
+def check_folder(folder: Path, campaign: Campaign) -> None:
+    """Raise InputError where a folder is there that is not this campaign's."""
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file; give a folder for the campaign")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not (folder / MANIFEST).is_file():
+            raise InputError(f"{folder}: holds files that are no campaign's; give a new folder")
+        name = read_json(folder / MANIFEST).get("name")
+        if name != campaign.name:
+            raise InputError(
+                f"{folder}: holds the campaign {name!r}, not {campaign.name!r}; give another folder"
+            )
+
+
+def _claim(folder: Path, campaign: Campaign) -> None:
+    """Make the folder of a campaign, or take the one that is there."""
+    check_folder(folder, campaign)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # First of all files, so that a folder is known for what it is whenever this is killed.
+        if not (folder / MANIFEST).is_file():
+            write_json(folder / MANIFEST, {"format": 1, "name": campaign.name})
+        (folder / _PARTS).mkdir(exist_ok=True)
+    except OSError as error:
+        raise disk_error(folder, error) from None
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove what killed writers have left beside the files that they did not come to rename."""
+    for path in folder.glob(".*.partial-*"):
+        path.unlink(missing_ok=True)
+
+
+def command(campaign: Campaign, job: Job) -> str:
+    """Return the command that renders a job's scene as a run of its own, to look at its frames."""
+    settings = {**campaign.settings, **job.settings}
+    seed = settings.pop("seed")
+    words = ["nir-render", "run", campaign.scene.path, "-o", f"outputs/{job.key[:8]}", "--seed", str(seed)]
+    for path, value in settings.items():
+        text = (
+            value if isinstance(value, str) else yaml.safe_dump(value, default_flow_style=True, width=10**6)
+        )
+        words += ["--set", f"{path}={text.removesuffix('...' + chr(10)).strip()}"]
+    return shlex.join(words)
+
+
+def _gather(
+    campaign: Campaign, jobs: Sequence[Job], folder: Path, failed: Mapping[str, str], reused: int
+) -> Sweep:
+    lines: list[dict[str, Any]] = []
+    tables: list[pa.Table] = []
+    done: list[Job] = []
+    failed = dict(failed)
+    for job in jobs:
+        part = None if job.key in failed else read_part(part_file(folder / _PARTS, job))
+        if part is None:
+            failed.setdefault(job.key, "its file is gone")
+            continue
+        rows, frames_sha256 = part
+        done.append(job)
+        tables.append(rows)
+        labels = {axis.name: axis.labels[i] for axis, i in zip(campaign.axes, job.values, strict=True)}
+        lines.append(
+            {
+                "format": 1,
+                "job": job.key,
+                "seed": job.seed,
+                "axes": labels,
+                "frames_sha256": frames_sha256,
+                "command": command(campaign, job),
+            }
+        )
+    if not tables:
+        raise InputError(f"{campaign.path}: no job could be done: {next(iter(failed.values()))}")
+    table = gathered(done, tables, campaign.axes)
+    write_table(folder / TABLE, table)
+    write_lines(folder / JOBS, lines)
+    facts = {
+        "campaign": campaign.path,
+        "versions": versions(),
+        "variant": backend().variant,
+        "jobs": len(jobs),
+        "failed": [{"job": key, "error": error} for key, error in failed.items()],
+    }
+    write_json(folder / MANIFEST, {"format": 1, "name": campaign.name, **facts})
+    return Sweep(campaign, tuple(jobs), table, failed, reused, folder, tuple(_noise_warnings(table)))
+
+
+def _noise_warnings(table: pa.Table) -> Iterator[str]:
+    """Yield a warning where render noise is above the target, in what could pass for the sensor's."""
+    share, target = (table[name].to_numpy() for name in ("render_noise_share", "render_noise_target"))
+    above = share > target  # false where there is no target
+    if above.any():
+        jobs = len(set(table["job"].filter(pa.array(above)).to_pylist()))
+        yield (
+            f"render noise is above its target in {counted(jobs, 'job')}: up to {share[above].max():.3g} of "
+            "the sensor's variance (column render_noise_share); more samples, fixed by "
+            "render.indirect.samples, bring it down"
+        )
+
+
+def write_report(result: Sweep) -> Path:
+    """Write the page of a sweep beside its table; returns its path."""
+    from nir_render.report.campaign_page import campaign_html
+
+    facts = read_json(result.folder / MANIFEST)
+    commands = {job.key: command(result.campaign, job) for job in result.jobs}
+    shown = {key: value for key, value in facts.items() if key not in ("format", "name")}
+    facts = {**shown, "commands": commands, "warnings": result.warnings}
+    page = result.folder / PAGE
+    write_file(page, campaign_html(result.campaign, result.table, facts).encode())
+    return page

@@ -1,0 +1,168 @@
+"""A campaign as people run it: whole, stopped by Ctrl-C, and killed again and again."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import yaml
+
+pytestmark = pytest.mark.mitsuba
+
+ROOT = Path(__file__).parents[2]
+
+# A source before a wall, seen by a camera of 64 × 48 pixels.
+SCENE: dict[str, Any] = {
+    "format": 1,
+    "name": "tiny",
+    "observe": ["r1.front"],
+    "clock": {"frames": 2, "frame_rate": "10 Hz"},
+    "render": {"indirect": {"scale": 2, "samples": 4, "max_depth": 3}},
+    "robots": {
+        "r1": {
+            "rig": {
+                "cameras": {
+                    "front": {
+                        "preset": "infra_swarm",
+                        "position": "[0, 0, 0.2] m",
+                        "exposure": "100 us",
+                        "sensor": {"preset": "mt9m031", "rows": 48, "columns": 64, "pixel_pitch": "60 um"},
+                    }
+                }
+            }
+        },
+        "r2": {"rig": {"sources": {"top": {"preset": "infra_swarm", "position": "[0, 0, 0.2] m"}}},
+               "position": "[1, 0, 0] m"},
+    },
+    "materials": {"paint": {"type": "diffuse", "reflectance": 0.7}},
+    "shapes": {"wall": {"type": "rectangle", "center": "[3, 0, 0] m", "size": "[4, 3] m", "normal": [-1, 0, 0],
+                        "material": "paint"}},
+}  # fmt: skip
+
+
+def campaign(folder: Path, ranges: int, exposures: int) -> Path:
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(SCENE))
+    document = {
+        "format": 1,
+        "name": "tiny",
+        "scene": "tiny.yaml",
+        "axes": {
+            "range": {"path": "robots.r2.position.x", "from": "0.5 m", "to": "2.5 m", "count": ranges},
+            "exposure": {"path": "robots.r1.rig.cameras.front.exposure", "from": "20 us", "to": "1 ms",
+                         "count": exposures, "spacing": "log"},
+        },
+        "bounds": {"range_rmse": "5 cm", "recall": "95 %"},
+    }  # fmt: skip
+    file = folder / "campaign.yaml"
+    file.write_text(yaml.safe_dump(document))
+    return file
+
+
+def start(file: Path, output: Path, *more: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "nir_render.cli", "stress", str(file), "-o", str(output)]
+    command += ["--workers", "2"]
+    return subprocess.Popen(
+        [*command, *more], cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+
+
+def finished(file: Path, output: Path, *more: str) -> str:
+    process = start(file, output, *more)
+    out, err = process.communicate(timeout=600)
+    assert process.returncode == 0, err
+    return out
+
+
+def workers_of(driver: psutil.Process) -> list[psutil.Process]:
+    """The processes that do jobs, not the ones that watch over what they leave."""
+    try:
+        children = driver.children(recursive=True)
+        return [one for one in children if "spawn_main" in " ".join(one.cmdline())]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def contents(folder: Path) -> tuple[bytes, bytes]:
+    return (folder / "table.parquet").read_bytes(), (folder / "jobs.jsonl").read_bytes()
+
+
+def left_over(folder: Path) -> list[str]:
+    return [path.name for path in folder.rglob("*") if ".partial-" in path.name or path.name == ".workers"]
+
+
+def test_a_campaign_runs_stops_and_goes_on(tmp_path: Path) -> None:
+    """Ctrl-C after the first jobs: exit 130, and how to go on; then the rest, and then nothing more to do."""
+    file, output = campaign(tmp_path, ranges=2, exposures=20), tmp_path / "out"
+    process = start(file, output)
+    while process.poll() is None and len(list(output.glob("jobs/*.parquet"))) < 3:
+        time.sleep(0.05)
+    workers = workers_of(psutil.Process(process.pid))
+    assert len(workers) == 2
+    for one in (process.pid, *(worker.pid for worker in workers)):  # as a terminal does: to all of them
+        os.kill(one, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "of 40 jobs done; the same command goes on: " in err.replace("\n", " ")
+    assert "Traceback" not in err
+    assert not any(worker.is_running() for worker in workers)
+    assert not (output / "table.parquet").exists()
+    parts = {path.name: path.stat().st_mtime_ns for path in output.glob("jobs/*.parquet")}
+    assert 3 <= len(parts) < 40
+
+    summary = json.loads(finished(file, output, "--json"))
+    assert (summary["jobs"], summary["done_before"], summary["failed"]) == (40, len(parts), 0)
+    assert set(summary["estimators"]) == {"paper", "robust"}
+    kept = {path.name: path.stat().st_mtime_ns for path in output.glob("jobs/*.parquet")}
+    assert len(kept) == 40
+    assert all(kept[name] == changed for name, changed in parts.items())
+    assert left_over(output) == []
+    assert "range" in (output / "report.html").read_text()
+
+    before = contents(output)
+    assert json.loads(finished(file, output, "--json"))["done_before"] == 40
+    assert contents(output) == before
+
+
+@pytest.mark.verify
+def test_twenty_kills_lose_nothing_and_do_nothing_twice(tmp_path: Path) -> None:
+    """200 jobs; 20 times the driver or a worker, drawn by lot, is killed without warning, at a random moment.
+
+    After restarts the table, and the hashes of all frames, are those of a run that nobody disturbed.
+    """
+    chance = random.Random(6)
+    file = campaign(tmp_path, ranges=10, exposures=20)
+    finished(file, tmp_path / "calm")
+    kills = {"driver": 0, "worker": 0}
+    output = tmp_path / "stormy"
+    process = start(file, output)
+    while sum(kills.values()) < 20:
+        done = len(list(output.glob("jobs/*.parquet")))
+        if process.poll() is not None:
+            pytest.fail(
+                f"ended with {done} jobs done, before the kills did ({kills}):\n{process.communicate()}"
+            )
+        time.sleep(chance.uniform(0.2, 1.5))
+        workers = workers_of(psutil.Process(process.pid))
+        if not workers:
+            continue  # still starting
+        victim = chance.choice(["driver", "worker"])
+        os.kill(process.pid if victim == "driver" else chance.choice(workers).pid, signal.SIGKILL)
+        kills[victim] += 1
+        if victim == "driver":
+            process.communicate(timeout=60)
+            _, alive = psutil.wait_procs(workers, timeout=20)
+            assert not alive, "workers outlive their driver"
+            process = start(file, output)
+    process.communicate(timeout=600)
+    finished(file, output)
+    assert min(kills.values()) >= 5
+    assert len(list(output.glob("jobs/*.parquet"))) == 200
+    assert contents(output) == contents(tmp_path / "calm")
+    assert left_over(output) == []
