@@ -117,7 +117,9 @@ def _images(
     return scene, lights, sharp, plain, [electrons(light, False) for light in full]
 
 
-@pytest.mark.parametrize(("name", "scale"), [("arena", 4), ("corridor", 2)])
+@pytest.mark.parametrize(
+    ("name", "scale"), [("arena", 4), pytest.param("corridor", 2, marks=pytest.mark.verify)]
+)
 def test_the_error_is_below_a_hundredth_of_the_sensors_noise(name: str, scale: int) -> None:
     scene, lights, sharp, plain, full = _images(name, scale)
     assert lights[0].indirect is not None

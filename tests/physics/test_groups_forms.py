@@ -144,20 +144,31 @@ def test_a_closed_room_keeps_its_energy(make: Any, reflectance: float) -> None:
     assert np.mean(radiance) == pytest.approx(expected, rel=0.002)
 
 
-FURNACES: dict[str, dict[str, Any]] = {
-    "clear": {},
-    "fog": {"fog": {"extinction": "0.2 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.85}}},
-    "even fog": {"fog": {"extinction": "1 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.0}}},
-    "bank of fog": {
-        "fog": {
-            "extinction": "2 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.5},
-            "center": "[0.5, 0.1, 0] m", "size": "[0.7, 0.9, 1.1] m",
-        }
-    },
+# Of 16 renders with so many samples per pixel the frame's mean has a standard error of 0.075 % in fog that scatters
+# forward, 0.05 % or less in the others.
+FURNACES: dict[str, tuple[int, dict[str, Any]]] = {
+    "clear": (128, {}),
+    "fog": (
+        128, {"fog": {"extinction": "0.2 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.85}}},
+    ),
+    "even fog": (
+        32, {"fog": {"extinction": "1 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.0}}},
+    ),
+    "bank of fog": (
+        32,
+        {
+            "fog": {
+                "extinction": "2 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.5},
+                "center": "[0.5, 0.1, 0] m", "size": "[0.7, 0.9, 1.1] m",
+            }
+        },
+    ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FURNACES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.verify if name == "fog" else ()) for name in FURNACES]
+)
 def test_a_white_furnace(make: Any, name: str) -> None:
     """In a room whose walls all shine alike nothing can be seen but even light, if nothing absorbs.
 
@@ -180,10 +191,11 @@ def test_a_white_furnace(make: Any, name: str) -> None:
         },
         "mirror": rectangle_document((0.7, 0.05, 0.3), (0.3, 0.5), (-1, 0.2, -0.3), "silver"),
     }  # fmt: skip
+    samples, fog = FURNACES[name]
     document = scene_document(
-        {"c": camera_document(64, 48, 32.0)}, {}, samples=128, max_depth=64, lamps=lamps, shapes=shapes,
+        {"c": camera_document(64, 48, 32.0)}, {}, samples=samples, max_depth=64, lamps=lamps, shapes=shapes,
         materials={"white": {"type": "diffuse", "reflectance": 1.0}, "silver": {"type": "mirror", "reflectance": 1.0}},
-        **FURNACES[name],
+        **fog,
     )  # fmt: skip
     document["robots"]["eye"]["position"] = "[-0.6, 0, 0] m"
     scene = make(document)
@@ -229,7 +241,8 @@ def test_single_scattering_is_the_integral_along_the_ray(make: Any, name: str) -
     # 2 px beyond the source's rim the radiance, which goes with 1/h there, is even enough within a pixel.
     clear = np.linalg.norm(np.cross(rays, source_m), axis=-1) > radius_m + 3.0 / FOCAL_PX * 2.6
     expected = np.zeros(radiance.shape)
-    expected[clear] = single_scatter_per_w(rays[clear], source_m, radius_m, 0.3, 0.9, phase)
+    # 128 nodes are right to 1e-11, across the corners of a table to 1e-4.
+    expected[clear] = single_scatter_per_w(rays[clear], source_m, radius_m, 0.3, 0.9, phase, steps=128)
     radiance = np.where(clear, radiance, 0.0)
     assert radiance.mean() == pytest.approx(expected.mean(), rel=0.003)
     np.testing.assert_allclose(tile_means(radiance), tile_means(expected), rtol=0.01)

@@ -65,6 +65,7 @@ def _scene(make: Loader, name: str, place_m: tuple[float, ...], **more: Any) -> 
     return make(scene_document({"c": camera}, sources, samples=256, max_depth=2, **more))
 
 
+@pytest.mark.vectorised
 @pytest.mark.parametrize("name", LENSES)
 def test_a_wall_is_lit_and_shaded_as_the_closed_forms_say(make: Loader, name: str) -> None:
     """A diffuse wall, 2 m ahead, lit by a source 0.5 m behind the lens and aside of it: L = ρ/π · Φ cos ψ/(4π d²)

@@ -31,18 +31,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """A room, the exposure of its camera, the target, and the film's scale."""
+    """A room, the exposure of its camera, the target, the film's scale, and the samples of what it is held against.
+
+    With so many the frame's mean is known to 0.1 %, in fog too: a fault of 1 % is ten standard errors.
+    """
 
     room: str
     exposure: str
     percent: float
     scale: int
     radius: str = "8 cm"
+    reference_samples: int = 128
 
 
 CASES = [
-    Case("diffuse room", "1 us", 5.0, 2),
-    Case("diffuse room", "0.2 us", 5.0, 4),
+    Case("diffuse room", "1 us", 5.0, 2, reference_samples=32),
+    Case("diffuse room", "0.2 us", 5.0, 4, reference_samples=32),
     Case("thin fog", "1 us", 5.0, 2, radius="1 cm"),
     pytest.param(Case("diffuse room", "1 us", 1.0, 1), marks=pytest.mark.verify),
     pytest.param(Case("glossy corridor", "20 us", 5.0, 1), marks=pytest.mark.verify),
@@ -133,7 +137,7 @@ def test_the_share_between_seeds_keeps_the_target_and_the_mean_is_right(case: Ca
     error = excess.std(ddof=1) / np.sqrt(SEEDS)
     assert abs(excess.mean()) < 4.0 * error
     assert error < 0.15 * (own_e2 / temporal_e2).mean()
-    fixed = _scene(case, tmp_path, {"render.indirect.samples": 128})
+    fixed = _scene(case, tmp_path, {"render.indirect.samples": case.reference_samples})
     references = [render(fixed, "r1.c", seed=100 + seed) for seed in range(SEEDS)]
     comparison = compare_batches(images, _images(references, fixed))
     assert comparison.same, comparison

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from perception import parse_calibration_document, read_calibrations, read_ranges
-from tests.system.test_cli import ROOT, nir_render
+from tests.system.command import ROOT, nir_render
 
 pytestmark = pytest.mark.mitsuba
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.test_cli import QUICK, ROOT, SCENE, nir_render
+from tests.system.command import QUICK, ROOT, SCENE, nir_render, nir_render_process
 
 pytestmark = pytest.mark.mitsuba
 
@@ -141,9 +141,9 @@ def test_who_installed_the_package_alone_gets_the_examples(tmp_path: Path) -> No
     where = [sys.executable, "-c", "import nir_render; print(nir_render.__file__)"]
     said = subprocess.run(where, cwd=tmp_path, env=alone, capture_output=True, text=True, check=True).stdout
     assert Path(said.strip()).is_relative_to(tmp_path)
-    assert nir_render("new", "mine", cwd=tmp_path, env=alone).returncode == 0
+    assert nir_render_process("new", "mine", cwd=tmp_path, env=alone).returncode == 0
     for name in ("one_source.yaml", "my_estimator.py", "scene.schema.json"):
         assert (tmp_path / "mine" / name).read_bytes() == (ROOT / "scenes" / name).read_bytes()
-    done = nir_render("run", "mine/one_source.yaml", "-o", "run", *QUICK, cwd=tmp_path, env=alone)
+    done = nir_render_process("run", "mine/one_source.yaml", "-o", "run", *QUICK, cwd=tmp_path, env=alone)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run" / "report.html").is_file()

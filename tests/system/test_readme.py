@@ -1,20 +1,20 @@
 """What the README shows runs as it stands there."""
 
+import contextlib
+import io
 import json
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.system.command import ROOT, nir_render
+
 pytestmark = pytest.mark.mitsuba
 
-ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -30,10 +30,11 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def _python(code: str, folder: Path) -> str:
-    run = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(run, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    """Run a program of its own names in a folder; return what it prints."""
+    said = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(said):
+        exec(compile(code, "<snippet>", "exec"), {"__name__": "__main__"})
+    return said.getvalue()
 
 
 def test_the_python_snippets_run_in_order(checkout: Path) -> None:
@@ -48,6 +49,11 @@ def test_the_python_snippets_run_in_order(checkout: Path) -> None:
 
 
 def test_the_example_of_the_design_runs_as_it_stands(checkout: Path) -> None:
+    """With fewer samples; its flares are straight light, which has none."""
+    arena = checkout / "scenes" / "arena.yaml"
+    text = arena.read_text(encoding="utf-8")
+    assert text.count("samples: 32,") == 1
+    arena.write_text(text.replace("samples: 32,", "samples: 4,"), encoding="utf-8")
     _python(
         """
 import nir_render as nr, perception
@@ -62,33 +68,18 @@ assert frame._repr_png_().startswith(b"\\x89PNG") and "r2.top" in light._repr_ht
     )
 
 
-def test_dimming_the_source_does_not_fool_the_calibration(checkout: Path) -> None:
-    """What the README's `--set …flux="0.05 W"` makes: the run is calibrated for the source it has."""
-    settings = ["--set", "robots.r2.rig.sources.top.flux=0.05 W", "--set", "clock.frames=3", "--json"]
-    run = [
-        sys.executable,
-        "-c",
-        "from nir_render.cli import main; main()",
-        "run",
-        "scenes/one_source.yaml",
-        "-o",
-        "dim",
-    ]
-    done = subprocess.run([*run, *settings], cwd=checkout, capture_output=True, text=True, check=True)
-    robust = json.loads(done.stdout)["estimators"]["robust"]
-    assert robust["recall"] == 1.0
-    assert robust["range_rmse_m"] < 3.0 * robust["range_limit_rmse_m"]
-
-
 def test_the_commands_run_in_order(checkout: Path) -> None:
+    """A run whose source is dimmed by `--set` is calibrated for the source it has: its ranges are right."""
     commands = [line for block in _blocks("sh") for line in block.splitlines() if line]
     assert len(commands) >= 2
     for command in commands:
         program, *arguments = shlex.split(command)
         assert program == ".venv/bin/nir-render"
-        run = [sys.executable, "-W", "error", "-c", "from nir_render.cli import main; main()", *arguments]
-        done = subprocess.run(run, cwd=checkout, capture_output=True, text=True, check=False)
+        done = nir_render(*arguments, cwd=checkout)
         assert done.returncode == 0, done.stderr
+    robust = json.loads((checkout / "outputs" / "dim" / "summary.json").read_text())["estimators"]["robust"]
+    assert robust["recall"] == 1.0
+    assert robust["range_rmse_m"] < 3.0 * robust["range_limit_rmse_m"]
 
 
 def _fields(document: dict[str, Any]) -> set[str]:
@@ -107,15 +98,9 @@ def test_every_field_of_a_manifest_is_explained(checkout: Path) -> None:
     changes = ["clock.frames=1", "materials.white={type: diffuse, reflectance: 0.5}", f"shapes.wall={wall}"]
     sensor = "robots.r1.rig.cameras.front.sensor"
     changes += [f"{sensor}.columns=160", f"{sensor}.rows=120", f"{sensor}.pixel_pitch=30 um"]
-    run = [
-        sys.executable,
-        "-c",
-        "from nir_render.cli import main; main()",
-        "render",
-        "scenes/one_source.yaml",
-    ]
     settings = [word for change in changes for word in ("--set", change)]
-    subprocess.run([*run, "-o", "one", *settings], cwd=checkout, capture_output=True, check=True)
+    done = nir_render("render", "scenes/one_source.yaml", "-o", "one", *settings, cwd=checkout)
+    assert done.returncode == 0, done.stderr
     manifest = json.loads((checkout / "one" / "manifest.json").read_text(encoding="utf-8"))
     page = (ROOT / "docs" / "manifest.md").read_text(encoding="utf-8")
     explained = set(re.findall(r"`(\w+)`", page))
@@ -125,15 +110,13 @@ def test_every_field_of_a_manifest_is_explained(checkout: Path) -> None:
     assert named - _fields(manifest) == {"reason"}
 
 
-def test_every_command_and_target_that_is_named_exists() -> None:
+def test_every_command_and_target_that_is_named_exists(monkeypatch: pytest.MonkeyPatch) -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in re.findall(r"^    make (\w+)", README, re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
     shown = set(re.findall(r"^\| `nir-render (\w+)", README, re.MULTILINE))
-    run = [sys.executable, "-c", "from nir_render.cli import main; main()", "--help"]
-    help_text = subprocess.run(
-        run, capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "120"}
-    ).stdout
+    monkeypatch.setenv("COLUMNS", "120")
+    help_text = nir_render("--help", cwd=ROOT).stdout
     offered = set(re.findall(r"^│ (\w+) ", help_text, re.MULTILINE))
     assert shown == offered
 

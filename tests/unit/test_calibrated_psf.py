@@ -69,19 +69,22 @@ def test_a_gaussian_is_told_as_it_is() -> None:
     assert (known.psf_sigma_px, dict(known.sigma)) == (0.7, {})
 
 
+GHOST = [{"share": "10 %", "radius": "30 px"}]
+
+
 def test_what_a_ghost_takes_is_missing_from_every_flare() -> None:
     """A ghost of 10 % falls elsewhere: the Gaussian is as it was, and the share 0.9, to 1e-3."""
-    scene = load_scene(SCENE, {f"{CAMERA}.point_spread.ghosts": [{"share": "10 %", "radius": "30 px"}]})
+    scene = load_scene(SCENE, {f"{CAMERA}.point_spread.ghosts": GHOST})
     spread = flare_spread(scene.camera("r1.front")[1], scene.sources()["r2.top"][1])
     assert (spread.share, spread.sigma_px) == pytest.approx((0.9, 0.7), rel=1e-2)
     assert spread.share == pytest.approx(0.9, rel=1e-3)
 
 
 def test_cameras_of_one_make_are_alike_wherever_they_are_mounted() -> None:
-    changes = {**SPREADS["diffraction"], "robots.r1.rig.cameras.left.point_spread.diffraction": "940 nm"}
-    scene = load_scene(SCENE, changes)
+    names = ("front", "left")
+    scene = load_scene(SCENE, {f"robots.r1.rig.cameras.{name}.point_spread.ghosts": GHOST for name in names})
     source = scene.sources()["r2.top"][1]
-    front, left = (flare_spread(scene.camera(f"r1.{name}")[1], source) for name in ("front", "left"))
+    front, left = (flare_spread(scene.camera(f"r1.{name}")[1], source) for name in names)
     assert front is left
 
 

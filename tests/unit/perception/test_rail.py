@@ -3,13 +3,15 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from perception.json_fields import RecordingError
 from perception.rail import calibrate_rail
-from perception.rail_result import IDEAL_MAE, faults
+from perception.rail_result import IDEAL_MAE, RailCalibration, faults
 from perception.types import RawFrame
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
@@ -22,12 +24,24 @@ RANGES_M = {
 }
 
 
-def take(index: int, gain_fault: float = 1.0) -> RawFrame:
+def exposure_s_of(index: int) -> float:
+    return 2.0e-4 / gain_of(index) * (1.0 + 0.02 * RANGES_M[index] ** 2)
+
+
+def gain_of(index: int) -> float:
     """Every second frame is read out at twice the gain, and exposed half as long."""
-    gain = 1.0 + index % 2
-    exposure_s = 2.0e-4 / gain * (1.0 + 0.02 * RANGES_M[index] ** 2)
+    return 1.0 + index % 2
+
+
+@cache
+def flare_e(index: int) -> NDArray[np.float64]:
     u_px, v_px = 110.0 + 7.3 / RANGES_M[index], 60.0 + 15.1 / RANGES_M[index]
-    mean_e = expected_e(CAMERA, [(u_px, v_px, RANGES_M[index])], exposure_s, 1.0, gain_fault)
+    return expected_e(CAMERA, [(u_px, v_px, RANGES_M[index])], exposure_s_of(index))
+
+
+def take(index: int, gain_fault: float = 1.0) -> RawFrame:
+    gain, exposure_s = gain_of(index), exposure_s_of(index)
+    mean_e = 1.0 + gain_fault * flare_e(index)
     at_gain = replace(CAMERA, system_gain_dn_per_e=gain * CAMERA.system_gain_dn_per_e)
     frame = expose(mean_e, at_gain, random(61, index), exposure_s)
     return replace(frame, index=index, gain=gain)
@@ -47,9 +61,19 @@ def sound() -> Callable[[int], RawFrame]:
     return recorded()
 
 
+@pytest.fixture(scope="module")
+def from_guess(sound: Callable[[int], RawFrame]) -> Callable[[float], RailCalibration]:
+    """Calibrate with the range constant guessed as so many times the true one, once for each guess."""
+    return cache(
+        lambda guess: calibrate_rail(RANGES_M, sound, replace(CAMERA, range_constant_dn_m2_per_s=guess * K))
+    )
+
+
 @pytest.mark.parametrize("first_guess", [1.0, 1.3, 0.6])
-def test_the_constant_is_found_from_any_guess(sound: Callable[[int], RawFrame], first_guess: float) -> None:
-    result = calibrate_rail(RANGES_M, sound, replace(CAMERA, range_constant_dn_m2_per_s=first_guess * K))
+def test_the_constant_is_found_from_any_guess(
+    from_guess: Callable[[float], RailCalibration], first_guess: float
+) -> None:
+    result = from_guess(first_guess)
     fit = result.fit
     assert fit.range_constant_sigma_dn_m2_per_s < 0.002 * K
     assert fit.range_constant_dn_m2_per_s == pytest.approx(K, abs=4 * fit.range_constant_sigma_dn_m2_per_s)
@@ -64,18 +88,15 @@ def test_the_constant_is_found_from_any_guess(sound: Callable[[int], RawFrame], 
     assert result.calibration.sigma["range_constant_dn_m2_per_s"] == fit.range_constant_sigma_dn_m2_per_s
 
 
-def test_the_guess_does_not_show_in_the_result(sound: Callable[[int], RawFrame]) -> None:
-    near, far = (
-        calibrate_rail(RANGES_M, sound, replace(CAMERA, range_constant_dn_m2_per_s=guess * K)).fit
-        for guess in (1.0, 1.3)
-    )
+def test_the_guess_does_not_show_in_the_result(from_guess: Callable[[float], RailCalibration]) -> None:
+    near, far = (from_guess(guess).fit for guess in (1.0, 1.3))
     assert far.range_constant_dn_m2_per_s == pytest.approx(
         near.range_constant_dn_m2_per_s, abs=0.1 * near.range_constant_sigma_dn_m2_per_s
     )
 
 
-def test_the_paper_is_calibrated_and_judged_too(sound: Callable[[int], RawFrame]) -> None:
-    result = calibrate_rail(RANGES_M, sound, CAMERA)
+def test_the_paper_is_calibrated_and_judged_too(from_guess: Callable[[float], RailCalibration]) -> None:
+    result = from_guess(1.0)
     assert result.paper is not None
     assert result.calibration.range_constant_paper_dn_m2_per_s == result.paper.slope_dn_m2_per_s
     assert abs(result.paper.intercept_dn_per_s) > 5 * result.paper.intercept_sigma_dn_per_s

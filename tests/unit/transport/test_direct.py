@@ -148,9 +148,10 @@ def test_the_scalar_variant_gives_the_same_table(scene: Scene, monkeypatch: pyte
 
     code = (
         "import sys; from nir_render import load_scene, render; "
+        "small = {f'robots.r1.rig.cameras.front.sensor.{edge}': 32 for edge in ('columns', 'rows')}; "
         "s = load_scene(sys.argv[1]).with_({'robots.r2.position': '[2.06, 0, -0.08] m', 'robots.r2.motion': [], "
         "'shapes.p': {'type': 'rectangle', 'center': '[1.06, 0, -0.3] m', 'size': '[1, 1] m', 'normal': [1, 0, 0], "
-        "'material': 'black'}}); print(render(s, 'r1.front').direct.visible_fraction[0])"
+        "'material': 'black'}, **small}); print(render(s, 'r1.front').direct.visible_fraction[0])"
     )
     path = str(Path(__file__).parents[3] / "scenes" / "one_source.yaml")
     seen = []
