@@ -20,6 +20,7 @@ from rich.table import Table
 
 from nir_render.console import errors, escape, print_json, progress_bar, warn
 from nir_render.errors import InputError
+from nir_render.regress.command import app as regress_app
 
 if TYPE_CHECKING:
     from nir_render.scene.load import Scene
@@ -35,6 +36,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(regress_app, name="regress")
 
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A scene file (YAML).")]
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")]

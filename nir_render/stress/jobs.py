@@ -70,6 +70,7 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
     made_by = _made_by(campaign)
     jobs: list[Job] = []
     problems: list[str] = []
+    known: dict[str, tuple[int, ...]] = {}
     for built, values in enumerate(itertools.product(*map(range, sizes))):
         progress(built, math.prod(sizes))
         settings = settings_of(campaign, values)
@@ -77,12 +78,13 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
             scene = campaign.scene.with_(settings)
             geometry = _geometry(scene)
         except InputError as error:
-            where = ", ".join(
-                f"{axis.name} = {axis.labels[i]}" for axis, i in zip(campaign.axes, values, strict=True)
-            )
-            problems += [f"{campaign.path}: at {where}: {problem}" for problem in error.problems]
+            problems += [f"{campaign.path}: at {_place(campaign, values)}: {one}" for one in error.problems]
             continue
         of_scene = hashlib.sha256(scene.resolved_yaml().encode()).hexdigest()
+        if of_scene in known:
+            same = _place(campaign, known[of_scene])
+            problems.append(f"{campaign.path}: at {_place(campaign, values)}: the same scene as at {same}")
+        known[of_scene] = values
         for seed in campaign.seeds:
             parts = (of_scene, f"seed {seed}", geometry, *made_by)
             key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:_DIGITS]
@@ -90,6 +92,10 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
     if problems:
         raise InputError(*_first(problems))
     return jobs
+
+
+def _place(campaign: Campaign, values: tuple[int, ...]) -> str:
+    return ", ".join(f"{axis.name} = {axis.labels[i]}" for axis, i in zip(campaign.axes, values, strict=True))
 
 
 def settings_of(campaign: Campaign, values: tuple[int, ...]) -> dict[str, Any]:

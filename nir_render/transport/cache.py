@@ -1,35 +1,28 @@
 """Lights that have been rendered, by the hash of what determines them: in memory, and on disk where asked.
 
-A file is an uncompressed NumPy archive (.npz), named by its key: one array for each array of the light, and
-a JSON header with the rest. It is written aside, synced and renamed, so several processes may share a folder;
-the archive's checksums are tested on reading, and a file that is damaged counts as none. What goes wrong with
-the folder never stops a run: it is said once, and lights stay in memory.
+A file (`light_file`) is named by its key. It is written aside, synced and renamed, so several processes may
+share a folder; a file that is damaged counts as none. What goes wrong with the folder never stops a run: it
+is said once, and lights stay in memory.
 """
 
 import contextlib
-import dataclasses
-import json
 import os
-import secrets
 import tempfile
 import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.errors import InputError
-from nir_render.transport import light as light_module
 from nir_render.transport.light import Light
+from nir_render.transport.light_file import ASIDE, bytes_of, read_light, write_light
 
 _SUFFIX = ".light.npz"
-_ASIDE = ".partial-"
 _ABANDONED_AFTER_S = 3600.0
-_HEADER = "header"
 _PLANS = 64
 
 
@@ -102,7 +95,7 @@ class LightCache:
             )
             return
         try:
-            _write(self._folder / f"{key}{_SUFFIX}", light)
+            write_light(self._folder / f"{key}{_SUFFIX}", light)
         except OSError as error:
             self._say_unwritable(error)
         self._shrink(self._folder)
@@ -145,7 +138,7 @@ class LightCache:
             return None
         path = self._folder / f"{key}{_SUFFIX}"
         try:
-            light = _load(path)
+            light = read_light(path)
         except Exception:  # a damaged archive raises a dozen types, from NumPy, zipfile, zlib, struct, ...
             return None
         with contextlib.suppress(OSError):  # it may be another user's, who alone may set its time
@@ -161,7 +154,7 @@ class LightCache:
         for path in paths:
             with contextlib.suppress(OSError):  # another process may have removed it
                 state = path.stat()
-                if _ASIDE in path.name and time.time() - state.st_mtime > _ABANDONED_AFTER_S:
+                if ASIDE in path.name and time.time() - state.st_mtime > _ABANDONED_AFTER_S:
                     path.unlink()
                 elif path.name.endswith(_SUFFIX):
                     files.append((state.st_mtime_ns, path, state.st_size))
@@ -184,61 +177,3 @@ def _gib(size_bytes: int) -> str:
 
 def _film(light: Light) -> tuple[str, tuple[int, ...]]:
     return light.camera, () if light.indirect is None else light.indirect.radiance_per_w.shape
-
-
-def bytes_of(light: Light) -> int:
-    """Return the size of a light's arrays."""
-    return sum(array.nbytes for array in _taken_apart(light)[1].values())
-
-
-def _write(path: Path, light: Light) -> None:
-    header, arrays = _taken_apart(light)
-    aside = path.with_name(f".{path.name}{_ASIDE}{os.getpid()}-{secrets.token_hex(4)}")
-    try:
-        with aside.open("xb") as file:
-            text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-            named: dict[str, Any] = {_HEADER: text, **arrays}
-            np.savez(file, **named)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
-
-
-def _load(path: Path) -> Light:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    header = json.loads(arrays.pop(_HEADER).tobytes())
-    light = _put_together(header, arrays)
-    if not isinstance(light, Light):
-        raise TypeError(f"{path}: holds no light")
-    return light
-
-
-def _taken_apart(value: Any, name: str = "light") -> tuple[Any, dict[str, NDArray[Any]]]:
-    """Return a dataclass as plain data, and its arrays by the names of the fields that lead to them."""
-    if isinstance(value, np.ndarray):
-        return {"array": name}, {name: value}
-    if isinstance(value, np.generic):  # a seed out of an array is none that JSON knows
-        return value.item(), {}
-    if not dataclasses.is_dataclass(value):
-        return value, {}
-    fields: dict[str, Any] = {}
-    arrays: dict[str, NDArray[Any]] = {}
-    for field in dataclasses.fields(value):
-        fields[field.name], inner = _taken_apart(getattr(value, field.name), f"{name}.{field.name}")
-        arrays |= inner
-    return {"class": type(value).__name__, "fields": fields}, arrays
-
-
-def _put_together(data: Any, arrays: dict[str, NDArray[Any]]) -> Any:
-    """Undo `_taken_apart`; what is no class of the light's module raises AttributeError."""
-    if isinstance(data, list):
-        return tuple(data)
-    if not isinstance(data, dict):
-        return data
-    if "array" in data:
-        return arrays[data["array"]]
-    fields = {field: _put_together(inner, arrays) for field, inner in data["fields"].items()}
-    return getattr(light_module, data["class"])(**fields)

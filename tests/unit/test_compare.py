@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy import stats
 
-from nir_render.compare import compare_batches
+from nir_render.compare import TILE_PX, Estimate, compare_batches, compare_parts, judge, sums, upper_tail
 from nir_render.randomness import generator
+
+Array = NDArray[np.float64]
 
 
 def _render(seed: int, gain: float = 1.0, batches: int = 16) -> np.ndarray:
@@ -49,3 +53,170 @@ def test_images_without_noise_must_agree() -> None:
     flat = np.ones((4, 32, 32))
     assert compare_batches(flat, flat.copy()).same
     assert not compare_batches(flat, 1.001 * flat).same
+
+
+LIT = 0.05  # of samples of the heavy-tailed renders bring light
+
+
+def _heavy(seed: int, renders: int, samples: int, lit: float = LIT, tail: float = 1.0) -> Estimate:
+    """Renders of 48 × 64 pixels whose samples are mostly nothing, and log-normal where they are something."""
+    mean, variance = _heavy_stack(seed, renders, samples, lit, tail)
+    return Estimate(mean.mean(axis=0), variance.mean(axis=0) / renders, renders * samples)
+
+
+def _heavy_stack(seed: int, renders: int, samples: int, lit: float, tail: float) -> tuple[Array, Array]:
+    draw = generator(seed, "test", "heavy", 0)
+    batch = samples // 8
+    count = draw.poisson(lit * batch, (renders, 8, 48, 64))
+    values = draw.lognormal(-0.5 * tail**2, tail, count.sum())
+    place = np.repeat(np.arange(count.size), count.ravel())
+    batches = np.bincount(place, values, count.size).reshape(count.shape) / batch
+    return batches.mean(axis=1), batches.var(axis=1, ddof=1) / 8
+
+
+def _third(seed: int, renders: int, samples: int, lit: float, tail: float) -> Array:
+    """Third cumulant of one sample, summed over tiles."""
+    mean, _ = _heavy_stack(seed, renders, samples, lit, tail)
+    return sums(np.asarray(stats.kstat(mean, 3, axis=0)), TILE_PX) * samples**2
+
+
+@pytest.mark.parametrize(("lit", "tail"), [(0.05, 1.0), (0.01, 1.2), (0.002, 1.0)])
+def test_heavy_tails_raise_no_more_false_alarms_than_stated(lit: float, tail: float) -> None:
+    """200 renders against 10 references, at 5 %: at most 10 + 3 σ; and the tail at 1e-3 is that of p-values."""
+    alarms, p = 0, []
+    for i in range(200):
+        if i % 20 == 0:
+            reference, third = _heavy(-i, 16, 64, lit, tail), _third(-i, 16, 64, lit, tail)
+        parts = compare_parts(reference, _heavy(i + 1, 1, 64, lit, tail), third)
+        p.append(parts.p[parts.judged])
+        alarms += not judge([parts], 0.05)[0].same
+    assert alarms <= 10 + 3 * np.sqrt(10 * 0.95)
+    every = np.concatenate(p)
+    # Tiles of 8, of 16 and the frame overlap: three times Poisson's variance at most.
+    expected = 1e-3 * every.size
+    assert (every < 1e-3).sum() <= expected + 3 * np.sqrt(3 * expected)
+
+
+def test_a_normal_tail_would_raise_false_alarms() -> None:
+    """So the skewness is needed: without it the upper tail at 1e-4 is three times as heavy as it says, or more."""
+    far = count = 0
+    for i in range(200):
+        if i % 20 == 0:
+            reference = _heavy(-i, 16, 64, 0.01, 1.2)
+        parts = compare_parts(reference, _heavy(i + 1, 1, 64, 0.01, 1.2))
+        z = ((parts.after - parts.before) / parts.error)[parts.judged]
+        far, count = far + int((z > stats.norm.isf(1e-4)).sum()), count + z.size
+    assert far > 3 * 1e-4 * count
+
+
+def test_few_samples_of_another_sampler_raise_no_more_false_alarms() -> None:
+    """8 samples whose own variance is poorly known, and low where their mean is, against a good reference, at 5 %."""
+    alarms = 0
+    for i in range(200):
+        if i % 20 == 0:
+            reference, third = _heavy(-i, 16, 64), _third(-i, 16, 64, LIT, 1.0)
+        parts = compare_parts(reference, _heavy(i + 1, 1, 8), third, alike=False)
+        alarms += not judge([parts], 0.05)[0].same
+    assert alarms <= 10 + 3 * np.sqrt(10 * 0.95)
+
+
+def test_the_tail_is_that_of_pearson_iii() -> None:
+    z, skewness = np.meshgrid([0.5, 2.0, 4.0, 6.0], [1e-4, 0.01, 0.3, 1.5])
+    assert upper_tail(z, skewness) == pytest.approx(stats.pearson3.sf(z, skewness), rel=0.01)
+
+
+def _smooth(seed: int, samples: int, gain: Array | float = 1.0) -> Estimate:
+    """An even image, its samples normal with a standard deviation of 1."""
+    draw = generator(seed, "test", "smooth", 0).standard_normal((8, 48, 64)) * np.sqrt(8 / samples)
+    batches = gain * (1.0 + draw)
+    return Estimate(batches.mean(axis=0), batches.var(axis=0, ddof=1) / 8, samples)
+
+
+def test_the_drift_that_would_have_been_seen_is_found_so_often() -> None:
+    """Of 400 renders with the stated drift, the frame's test finds 95 %, and so does a tile's."""
+    reference = _smooth(-1, 1024)
+    clean = judge([compare_parts(reference, _smooth(-2, 64))], 1e-3)[0]
+    tile = np.ones((48, 64))
+    tile[16:24, 32:40] += clean.tile_drift
+    place = 2 * 8 + 4
+    found = np.zeros(2)
+    for i in range(400):
+        if i % 4 == 0:  # its own noise counts too
+            reference = _smooth(-10 - i, 1024)
+        whole = compare_parts(reference, _smooth(i, 64, 1.0 + clean.frame_drift))
+        one = compare_parts(reference, _smooth(i, 64, tile))
+        threshold = 1e-3 / whole.judged.sum()
+        found += [whole.p[-1] < threshold, one.p[place] < threshold]
+    assert found / 400 == pytest.approx(0.95, abs=0.035)
+    assert clean.frame_drift == pytest.approx(6.0 / np.sqrt(64 * 48 * 64), rel=0.1)
+
+
+def test_differences_of_equal_renders_are_of_their_stated_error() -> None:
+    """In 400 pairs of 64 and 256 samples 48 tiles differ by 1.00 standard errors: 0.5 % is what chance allows."""
+    pairs = [compare_parts(_smooth(-10 - i, 256), _smooth(i, 64)) for i in range(400)]
+    z = np.array([((one.after - one.before) / one.error)[: one.tiles] for one in pairs])
+    assert z.std() == pytest.approx(1.0, abs=0.012)
+
+
+def test_the_skewness_is_the_measured_one_and_at_least_that_of_equal_samples() -> None:
+    """Log-normal samples of tail t, of which a share is lit: κ₂ is lit · e^t² and κ₃ lit · e^3t², for one sample.
+
+    The frame is a mean of N = 64 · 3072 samples, and differs from a reference of 16 times as many.
+    """
+    lit, tail, n = 0.3, 0.7, 64
+    third = np.mean([_third(-i, 16, n, lit, tail) for i in range(8)], axis=0)
+    reference, render = _heavy(-1, 16, n, lit, tail), _heavy(1, 1, n, lit, tail)
+    count = n * 48 * 64
+    variance = lit * np.exp(tail**2) / count * (1 + 1 / 16)
+    cumulant = lit * np.exp(3 * tail**2) / count**2 * (1 - 1 / 256)
+    measured = compare_parts(reference, render, third).skewness[-1]
+    assert measured == pytest.approx(cumulant / variance**1.5, rel=0.1)
+    least = compare_parts(reference, render).skewness[-1]
+    assert least == pytest.approx(np.sqrt(variance) / lit, rel=0.02)
+    assert measured > 1.4 * least
+
+
+def test_it_says_where_and_how_much() -> None:
+    gain = np.ones((48, 64))
+    gain[24:32, 8:16] = 1.3
+    verdict = judge([compare_parts(_smooth(-1, 1024), _smooth(1, 64, gain))], 1e-3)[0]
+    assert not verdict.same
+    assert verdict.part == (24, 32, 8, 16)
+    assert verdict.change == pytest.approx(0.3, abs=0.06)
+    assert verdict.frame_change == pytest.approx(0.3 * 64 / 3072, abs=0.008)
+
+
+def test_what_no_tile_tells_is_over_the_frame() -> None:
+    """Seven standard errors of the frame are two of a tile of 16."""
+    brighter = _smooth(1, 64, 1.0 + 7.0 / np.sqrt(64 * 48 * 64))
+    verdict = judge([compare_parts(_smooth(-1, 1024), brighter)], 1e-3)[0]
+    assert not verdict.same
+    assert verdict.part == (0, 48, 0, 64)
+
+
+def test_noise_that_only_one_has_found_is_no_alarm_light_is() -> None:
+    dark = Estimate(np.zeros((16, 16)), np.zeros((16, 16)), 1024)
+    lone, lone_variance = np.zeros((16, 16)), np.zeros((16, 16))
+    lone[3, 4], lone_variance[3, 4] = 1.0, 1.0
+    assert judge([compare_parts(dark, Estimate(lone, lone_variance, 64))], 1e-3)[0].same
+    lit = Estimate(np.ones((16, 16)), np.full((16, 16), 0.01), 64)
+    verdict = judge([compare_parts(dark, lit)], 1e-3)[0]
+    assert not verdict.same
+    assert verdict.change == np.inf
+
+
+def test_light_without_noise_agrees_to_float32() -> None:
+    lamp, none = np.full((16, 16), 3.0), np.zeros((16, 16))
+    for change, same in ((1e-6, True), (1e-4, False)):
+        parts = compare_parts(Estimate(lamp, none, 1024), Estimate(lamp * (1 + change), none, 64))
+        assert judge([parts], 1e-3)[0].same is same
+
+
+def test_images_of_a_family_share_the_rate() -> None:
+    """Twice as many images, half the threshold: what one image alone calls a drift, many do not."""
+    reference, drifted = _smooth(-1, 1024), _smooth(3, 64, 1.0 + 4.6 / np.sqrt(64 * 48 * 64))
+    alone = compare_parts(reference, drifted)
+    others = [compare_parts(_smooth(-10 - i, 1024), _smooth(10 + i, 64)) for i in range(40)]
+    one, many = judge([alone], 1e-3)[0], judge([alone, *others], 1e-3)[0]
+    assert many.smallest_p > 20 * one.smallest_p
+    assert many.frame_drift > 1.1 * one.frame_drift

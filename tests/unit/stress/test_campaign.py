@@ -149,6 +149,15 @@ def test_what_is_wrong_is_refused_before_anything_runs(
     assert all(problem.startswith(f"{tmp_path / 'campaign.yaml'}") for problem in refused.value.problems)
 
 
+def test_two_combinations_that_are_one_scene_are_refused(tmp_path: Path) -> None:
+    """Their jobs would be one, and stand at one of two places."""
+    axes = {"a": {"path": "fog", "values": [None, {"extinction": "0.1 /m"}, {"visibility": "39.12 m"}]}}
+    with pytest.raises(
+        InputError, match=r"at a = \{visibility: 39\.12 m\}: the same scene as at a = \{extinction"
+    ):
+        planned(tmp_path, axes=axes)
+
+
 def test_a_scene_is_no_campaign() -> None:
     with pytest.raises(InputError, match="is a scene"):
         load_campaign(ROOT / "scenes" / "arena.yaml")

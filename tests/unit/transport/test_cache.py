@@ -16,8 +16,8 @@ import pytest
 
 from nir_render import DirectTable, Indirect, InputError, Light, LightCache
 from nir_render.camera.enlarge import Enlargement
-from nir_render.transport.cache import bytes_of
 from nir_render.transport.light import Edges
+from nir_render.transport.light_file import bytes_of
 
 KEY, OTHER, THIRD = "a" * 64, "b" * 64, "c" * 64
 

@@ -1,0 +1,173 @@
+"""What a reference holds: what each stage was given, what it made of it, and what made it."""
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.scene.load import Scene
+from nir_render.scene.world import Mesh
+from nir_render.transport.light import Light
+from perception.types import Calibration, Detection, RawFrame
+
+_PACKAGES = ("numpy", "scipy", "opencv-python-headless")
+_OF_TRANSPORT = (
+    "variant", "compiler", "nir-render", "mitsuba", "drjit", "numpy", "processor", "code of transport",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceLight:
+    """The light of one camera with one geometry.
+
+    Attributes
+    ----------
+    light
+        The mean of many renders with seeds of their own; `variance` and `samples` are those of the mean.
+    third
+        Third cumulant of one sample, summed over tiles of 8 × 8 pixels, shape (groups, tile rows, tile
+        columns); None without indirect light.
+    third_edges
+        The same of the pixels along edges, as `edge_image` has them; None where there are none.
+    own_hash
+        SHA-256 of the light that the scene renders with its own samples and seed, which is none of these.
+    """
+
+    light: Light
+    third: NDArray[np.float64] | None
+    third_edges: NDArray[np.float64] | None
+    own_hash: str
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceShot:
+    """One frame: the reference's light through the scene's camera.
+
+    `light` counts the reference's lights; `electrons` are the expected ones, shape (rows, columns).
+    """
+
+    light: int
+    electrons: NDArray[np.float32]
+    frame: RawFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The reference of one scene.
+
+    Attributes
+    ----------
+    document
+        The scene as `document_of` gives it.
+    seed
+        The scene's, with which its own light was rendered and its noise drawn.
+    renders
+        How many renders the lights are the mean of.
+    made_by
+        What the bits follow from besides the scene: `transport` that of light, `other` that of all else.
+    calibrations
+        By camera.
+    detections
+        By estimator.
+    history
+        Why it was made, and each time that it was made anew: `reason` and `time`.
+    """
+
+    document: Mapping[str, Any]
+    seed: int
+    renders: int
+    made_by: Mapping[str, Mapping[str, str]]
+    lights: tuple[ReferenceLight, ...]
+    shots: tuple[ReferenceShot, ...]
+    calibrations: Mapping[str, Calibration]
+    detections: Mapping[str, tuple[Detection, ...]]
+    history: tuple[Mapping[str, str], ...]
+
+
+def document_of(scene: Scene) -> dict[str, Any]:
+    """Return a scene with everything expanded as plain data; a mesh by its name beside the scene and hash."""
+    data = scene.document.model_dump(mode="json", by_alias=True, exclude_none=True)
+    for name, shape in scene.document.shapes.items():
+        if isinstance(shape, Mesh):
+            file = Path(shape.file)
+            data["shapes"][name]["file"] = Path(os.path.relpath(file, scene.folder)).as_posix()
+            data["shapes"][name]["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return data
+
+
+def changes_of(before: Mapping[str, Any], after: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what differs between two documents, a line each: `seed: 1 → 2`."""
+    old, new = leaves(before), leaves(after)
+    return tuple(
+        f"{path}: {_short(old.get(path))} → {_short(new.get(path))}"
+        for path in dict.fromkeys([*old, *new])
+        if old.get(path) != new.get(path)
+    )
+
+
+def _short(value: Any) -> str:
+    """Write a value in a line; the beginning of a hash says as much."""
+    text = "nothing" if value is None else str(value)
+    return text if len(text) < 60 else f"{text[:24]}…"
+
+
+def leaves(node: Any, path: str = "") -> dict[str, Any]:
+    """Return every leaf of nested data by its dotted path."""
+    children = (
+        node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
+    )
+    found = {
+        inner: leaf
+        for key, value in children
+        for inner, leaf in leaves(value, f"{path}.{key}" if path else str(key)).items()
+    }
+    return found or {path: node}
+
+
+def made_by() -> dict[str, dict[str, str]]:
+    """Return what the bits follow from besides the scene, by name: of light, and of all that comes after."""
+    from nir_render.transport.backend import backend  # Mitsuba loads only where light is rendered
+    from nir_render.transport.key import versions
+
+    light = versions(backend().variant, backend().compiler)
+    transport = {
+        name: value.removeprefix(f"{name} ") for name, value in zip(_OF_TRANSPORT, light, strict=True)
+    }
+    other = {"python": platform.python_version(), "processor": transport["processor"]}
+    other |= {name: _version(name) for name in _PACKAGES}
+    return {"transport": transport, "other": other | {"code": _code_hash()}}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # OpenCV comes under several names
+        return "not installed"
+
+
+@cache
+def _code_hash() -> str:
+    import nir_render
+    import perception
+
+    hashed = hashlib.sha256()
+    for package in (nir_render, perception):
+        root = Path(str(package.__file__)).parent
+        for file in sorted(root.rglob("*.py")):
+            hashed.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return hashed.hexdigest()
+
+
+def edge_image(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return values of pixels in a list, shape (…, n), as images of eight columns, filled up with zeros."""
+    missing = -values.shape[-1] % 8
+    padded = np.concatenate([values, np.zeros((*values.shape[:-1], missing))], axis=-1)
+    return np.asarray(padded.reshape(*values.shape[:-1], -1, 8), dtype=np.float64)

@@ -1,0 +1,168 @@
+"""References of a whole suite: made, and made anew where something has changed on purpose."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from nir_render import run_folder
+from nir_render.errors import InputError
+from nir_render.regress.check import Progress, check_scenes
+from nir_render.regress.findings import Check
+from nir_render.regress.making import lights_of, make_reference, settings_of
+from nir_render.regress.reference import Reference
+from nir_render.regress.reference_files import names_in, read_reference, write_references
+from nir_render.regress.suite import references_of, scenes_of
+from nir_render.scene.load import Scene
+
+RENDERS = 16
+"""Renders that a reference is the mean of: its own noise is a quarter of that of what is held against it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What an update did.
+
+    Attributes
+    ----------
+    made, kept, removed
+        Scenes whose references are new, as they were, and gone.
+    before
+        What a check against the old references said, of the scenes that had any.
+    old, new
+        The references of the scenes that were made anew, before (where there were any) and after.
+    """
+
+    reason: str
+    made: tuple[str, ...]
+    kept: tuple[str, ...]
+    removed: tuple[str, ...]
+    before: Check
+    old: Mapping[str, Reference]
+    new: Mapping[str, Reference]
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything was written."""
+        return bool(self.made or self.removed)
+
+
+def create(
+    suite: str | Path,
+    refs: str | Path | None = None,
+    *,
+    renders: int = RENDERS,
+    progress: Progress | None = None,
+) -> tuple[str, ...]:
+    """Make the references of a suite that has none; return its scenes.
+
+    Parameters
+    ----------
+    suite
+        A folder of scene files.
+    refs
+        Where the references go, `references` within the suite if not given.
+    renders
+        Renders that each light is the mean of, 8 or more.
+    progress
+        Called with the number of renders done, and of all.
+
+    Raises
+    ------
+    InputError
+        There are references already, or a scene cannot be rendered.
+    """
+    scenes = scenes_of(suite)
+    folder = references_of(suite, refs)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            f"{folder}: is there already and is not overwritten; 'nir-render regress update {suite} "
+            "--reason '...'' makes references anew where something changed"
+        )
+    made = _made(scenes, renders, dict.fromkeys(scenes, ()), "created", progress)
+    write_references(folder, made, [], lambda: None)
+    return tuple(scenes)
+
+
+def update(
+    suite: str | Path,
+    reason: str,
+    refs: str | Path | None = None,
+    *,
+    every: bool = False,
+    page: str | Path | None = None,
+    renders: int = RENDERS,
+    progress: Progress | None = None,
+) -> Update:
+    """Make references anew where a check finds a drift, or the scene has changed; the others are kept.
+
+    What passes keeps its reference: so no drift creeps in by steps too small to see.
+
+    Parameters
+    ----------
+    reason
+        Why, for those who come after; kept with each reference.
+    every
+        Make all anew.
+    page
+        Where a page that shows old, new and their difference goes, if anywhere.
+
+    Raises
+    ------
+    InputError
+        No reason is given, or the suite or its references are missing or broken.
+    """
+    if not reason.strip():
+        raise InputError("--reason is empty; say why the references change, for those who come after")
+    scenes = scenes_of(suite)
+    folder = references_of(suite, refs)
+    known = names_in(folder, Path(suite))
+    old = {name: read_reference(folder, name, Path(suite)) for name in known if name in scenes}
+    before = check_scenes(str(suite), {name: scenes[name] for name in old}, old)
+    stands = {one.name for one in before.scenes if one.holds and not one.changes and not every}
+    anew = {name: scene for name, scene in scenes.items() if name not in stands}
+    history = {name: old[name].history if name in old else () for name in anew}
+    made = _made(anew, renders, history, reason.strip(), progress)
+    done = Update(
+        reason.strip(),
+        tuple(made),
+        tuple(name for name in scenes if name in stands),
+        tuple(name for name in known if name not in scenes),
+        before,
+        {name: old[name] for name in made if name in old},
+        made,
+    )
+    if done.changed:
+        write_references(folder, made, done.kept, lambda: _write_page(done, page))
+    return done
+
+
+def _write_page(done: Update, page: str | Path | None) -> None:
+    if page is not None:
+        from nir_render.report.regress_page import update_page
+
+        run_folder.write_file(Path(page), update_page(done).encode())
+
+
+def _made(
+    scenes: Mapping[str, Scene],
+    renders: int,
+    history: Mapping[str, tuple[Mapping[str, str], ...]],
+    reason: str,
+    progress: Progress | None,
+) -> dict[str, Reference]:
+    settings = {name: settings_of(scene) for name, scene in scenes.items()}
+    lights = sum(len(lights_of(scene, settings[name])[0]) for name, scene in scenes.items())
+    total, done = lights * (renders + 1), 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    entry = {"time": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "reason": reason}
+    return {
+        name: make_reference(scene, settings[name], renders, (*history[name], entry), step)
+        for name, scene in scenes.items()
+    }
