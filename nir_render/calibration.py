@@ -5,7 +5,8 @@ where these differ, their mean, with their spread as σ.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -22,12 +23,13 @@ from perception.calibrate import regress_paper_range_constant
 from perception.pipeline import detect
 from perception.types import Calibration, RawFrame
 
+_KEPT = 64
 _RAIL_M = tuple(float(range_m) for range_m in range(1, 11))
 _RAIL_PEAK = 0.8  # of full scale, at the nearest range: as bright as one would dare
 
 
 def calibration(scene: Scene, camera: str) -> Calibration:
-    """Return the calibration of a camera, `robot.camera`.
+    """Return the calibration of a camera, `robot.camera`; its arrays are read-only.
 
     Raises
     ------
@@ -41,6 +43,12 @@ def calibration(scene: Scene, camera: str) -> Calibration:
     sources = others or list(everyone.values())
     if not sources:
         raise InputError(f"{scene.path}: robots: no robot has a source, so there is no range constant")
+    return _of_devices(camera, device, tuple(sources))
+
+
+@lru_cache(maxsize=_KEPT)
+def _of_devices(camera: str, device: Camera, sources: tuple[Source, ...]) -> Calibration:
+    """Return the calibration of a camera to the sources that it ranges to, kept for other scenes."""
     intrinsics = intrinsics_of(device)
     mount = camera_pose_on_robot(device)
     on_axis = response(device, sources[0])
@@ -81,6 +89,9 @@ def calibration(scene: Scene, camera: str) -> Calibration:
         lens_model=device.lens.model,
         distortion=device.lens.distortion,
     )
+    for field in fields(known):
+        if isinstance(array := getattr(known, field.name), np.ndarray):
+            array.setflags(write=False)
     return replace(known, range_constant_paper_dn_m2_per_s=_paper_constant(known, device, sources[0]))
 
 
