@@ -6,7 +6,6 @@ Exit status: 0 done, 1 the work failed or a check did not hold, 2 the input was 
 import dataclasses
 import json
 import math
-import os
 import shlex
 import signal
 import sys
@@ -242,7 +241,7 @@ def stress(
     from nir_render.stress.campaign import load_campaign
     from nir_render.stress.jobs import plan
     from nir_render.stress.summary import summary_of
-    from nir_render.stress.sweep import StoppedError, done_before, sweep, write_report
+    from nir_render.stress.sweep import StoppedError, cores, done_before, sweep, write_report
 
     known = load_campaign(campaign)
     light_limit_bytes = _light_limit_bytes(light_cache_gib)
@@ -257,7 +256,7 @@ def stress(
         else:
             typer.echo(f"{known.name}: {len(jobs)} jobs in {lights} geometries; {done} are done in {folder}")
         return
-    count = workers if workers is not None else min(os.cpu_count() or 1, _MOST_WORKERS)
+    count = workers if workers is not None else min(cores(), _MOST_WORKERS)
     try:
         with progress_bar("stress") as progress:
             result = sweep(

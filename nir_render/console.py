@@ -36,9 +36,8 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
     Its first call says what is done already. Where no one watches, it is a line now and then.
     """
     columns = (TextColumn(f"{what:<9}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
-    # What takes minutes each has to be averaged over long.
     with Progress(
-        *columns, console=errors, transient=not errors.is_terminal, speed_estimate_period=600
+        *columns, console=errors, transient=not errors.is_terminal, speed_estimate_period=_AVERAGED_OVER_S
     ) as bar:
         task = bar.add_task(what, total=None)
         began = said = time.monotonic()

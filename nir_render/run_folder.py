@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -60,6 +61,27 @@ def check_free(folder: Path, overwrite: bool) -> None:
         )
     if not overwrite:
         raise InputError(f"{folder}: holds another run; give a new folder, or --overwrite to replace it")
+
+
+@contextlib.contextmanager
+def locked(file: Path, taken: str) -> Iterator[None]:
+    """Hold a lock on a file for the block; the system gives it back whatever becomes of the process.
+
+    Raises
+    ------
+    InputError
+        Another process holds it, with the text `taken`; the file cannot be written.
+    """
+    try:
+        held = file.open("a")
+    except OSError as error:
+        raise disk_error(file, error) from None
+    with held:
+        try:
+            _lock(held.fileno())
+        except OSError:
+            raise InputError(taken) from None
+        yield
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -179,6 +201,17 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def _lock(descriptor: int) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _umask() -> int:

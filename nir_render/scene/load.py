@@ -22,7 +22,7 @@ from nir_render.scene.world import Lamp, Sun
 _RIVALS = ("render.noise", "render.indirect.samples")
 
 
-_COMPONENTS = {"x": 0, "y": 1, "z": 2, "0": 0, "1": 1, "2": 2}
+_COMPONENTS = {"x": 0, "y": 1, "z": 2, "0": 0, "1": 1, "2": 2}  # of vectors
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +154,12 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
     if not keys:
         return value
     if isinstance(node, list):
-        if not keys[0].isdigit() or int(keys[0]) >= len(node):
+        numbers = all(isinstance(item, int | float) for item in node)
+        known = _COMPONENTS if numbers else {}
+        index = int(keys[0]) if keys[0].isdigit() else known.get(keys[0], -1)
+        if not 0 <= index < len(node):
             raise InputError(f"--set {path}: {keys[0]!r} is no index of a list of {len(node)}")
-        return [
-            _set(item, keys[1:], value, path) if i == int(keys[0]) else item for i, item in enumerate(node)
-        ]
+        return [_set(item, keys[1:], value, path) if i == index else item for i, item in enumerate(node)]
     if isinstance(node, str) and node.lstrip().startswith("["):
         if len(keys) != 1 or keys[0] not in _COMPONENTS:
             raise InputError(f"--set {path}: {keys[0]!r} is no component of {node!r}; take x, y or z")

@@ -1,7 +1,8 @@
 """A campaign document: which scene is swept along which axes, and what is to hold there."""
 
+import difflib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -9,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ValidationError, field_validator
 
 from nir_render.errors import InputError
-from nir_render.scene.base import Document, read_yaml
+from nir_render.scene.base import Document, document_key, read_yaml
 from nir_render.scene.explain import explain
 from nir_render.scene.load import Scene, load_scene
 from nir_render.stress.axes import Axis, AxisDocument
@@ -145,6 +146,14 @@ def _base_scene(file: Path, document: CampaignDocument) -> Scene:
 
 def _check_axes(file: Path, scene: Scene, axes: list[Axis]) -> None:
     """Refuse an axis whose path is no part of the scene, or a value that is none for it."""
+    nowhere = [
+        f"{file}: axes.{axis.name}: {problem}"
+        for axis in axes
+        for path in axis.paths
+        for problem in _nowhere(scene.document, path)
+    ]
+    if nowhere:
+        raise InputError(*nowhere)
     for axis in axes:
         # Two axes may only make sense together.
         others = {
@@ -157,6 +166,34 @@ def _check_axes(file: Path, scene: Scene, axes: list[Axis]) -> None:
                 problems += [f"{file}: axes.{axis.name}: {label}: {_bare(one)}" for one in alone]
         if problems:
             raise InputError(*problems)
+
+
+def _nowhere(document: Document, path: str) -> Iterator[str]:
+    """Yield what is wrong with a path to a thing that the scene has not.
+
+    A whole new material under a misspelt name would make a scene that is right, and an axis that changes
+    nothing.
+    """
+    node: Any = document
+    way = path.split(".")
+    for depth, key in enumerate(way):
+        if isinstance(node, Document):
+            names = {document_key(name): name for name in type(node).model_fields}
+            if key not in names:  # of such keys the model itself tells
+                return
+            node = getattr(node, names[key])
+        elif isinstance(node, Mapping):
+            if key not in node:
+                near = difflib.get_close_matches(key, node, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(node) or 'none'}"
+                yield (
+                    f"there is no {key!r} in {'.'.join(way[:depth])}; {hint} "
+                    "(what is new is written in the scene, or under 'set')"
+                )
+                return
+            node = node[key]
+        else:
+            return
 
 
 def _problems(scene: Scene, settings: Mapping[str, Any]) -> Sequence[str]:
@@ -177,6 +214,9 @@ def _clashes(axes: list[Axis], settings: Mapping[str, Any]) -> list[str]:
                 problems.append(f"axes.{axis.name}: {path} is set by {owner[path]} too")
             owner[path] = f"axes.{axis.name}"
     problems += [f"{owner['seed']} sets the seed: write it under 'seeds'"] if "seed" in owner else []
+    problems += [
+        f"{owner[key]} sets {key!r}, which changes no picture" for key in ("name", "format") if key in owner
+    ]
     return problems
 
 

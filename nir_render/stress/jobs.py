@@ -3,14 +3,15 @@
 import hashlib
 import itertools
 import math
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from nir_render import run
 from nir_render.errors import InputError
-from nir_render.run import chosen_estimators
 from nir_render.scene.load import Scene
 from nir_render.stress.campaign import Campaign
 from perception.own_estimator import OwnEstimator
@@ -75,7 +76,7 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
         progress(built, math.prod(sizes))
         settings = settings_of(campaign, values)
         try:
-            scene = campaign.scene.with_(settings)
+            scene = campaign.scene.with_({**settings, "seed": 0})
             geometry = _geometry(scene)
         except InputError as error:
             problems += [f"{campaign.path}: at {_place(campaign, values)}: {one}" for one in error.problems]
@@ -89,6 +90,7 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
             parts = (of_scene, f"seed {seed}", geometry, *made_by)
             key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:_DIGITS]
             jobs.append(Job(key, values, seed, {**settings, "seed": seed}, f"{seed} {geometry}"))
+    progress(math.prod(sizes), math.prod(sizes))
     if problems:
         raise InputError(*_first(problems))
     return jobs
@@ -124,13 +126,22 @@ def _made_by(campaign: Campaign) -> tuple[str, ...]:
     from nir_render.transport.key import versions
 
     try:
-        estimators = chosen_estimators(campaign.estimators)
+        estimators = run.chosen_estimators(campaign.estimators)
     except InputError as error:
         problems = (problem.removeprefix("--estimator ") for problem in error.problems)
         raise InputError(*(f"{campaign.path}: estimators: {problem}" for problem in problems)) from None
-    own = [one.path.read_bytes() for one in estimators.values() if isinstance(one, OwnEstimator)]
-    contents = (hashlib.sha256(content).hexdigest() for content in own)
-    return (*estimators, *contents, _code(), *versions(backend().variant, backend().compiler))
+    own = [one.path.resolve() for one in estimators.values() if isinstance(one, OwnEstimator)]
+    contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in _with_imports(own))
+    packages = (f"{name} {version}" for name, version in run.versions().items() if name != "platform")
+    return (*estimators, *contents, _code(), *packages, *versions(backend().variant, backend().compiler))
+
+
+def _with_imports(estimators: list[Path]) -> list[Path]:
+    """Return files of estimators, and what they have imported from beside them."""
+    folders = {file.parent for file in estimators}
+    files = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
+    imported = {Path(file).resolve() for file in files if file is not None}
+    return sorted({*estimators, *(file for file in imported if file.parent in folders and file.is_file())})
 
 
 @cache

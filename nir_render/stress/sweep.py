@@ -14,7 +14,7 @@ import yaml
 from nir_render.errors import InputError
 from nir_render.report.wording import counted
 from nir_render.run import versions
-from nir_render.run_folder import disk_error, read_json, write_file, write_json, write_lines
+from nir_render.run_folder import disk_error, locked, read_json, write_file, write_json, write_lines
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.jobs import Job
 from nir_render.stress.table import gathered, read_part, write_table
@@ -23,7 +23,7 @@ from nir_render.transport.backend import backend
 
 MANIFEST = "campaign.json"
 TABLE, PAGE, JOBS = "table.parquet", "report.html", "jobs.jsonl"
-_PARTS, _LIGHT, _SCRATCH = "jobs", "light", ".workers"
+_PARTS, _LIGHT, _SCRATCH, _LOCK = "jobs", "light", ".workers", ".lock"
 
 Progress = Callable[[int, int], None]
 
@@ -81,31 +81,38 @@ def sweep(
     Raises
     ------
     InputError
-        The folder is taken, the disk is full.
+        The folder is taken, another process works in it, the disk is full.
     StoppedError
         By Ctrl-C; what was done stays, and the same call goes on.
     """
     _claim(folder, campaign)
-    parts = folder / _PARTS
-    missing = [job for job in jobs if read_part(part_file(parts, job)) is None]
-    done, failed = len(jobs) - len(missing), dict[str, str]()
-    progress(done, len(jobs))
-    if missing:
-        threads = max((os.cpu_count() or 1) // workers, 1)
-        kept = folder / _LIGHT if light is None else light
-        work = Work(campaign.scene, campaign.estimators, parts, kept, light_limit_bytes, threads)
-        try:
-            with closing(run_jobs(work, missing, min(workers, len(missing)), folder / _SCRATCH)) as ending:
-                for one in ending:
-                    if one.error is not None:
-                        failed[one.job.key] = one.error
-                    done += 1
-                    progress(done, len(jobs))
-        except KeyboardInterrupt:
-            raise StoppedError(done - len(failed), len(jobs)) from None
-    for place in (folder, parts, folder / _LIGHT):
-        _remove_abandoned(place)
-    return _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
+    with locked(folder / _LOCK, f"{folder}: another nir-render works on this campaign; wait for its end"):
+        parts = folder / _PARTS
+        missing = [job for job in jobs if read_part(part_file(parts, job)) is None]
+        done, failed = len(jobs) - len(missing), dict[str, str]()
+        progress(done, len(jobs))
+        if missing:
+            workers = min(workers, len(missing))
+            kept = folder / _LIGHT if light is None else light
+            threads = max(cores() // workers, 1)
+            work = Work(campaign.scene, campaign.estimators, parts, kept, light_limit_bytes, threads)
+            try:
+                with closing(run_jobs(work, missing, workers, folder / _SCRATCH)) as ending:
+                    for one in ending:
+                        if one.error is not None:
+                            failed[one.job.key] = one.error
+                        done += 1
+                        progress(done, len(jobs))
+            except KeyboardInterrupt:
+                raise StoppedError(done - len(failed), len(jobs)) from None
+        for place in (folder, parts, folder / _LIGHT):
+            _remove_abandoned(place)
+        return _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def done_before(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> int:
@@ -120,10 +127,13 @@ def check_folder(folder: Path, campaign: Campaign) -> None:
     """Raise InputError where a folder is there that is not this campaign's."""
     if folder.is_file():
         raise InputError(f"{folder}: is a file; give a folder for the campaign")
-    if folder.is_dir() and any(folder.iterdir()):
+    # One that was killed as it began has left no more than these.
+    begun = (_LOCK, f".{MANIFEST}.partial-")
+    if folder.is_dir() and not all(path.name.startswith(begun) for path in folder.iterdir()):
         if not (folder / MANIFEST).is_file():
             raise InputError(f"{folder}: holds files that are no campaign's; give a new folder")
-        name = read_json(folder / MANIFEST).get("name")
+        facts = read_json(folder / MANIFEST)
+        name = facts.get("name") if isinstance(facts, dict) else None
         if name != campaign.name:
             raise InputError(
                 f"{folder}: holds the campaign {name!r}, not {campaign.name!r}; give another folder"

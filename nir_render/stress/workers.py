@@ -6,11 +6,13 @@ is killed is started again, and its job goes to another; one that dies with seve
 
 import contextlib
 import logging
+import multiprocessing
 import shutil
 import signal
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import cv2
@@ -24,7 +26,7 @@ from nir_render.run import chosen_estimators
 from nir_render.scene.load import Scene
 from nir_render.stress.execute import execute
 from nir_render.stress.jobs import Job
-from nir_render.stress.table import write_part
+from nir_render.stress.table import read_part, write_part
 from nir_render.transport.backend import set_threads
 from nir_render.transport.cache import LightCache
 from perception import Estimator
@@ -67,8 +69,8 @@ def part_file(parts: Path, job: Job) -> Path:
 def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Generator[Done]:
     """Do jobs in `workers` processes; yield each as it ends.
 
-    The first job of those that share light renders it, the others wait for it and find it in the cache.
-    When the generator is closed, or an exception goes through it, the workers end.
+    The first job of those that share light renders it; the others begin when it has ended, and find it in the
+    cache. When the generator is closed, or an exception goes through it, the workers end.
     """
     # `scratch` may hold what a killed run has left.
     shutil.rmtree(scratch, ignore_errors=True)
@@ -82,17 +84,29 @@ def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Ge
     try:
         with dask.config.set(settings), _client(workers) as client:
             client.register_plugin(_Context(work), name=_PLUGIN)
-            waiting: dict[Future, Job] = {}
-            first: dict[str, Future] = {}
-            for priority, job in enumerate(jobs):
-                after = first.get(job.light)
-                future = client.submit(
-                    _do, job, after, key=job.key, priority=-priority, retries=0, pure=False
-                )
-                first.setdefault(job.light, future)
-                waiting[future] = job
-            for future in as_completed(list(waiting)):
-                yield Done(waiting[future], _fault(future))
+            place = {job.key: number for number, job in enumerate(jobs)}
+            followers: dict[str, list[Job]] = {}
+            first: list[Job] = []
+            for job in jobs:
+                if job.light in followers:
+                    followers[job.light].append(job)
+                else:
+                    followers[job.light] = []
+                    first.append(job)
+            known: dict[Future, Job] = {}
+
+            def submitted(job: Job) -> Future:
+                future = client.submit(_do, job, key=job.key, priority=-place[job.key], retries=0, pure=False)
+                known[future] = job
+                return future
+
+            ending = as_completed([submitted(job) for job in first])
+            for future in ending:
+                job = known.pop(future)
+                # However it has ended: one that takes its workers along must not take the others along.
+                for follower in followers.pop(job.light, ()):
+                    ending.add(submitted(follower))
+                yield Done(job, _fault(future))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
@@ -100,10 +114,11 @@ def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Ge
 @contextlib.contextmanager
 def _client(workers: int) -> Iterator[Client]:
     """Start worker processes; they end with the block."""
+    others = set(multiprocessing.active_children())
     with contextlib.ExitStack() as stack:
         with _interrupts_held():
             cluster = _started(workers)
-            stack.callback(cluster.close, timeout=_ENDS_WITHIN_S)
+            stack.callback(_end, cluster, others)
             client = stack.enter_context(Client(cluster))
         yield client
 
@@ -116,7 +131,7 @@ def _started(workers: int) -> LocalCluster:
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # none, but for a port that is free
                 memory_limit=0,
                 silence_logs=logging.CRITICAL,
             )
@@ -124,6 +139,16 @@ def _started(workers: int) -> LocalCluster:
             if attempt == _STARTS - 1:
                 raise
     raise AssertionError
+
+
+def _end(cluster: LocalCluster, others: Collection[BaseProcess]) -> None:
+    """End the workers: what has been done is on the disk, so those that do not end in time are killed."""
+    try:
+        cluster.close(timeout=_ENDS_WITHIN_S)
+    except TimeoutError:  # one was just being started in the place of another that was killed
+        for child in multiprocessing.active_children():
+            if child not in others:
+                child.kill()
 
 
 @contextlib.contextmanager
@@ -163,12 +188,14 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
                 limit_bytes=self.work.light_limit_bytes,
                 memory_limit_bytes=_MEMORY_LIMIT_BYTES,
             )
+        if read_part(part_file(self.work.parts, job)) is not None:
+            return  # by a worker that was killed before it could say so
         scene = self.work.scene.with_(job.settings)
         rows, frames_sha256 = execute(scene, self._estimators, self._cache)
         write_part(part_file(self.work.parts, job), rows, frames_sha256)
 
 
-def _do(job: Job, after: object) -> str | None:  # noqa: ARG001 (to wait for)
+def _do(job: Job) -> str | None:
     """Do one job in a worker; return what went wrong, in words."""
     context = get_worker().plugins[_PLUGIN]
     try:

@@ -28,6 +28,23 @@ def test_components_follow_one_another() -> None:
     assert changed.document.robots["r2"].position_m == pytest.approx((1.5, 0.0, 0.02), rel=1e-15)
 
 
+def test_a_vector_without_a_unit_has_components_too() -> None:
+    changed = load_scene(SCENE, {"shapes.white_wall.normal.y": 0.5})
+    assert changed.document.shapes["white_wall"].normal == (-1.0, 0.5, 0.0)  # type: ignore[union-attr]
+
+
+def test_lists_longer_than_vectors_keep_their_indices() -> None:
+    scene = load_scene("scenes/blinking.yaml")
+    assert scene.raw["robots"]["r1"]["rig"]["cameras"]["front"]["lens"]["distortion"] == [
+        -0.15,
+        0.02,
+        0.0,
+        0.0,
+    ]
+    changed = scene.with_({"robots.r1.rig.cameras.front.lens.distortion.3": 1e-4})
+    assert changed.camera("r1.front")[1].lens.distortion == (-0.15, 0.02, 0.0, 1e-4)
+
+
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [

@@ -98,13 +98,26 @@ def test_a_job_is_named_by_what_it_does(tmp_path: Path) -> None:
     assert not keys & {job.key for job in planned(tmp_path, set=dimmer)[1]}
 
 
+def test_a_job_does_not_follow_from_the_scenes_own_seed(tmp_path: Path) -> None:
+    base = {"robots.r2.motion": [], "robots.r2.position": "[1, 0.2, 0] m", "clock.frames": 1}
+    (tmp_path / "seeded.yaml").write_text(
+        (ROOT / "scenes" / "one_source.yaml").read_text().replace("seed: 1", "seed: 7")
+    )
+    seeded = planned(tmp_path, scene="seeded.yaml", set=base)[1]
+    assert [job.key for job in seeded] == [job.key for job in planned(tmp_path, set=base)[1]]
+
+
 def test_ones_own_estimator_is_known_by_what_its_file_holds(tmp_path: Path) -> None:
     own = tmp_path / "mine.py"
     own.write_text("def none(frame, calibration):\n    return []\n")
     first = planned(tmp_path, estimators=["mine.py:none"])[1]
-    own.write_text("def none(frame, calibration):\n    return list()\n")
+    own.write_text("import beside_it\ndef none(frame, calibration):\n    return beside_it.NONE\n")
+    (tmp_path / "beside_it.py").write_text("NONE = []\n")
     again = planned(tmp_path, estimators=["mine.py:none"])[1]
     assert not {job.key for job in first} & {job.key for job in again}
+    (tmp_path / "beside_it.py").write_text("NONE = list()\n")
+    other = planned(tmp_path, estimators=["mine.py:none"])[1]
+    assert not {job.key for job in again} & {job.key for job in other}
 
 
 @pytest.mark.parametrize(
@@ -112,8 +125,13 @@ def test_ones_own_estimator_is_known_by_what_its_file_holds(tmp_path: Path) -> N
     [
         ({"axes": {"robots.r2.position.x": ["1 m", "2 m"], "robots.r2.positoin": ["x"]}},
          r"axes\.robots\.r2\.positoin: x: .*did you mean 'position'"),
+        ({"axes": {"m": {"path": "robots.r2.rig.sources.tpo", "values": ["infra_swarm"]}}},
+         r"axes\.m: there is no 'tpo' in robots\.r2\.rig\.sources; did you mean 'top'"),
+        ({"axes": {"m": {"path": "materials.paint", "values": [{"type": "diffuse", "reflectance": 0.1}]}}},
+         r"axes\.m: there is no 'paint' in materials; known: none"),
+        ({"axes": {"name": ["one", "two"]}}, "changes no picture"),
         ({"axes": {"fgo.visibility": ["20 m"]}}, r"'fgo' is no part of a scene"),
-        ({"axes": {"robots.r9.rig.cameras.front.exposure": ["1 ms"]}}, r"robots\.r9"),
+        ({"axes": {"robots.r9.rig.cameras.front.exposure": ["1 ms"]}}, r"there is no 'r9' in robots"),
         ({"axes": {"range": ["1 m"]}}, r"axes\.range: 1 m: range: 'range' is no part of a scene"),
         ({"axes": {"x": {"path": "robots.r2.position.x", "values": ["1 m", "2 s"]}}}, r"2 s: .*a length"),
         ({"axes": {"e": {"path": "robots.r1.rig.cameras.front.exposure", "values": ["1 ms", "-1 ms"]}}},
