@@ -17,7 +17,6 @@ from nir_render.evaluate.metrics import Evaluation, FrameKey, evaluate
 from nir_render.evaluate.truth import SourceTruth, parse_truth
 from nir_render.noise_facts import enlarging_facts, noise_facts, noise_warning, sample_facts
 from nir_render.render_noise import RenderNoise
-from nir_render.report.preview import preview_png
 from nir_render.scene.load import Scene, load_scene
 from nir_render.simulate import simulate
 from nir_render.transport.cache import LightCache
@@ -341,6 +340,8 @@ def _check_frames_known(
 def _preview(
     folder: Path, keys: Sequence[FrameKey], calibrations: Mapping[str, Calibration], result: Evaluation
 ) -> bytes:
+    from nir_render.report.preview import preview_png  # Matplotlib loads only where something is drawn
+
     at = {(record.camera, record.index): record for record in read_frame_records(folder)}
     estimators = list(result.summary["estimators"])
     return preview_png(
