@@ -118,7 +118,7 @@ def _cells(panel: Axes, figure: Figure, one: _Map, bound: float | None, image: A
         if written and np.isfinite(value):
             red, green, blue, _ = image.cmap(image.norm(abs(value)))
             dark = 0.2126 * red + 0.7152 * green + 0.0722 * blue < 0.45
-            text = figure_text(figure.name, value)
+            text = figure_text(figure.name, value, bound)
             panel.text(
                 column, row, text, ha="center", va="center", fontsize=7.5, color=INK if dark else PANEL
             )

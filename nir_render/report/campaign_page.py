@@ -17,12 +17,12 @@ from nir_render.report.campaign_tables import (
 )
 from nir_render.report.campaign_words import bound_text, corner_text, figure_text, sentence_of, verdict_text
 from nir_render.report.parts import facts_table, mark, page, table
-from nir_render.report.wording import counted, share, times
+from nir_render.report.wording import counted, share, significant
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.figures import FIGURES
 from nir_render.stress.limits import Limit, corners_kept, limits_of
-from nir_render.stress.repeats import repeated_in_corners, repetitions
-from nir_render.stress.sums import ASKED, COUNT, TOTAL, JobSums, job_sums
+from nir_render.stress.repeats import LEAST_OF_ONE, repeated_in_corners, repetitions
+from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, JobSums, job_sums
 
 _MOST_WARNINGS = 12
 _MOST_LETTERS = 400
@@ -111,16 +111,19 @@ def _summary(campaign: Campaign, sums: JobSums, limits: Sequence[Limit]) -> str:
 
 
 def _overall_sentence(sums: JobSums, name: str) -> str:
-    recall, ranged, rmse, bias, pull = (
-        _overall(sums, name, figure)
-        for figure in ("recall", "ranged", "range_rmse", "range_bias", "range_pull")
+    recall, ranged, rmse, bias = (
+        _overall(sums, name, figure) for figure in ("recall", "ranged", "range_rmse", "range_bias")
     )
     asked = int(sums.of[name, "recall"][ASKED].sum())
     if not asked:
         return f"{name} met no source that counts: there is nothing to judge."
     if not math.isfinite(rmse):
         return f"{name} finds {share(recall)} of {counted(asked, 'source')}, and gives none a range."
-    at_limit = f", {times(pull)} × the physical limit" if math.isfinite(pull) else ""
+    own = sums.of[name, "range_rmse"].sum(axis=1)
+    limit = float(FIGURES["range_rmse"].value(own[LIMIT], own[LIMITED]))
+    at_limit = ""
+    if limit > 0.0:
+        at_limit = f", {significant(rmse / limit)} × the physical limit of {figure_text('range_rmse', limit)}"
     return (
         f"{name} finds {share(recall)} of {counted(asked, 'source')} and ranges {share(ranged)}, with an RMS "
         f"error of {figure_text('range_rmse', rmse)} (bias {figure_text('range_bias', bias)}){at_limit}."
@@ -136,8 +139,8 @@ def _compared(sums: JobSums) -> str:
     more, less = ("paper", "robust") if paper >= robust else ("robust", "paper")
     ratio = max(paper, robust) / min(paper, robust)
     return (
-        f"Over all, the range errors of {more} are {times(ratio)} × those of {less}, each of the sources "
-        "that it ranges."
+        f"Over all, the range errors of {more} are {significant(ratio)} × those of {less}, each of the "
+        "sources that it ranges."
     )
 
 
@@ -178,7 +181,8 @@ def _pooled_cell(campaign: Campaign, limit: Limit) -> str:
     text = _worded(verdict_text(campaign.axes[limit.axis], limit.pooled), limit.pooled.status)
     worst = limit.pooled.worst
     if limit.pooled.status in ("in part", "nowhere") and math.isfinite(worst):
-        text += f'<br><span class="faint">worst {escape(figure_text(figure.name, worst))}</span>'
+        said = figure_text(figure.name, worst, limit.bound.value)
+        text += f'<br><span class="faint">worst {escape(said)}</span>'
     asked, count = sum(point.asked for point in limit.points), sum(point.count for point in limit.points)
     if figure.kind == "source" and not figure.higher_is_better and count < 0.95 * asked:
         text += f'<br><span class="faint">of {share(count / asked)} of the sources</span>'
@@ -211,20 +215,23 @@ def _how_sure(sums: JobSums) -> str:
     if repeated_in_corners(sums.place):
         return corner + (
             "In brackets what 68 of 100 repetitions with other seeds would give (bootstrap over jobs within "
-            "their corner). The worst of many corners is also the unluckiest: more seeds make it fairer."
+            "their corner); those of two seeds are rather narrow. A single corner has them from "
+            f"{LEAST_OF_ONE} seeds on; else the two values are named between which the limit lies. The worst "
+            "of many corners is also the unluckiest: more seeds make it fairer."
         )
     return corner + (
         "In brackets the 68 % interval of a bootstrap over the jobs of each value. With one seed it holds "
-        "the differences between corners too, and is wider than what other seeds would give; a single corner "
-        "has none."
+        "the differences between corners too, and is wider than what other seeds would give. A single corner "
+        "has none: there the two values are named between which the limit lies."
     )
 
 
 def _worst(campaign: Campaign, sums: JobSums, facts: Mapping[str, Any]) -> str:
     commands = facts.get("commands", {})
     parts = []
+    bounds = {bound.figure: bound.value for bound in campaign.bounds}
     for number, name in enumerate(figures_shown(campaign)):
-        listed = worst_table(campaign.axes, sums, FIGURES[name], commands)
+        listed = worst_table(campaign.axes, sums, FIGURES[name], commands, bounds.get(name))
         if listed:
             opened = " open" if number == 0 else ""
             parts.append(

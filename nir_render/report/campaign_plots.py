@@ -58,7 +58,10 @@ def against_axes(
                 _panel(panel, figure, name, names, x, points, corners, bound)
                 _ticks_x(panel, axis, x, points[name], figure)
                 panel.set_xlabel(short(axis.title, 40) + (f", {axis.unit}" if axis.unit else ""))
-                shown += [corners.ravel(), np.array([point.value for point in points[name]])]
+                shown += [
+                    corners.ravel(),
+                    *(np.array([said.value, said.limit]) for said in points[name]),
+                ]
             row[0].set_ylabel(figure.title)
         for panel, name in zip(panels[0], names, strict=True):
             panel.set_title(short(name, 40), fontsize=9, color=look(name, names).colour, loc="left")

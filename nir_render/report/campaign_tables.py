@@ -34,7 +34,9 @@ def overall_table(sums: JobSums) -> str:
     return table(headings, rows)
 
 
-def worst_table(axes: Sequence[Axis], sums: JobSums, figure: Figure, commands: Mapping[str, str]) -> str:
+def worst_table(
+    axes: Sequence[Axis], sums: JobSums, figure: Figure, commands: Mapping[str, str], bound: float | None
+) -> str:
     """Return the jobs with the worst figures of each estimator; empty where none is less than perfect."""
     rows = []
     for name in sums.estimators:
@@ -48,7 +50,7 @@ def worst_table(axes: Sequence[Axis], sums: JobSums, figure: Figure, commands: M
             command = commands.get(sums.jobs[job], "")
             row = [f"{mark(name, sums.estimators)} {escape(name)}"]
             row += [escape(axis.labels[sums.place[job, i]]) for i, axis in enumerate(axes)]
-            row += [str(sums.seeds[job]), figure_text(figure.name, value[job])]
+            row += [str(sums.seeds[job]), figure_text(figure.name, value[job], bound)]
             row += [figure_text(figure.name, limit[job])] if figure.limit else []
             row += [_of(figure, int(own[COUNT, job]), int(own[ASKED, job]))]
             rows.append([*row, f"<code>{escape(command)}</code>" if command else ""])

@@ -1,11 +1,12 @@
 """What a campaign's limits and figures say, in words."""
 
+import bisect
 import math
 from collections.abc import Sequence
 
 import pyarrow as pa
 
-from nir_render.report.wording import counted, degrees, metres, share, times
+from nir_render.report.wording import counted, metres, share, significant
 from nir_render.scene.units import ANGLE, LENGTH
 from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
@@ -16,22 +17,21 @@ from nir_render.stress.sums import job_sums
 
 _BEYOND = {"nothing there": "nothing to judge", "not defined": "no such figure"}
 _MOST_NAMED = 6
+_MOST_DIGITS = 7
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "%": 0.01, "°": math.pi / 180.0, "": 1.0}
 
 
-def figure_text(name: str, value: float | None) -> str:
-    """Write the value of a figure as a person reads it."""
+def figure_text(name: str, value: float | None, bound: float | None = None) -> str:
+    """Write the value of a figure as a person reads it, so that it tells on which side of a bound it lies."""
     if value is None or not math.isfinite(value):
         return "–"
-    quantity = FIGURES[name].quantity
-    if quantity is LENGTH:
-        return metres(value, signed=name == "range_bias")
-    if quantity is ANGLE:
-        return degrees(math.degrees(value))
-    if name in SHARES or name == "range_rmse_share":
-        return share(value) if value <= 1.0 else f"{100.0 * value:.3g} %"
-    if name == "false_alarms":
-        return f"{value:.2g}"
-    return times(value)
+    text = _figure_text(name, value, 0)
+    figure = FIGURES[name]
+    for more in range(1, _MOST_DIGITS):
+        if bound is None or figure.holds(_read(text), bound) == figure.holds(value, bound):
+            break
+        text = _figure_text(name, value, more)
+    return text
 
 
 def marked_unit(name: str) -> float:
@@ -42,9 +42,8 @@ def marked_unit(name: str) -> float:
 def tick_text(name: str, value: float) -> str:
     """Write a value at a scale of a plot, as short as it goes."""
     head, _, unit = figure_text(name, value).partition(" ")
-    if "." in head:
-        head = head.rstrip("0").rstrip(".")
-    return f"{head} {unit}".rstrip() if value else "0"
+    degree = "°" if head.endswith("°") else ""
+    return f"{_shortened(head.removesuffix('°'))}{degree} {unit}".rstrip() if value else "0"
 
 
 def bound_text(bound: Bound) -> str:
@@ -126,15 +125,49 @@ def _span_text(axis: Axis, span: Span) -> str:
 
 
 def _edge_text(axis: Axis, edge: Edge, where: str) -> str:
+    """Write where a span ends: how sure that is, or else between which values of the axis it lies."""
     text = number_text(axis, edge.value)
     if edge.reason in _BEYOND:
         return f"{text} ({_BEYOND[edge.reason]} {where})"
-    if edge.low is None or edge.high is None or not edge.low <= edge.high:
+    numbers = axis.numbers or ()
+    if edge.low is not None and edge.high is not None:
+        first, last = edge.within or (numbers[0], numbers[-1])
+        low = f"{edge.low:.3g}" if math.isfinite(edge.low) else f"below {first:.3g}"
+        high = f"{edge.high:.3g}" if math.isfinite(edge.high) else f"beyond {last:.3g}"
+        # Repetitions that agree on what is printed tell of the few that there are, not of how sure it is.
+        if low != high:
+            return f"{text} ({low}–{high})".replace("-", "−")
+    right = bisect.bisect_right(numbers, edge.value)
+    if not 0 < right < len(numbers) or edge.value == numbers[right - 1]:
         return text
-    numbers = axis.numbers or (math.nan,)
-    low = f"{edge.low:.3g}" if math.isfinite(edge.low) else f"below {numbers[0]:.3g}"
-    high = f"{edge.high:.3g}" if math.isfinite(edge.high) else f"beyond {numbers[-1]:.3g}"
-    return f"{text} ({low}–{high})".replace("-", "−")
+    before, behind = (number_text(axis, number) for number in numbers[right - 1 : right + 1])
+    return f"about {text} (between {before} and {behind})"
+
+
+def _figure_text(name: str, value: float, more: int) -> str:
+    """Write a value with three digits, a share of sources with one decimal, or with `more`."""
+    quantity = FIGURES[name].quantity
+    if quantity is LENGTH:
+        return metres(value, signed=name == "range_bias", more=more)
+    if quantity is ANGLE:
+        return f"{significant(math.degrees(value), 3 + more)}°"
+    if name in SHARES:
+        return share(value, more=more)
+    if name == "range_rmse_share":
+        return f"{significant(100.0 * value, 3 + more)} %"
+    if name == "false_alarms":
+        return _shortened(significant(value, 2 + more))
+    return significant(value, 3 + more)
+
+
+def _read(text: str) -> float:
+    """Return what `_figure_text` has written, in the figure's unit."""
+    head, _, unit = text.replace("−", "-").replace("°", " °").partition(" ")
+    return float(f"{float(head) * _UNITS[unit]:.12g}")
+
+
+def _shortened(number: str) -> str:
+    return number.rstrip("0").rstrip(".") if "." in number else number
 
 
 def _labels_text(axis: Axis, verdict: Verdict) -> str:

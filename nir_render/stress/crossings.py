@@ -18,14 +18,17 @@ class Edge:
 
     `reason` says why it ends there: the figure crosses the bound (`value` is interpolated between the two
     neighbours); the axis ends; or the next value has nothing to judge, or no figure, and `value` is the last
-    that holds. `low` and `high` hold 68 of 100 repetitions, infinite where such a repetition has no crossing
-    within the axis; None where nothing was repeated.
+    that holds. `low` and `high` hold 68 of 100 repetitions, and `value`; None where nothing was repeated.
+    `within` are the axis's values between which repetitions were searched for this crossing: those of no
+    other span. An end of the interval is infinite where a repetition has none there: it keeps the bound
+    through them, or breaks it.
     """
 
     value: float
     reason: Reason
     low: float | None = None
     high: float | None = None
+    within: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,14 +69,21 @@ def spans(
     places = _crossings(scaled, figure, bound, value[None])[0]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
     found = []
-    for first, after in zip(edges[::2], edges[1::2], strict=True):
+    # Repetitions are searched for a crossing where no other span is: for a start after the span before has
+    # ended, for an end before the next span starts.
+    ended, starting = np.append(0, edges[1::2]), np.append(edges[2::2], x.size)
+    for first, after, left, right in zip(edges[::2], edges[1::2], ended, starting, strict=False):
         start = _edge(x, log, first - 1, first, places, value, asked)
         end = _edge(x, log, after - 1, after, places, value, asked)
         if draws is not None:
             again = _crossings(scaled, figure, bound, draws)
             kept = figure.holds(draws, bound)
-            start = _with_interval(start, log, places, first - 1, again, kept, falls=False)
-            end = _with_interval(end, log, places, after - 1, again, kept, falls=True)
+            start = _with_interval(
+                start, x[left:after], log, again[:, left : after - 1], kept[:, left:after], falls=False
+            )
+            end = _with_interval(
+                end, x[first:right], log, again[:, first : right - 1], kept[:, first:right], falls=True
+            )
         found.append(Span(start, end))
     return tuple(found)
 
@@ -136,19 +146,31 @@ def _edge(
 
 
 def _with_interval(
-    edge: Edge, log: bool, places: Values, gap: int, again: Values, kept: NDArray[np.bool_], *, falls: bool
+    edge: Edge, x: Values, log: bool, again: Values, kept: NDArray[np.bool_], *, falls: bool
 ) -> Edge:
     """Find the same crossing in each repetition: the nearest in the same direction.
 
-    A repetition without one either keeps the bound beyond the axis's end, or never keeps it.
+    A repetition without one keeps the bound all through, or breaks it. The interval is widened to hold the
+    crossing itself, which may be off the middle of its repetitions.
+
+    Parameters
+    ----------
+    x
+        The axis's values in which to search, shape (m,).
+    again, kept
+        Where each repetition crosses the bound, shape (repetitions, m − 1), and where it keeps it,
+        shape (repetitions, m).
     """
     if edge.reason != "crossing":
         return edge
+    place = np.log(edge.value) if log else edge.value
     same = kept[:, :-1] if falls else kept[:, 1:]
-    away = np.where(np.isfinite(again) & same, np.abs(again - places[gap]), np.inf)
+    away = np.where(np.isfinite(again) & same, np.abs(again - place), np.inf)
     nearest = np.argmin(away, axis=1)
     rows = np.arange(len(again))
     beyond = np.where(kept[:, -1] if falls else ~kept[:, 0], np.inf, -np.inf)
-    found = np.where(np.isfinite(away[rows, nearest]), again[rows, nearest], beyond)
-    low, high = interval(np.exp(found) if log else found)
-    return Edge(edge.value, edge.reason, -np.inf if log and low == 0.0 else low, high)
+    low, high = interval(np.where(np.isfinite(away[rows, nearest]), again[rows, nearest], beyond))
+    low, high = (float(np.exp(end)) if log and np.isfinite(end) else end for end in (low, high))
+    return Edge(
+        edge.value, edge.reason, min(low, edge.value), max(high, edge.value), (float(x[0]), float(x[-1]))
+    )

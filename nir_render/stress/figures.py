@@ -183,7 +183,8 @@ def parse_bound(figure: str, text: object) -> Bound:
         An unknown figure; a wrong or missing unit; a share beyond 1; a bound that nothing can keep or miss.
     """
     of = FIGURES[known_figure(figure)]
-    value = parse_quantity(text, of.quantity)
+    # 95 × 0.01 is not the 0.95 that 19 of 20 gives: a decimal is read as the number nearest to it.
+    value = float(f"{parse_quantity(text, of.quantity):.12g}")
     if figure in SHARES and not 0.0 < value <= 1.0:
         raise ValueError(
             f"{text!r} is no share that {of.title} could reach; write one up to 1, such as '95 %'"

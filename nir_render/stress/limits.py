@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nir_render.stress.axes import Axis
 from nir_render.stress.crossings import Span, interval, kept_length, spans
 from nir_render.stress.figures import FIGURES, Bound, Figure, Values
-from nir_render.stress.repeats import Again, repeated_in_corners, repetitions
+from nir_render.stress.repeats import LEAST_OF_ONE, Again, repeated_in_corners, repetitions
 from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, JobSums, pooled, slices
 
 Status = Literal["throughout", "wherever judged", "in part", "nowhere", "nothing to judge"]
@@ -40,7 +40,8 @@ class Verdict:
     `holds` has a word for each value of the axis: True, False, or None where there is nothing to judge. Where
     it holds at all the others, `status` is "wherever judged".
     `spans` are the intervals where it holds, empty for an axis that is no numbers. `agree` is the share of
-    repetitions in which the same values hold; None where nothing was repeated. `worst` is the figure at the
+    repetitions in which the same values hold; None where nothing was repeated, or a single corner too seldom
+    (`LEAST_OF_ONE`): there spans have no intervals either. `worst` is the figure at the
     value where it is farthest from the bound, NaN where it is not defined at some value.
     """
 
@@ -151,8 +152,7 @@ def _limit(axes: Sequence[Axis], index: int, bound: Bound, name: str, sums: JobS
     order = _order(axis, figure, bound, value, judged)
     least = usable[np.lexsort([key[usable] for key in (*order[::-1], unbroken)])[0]]
     chosen = slice_of == least
-    # With one seed nothing was repeated within a corner.
-    drawn = again.of(chosen) if repeated_in_corners(sums.place) else None
+    drawn = again.of(chosen) if repeated_in_corners(sums.place[chosen], LEAST_OF_ONE) else None
     worst = _verdict(axis, figure, bound, own[:, chosen], at[chosen], drawn)
     corner = tuple(int(i) for i in np.insert(combinations[least], index, -1))
     return Limit(name, index, bound, points, whole, worst, corner, usable.size, int(unbroken[usable].sum()))

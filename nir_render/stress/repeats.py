@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 from nir_render.randomness import generator
 from nir_render.stress.figures import Figure, Values
-from nir_render.stress.sums import COUNT, TOTAL
+from nir_render.stress.sums import COUNT, TOTAL, slices
+
+LEAST_OF_ONE = 5
+"""A single corner has no interval below so many jobs: of fewer it would hold far less than it says."""
 
 _MOST, _LEAST = 1000, 100
 _MOST_NUMBERS = 20_000_000
@@ -62,20 +65,28 @@ def repetitions(place: NDArray[np.int64], seed: int) -> tuple[Again, ...]:
 
     Returns
     -------
-    One for each axis.
+    One for each axis; none drawn (`repeated`) for an axis that has a single corner at each value, of too few
+    jobs (`LEAST_OF_ONE`).
     """
     jobs, axes = place.shape
     if repeated_in_corners(place):
         _, corner = np.unique(place, axis=0, return_inverse=True)
-        once = _drawn(corner.reshape(-1), seed, "corners", _number(jobs))
-        return tuple(once for _ in range(axes))
-    return tuple(_drawn(place[:, axis], seed, f"axis {axis}", _number(jobs * axes)) for axis in range(axes))
+        drawn = [_drawn(corner.reshape(-1), seed, "corners", _number(jobs))] * axes
+    else:
+        drawn = [_drawn(place[:, axis], seed, f"axis {axis}", _number(jobs * axes)) for axis in range(axes)]
+    if repeated_in_corners(place, LEAST_OF_ONE):
+        return tuple(drawn)
+    none = np.zeros(jobs, dtype=np.bool_)
+    return tuple(
+        again if len(slices(place, axis)[0]) > 1 else Again(again.weight, none)
+        for axis, again in enumerate(drawn)
+    )
 
 
-def repeated_in_corners(place: NDArray[np.int64]) -> bool:
-    """Tell whether corners have several jobs each; a tenth may have lost theirs."""
+def repeated_in_corners(place: NDArray[np.int64], least: int = 2) -> bool:
+    """Tell whether corners have several jobs each, or at least so many; a tenth may have lost theirs."""
     _, count = np.unique(place, axis=0, return_counts=True)
-    return bool(np.mean(count > 1) >= 0.9) if count.size else False
+    return bool(np.mean(count >= least) >= 0.9) if count.size else False
 
 
 def _number(numbers: int) -> int:

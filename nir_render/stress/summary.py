@@ -8,6 +8,7 @@ import pyarrow as pa
 
 from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
+from nir_render.stress.crossings import Edge
 from nir_render.stress.figures import FIGURES
 from nir_render.stress.limits import Limit, Verdict, limits_of
 from nir_render.stress.sums import COUNT, TOTAL, JobSums, job_sums
@@ -52,22 +53,25 @@ def _limit(axes: Sequence[Axis], limit: Limit) -> dict[str, Any]:
 def _verdict(axis: Axis, verdict: Verdict) -> dict[str, Any]:
     return {
         "holds": verdict.status,
-        "spans": [
-            {
-                "from": span.start.value,
-                "to": span.end.value,
-                "from_68": _pair(span.start.low, span.start.high),
-                "to_68": _pair(span.end.low, span.end.high),
-            }
-            for span in verdict.spans
-        ],
+        "agree": verdict.agree,
+        "spans": [{**_edge("from", span.start), **_edge("to", span.end)} for span in verdict.spans],
         "at": [label for label, kept in zip(axis.labels, verdict.holds, strict=True) if kept],
         "worst": _finite(verdict.worst),
     }
 
 
-def _pair(low: float | None, high: float | None) -> list[float | None] | None:
-    return None if low is None or high is None else [_finite(low), _finite(high)]
+def _edge(key: str, edge: Edge) -> dict[str, Any]:
+    """Return where a span ends, why, and its interval; an open end has no crossing up to `within`."""
+    said: dict[str, Any] = {key: edge.value, f"{key}_reason": edge.reason, f"{key}_68": None}
+    if edge.low is not None and edge.high is not None and edge.within is not None:
+        said[f"{key}_68"] = {
+            "low": _finite(edge.low),
+            "high": _finite(edge.high),
+            "low_open": math.isinf(edge.low),
+            "high_open": math.isinf(edge.high),
+            "within": list(edge.within),
+        }
+    return said
 
 
 def _finite(value: float) -> float | None:

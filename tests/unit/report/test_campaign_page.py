@@ -1,18 +1,23 @@
 """The page of a campaign: what it says of known errors, that it is safe, whole and small."""
 
 import dataclasses
+import math
 import re
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure as MatplotlibFigure
 
+from nir_render.report import campaign_plots
 from nir_render.report.campaign_page import campaign_html
-from nir_render.report.campaign_words import bound_text, figure_text, verdict_text
+from nir_render.report.campaign_words import bound_text, figure_text, tick_text, verdict_text
 from nir_render.report.drawing import ratio_ticks
 from nir_render.stress.axes import Axis
 from nir_render.stress.crossings import Edge, Span
-from nir_render.stress.figures import Bound
+from nir_render.stress.figures import FIGURES, Bound
 from nir_render.stress.limits import Verdict
+from nir_render.stress.repeats import repetitions
+from nir_render.stress.sums import job_sums
 from tests.unit.report.cases import Page
 from tests.unit.stress.synthetic import FOG, LAMP, RANGE, Row, campaign, frame, source, table
 
@@ -44,10 +49,16 @@ def test_the_page_says_where_each_estimator_fails_and_by_how_much() -> None:
         in page.text
     )
     assert "range RMSE ≤ 5 cm" in page.text
-    assert "robust keeps it at 2 of 5 combinations of values; along range up to 2.24 m" in page.text
+    assert (
+        "robust keeps it at 2 of 5 combinations of values; along range up to about 2.24 m (between 1.7 m and 2.8 m)"
+        in page.text
+    )
     assert "paper keeps it at none of 5 combinations of values." in page.text
     # Recall goes from all at 4.8 m to none at 8 m: 95 % after 0.05 of the logarithmic way.
-    assert "paper keeps it at 4 of 5 combinations of values; along range up to 4.92 m" in page.text
+    assert (
+        "paper keeps it at 4 of 5 combinations of values; along range up to about 4.92 m (between 4.8 m and 8 m)"
+        in page.text
+    )
     assert "of 80.0 % of the sources" in page.text  # its range RMSE is not of the ones it missed
     assert "worst 64.0 cm" in page.text
     assert "nir-render run clutter.yaml --seed 1" in page.text
@@ -124,6 +135,29 @@ def test_a_large_campaign_stays_a_small_page() -> None:
     assert len(html) < 700_000
 
 
+@pytest.mark.parametrize("limit_m", [1e-4, 10.0])
+def test_the_limit_lies_within_the_picture(limit_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawings: list[MatplotlibFigure] = []
+    monkeypatch.setattr(campaign_plots, "svg_of", drawings.append)
+    rows = table([RANGE], 1, lambda at, seed, name: [frame(), source(0.03, range_limit_m=limit_m)])
+    sums = job_sums([RANGE], rows)
+    again = repetitions(sums.place, 1)
+    campaign_plots.against_axes(FIGURES["range_rmse"], [RANGE], [0], sums, again, 0.05)
+    shown = [panel.get_ylim() for panel in drawings[0].axes]
+    assert all(low < limit_m < high for low, high in shown)
+    assert len(shown) == 2
+
+
+def test_the_ratio_to_the_limit_is_that_of_the_two_figures_beside_it() -> None:
+    """Errors of 10 and 30 cm with limits of 1 and 10 cm: RMS 22.4 cm is 3.15 × 7.11 cm; the pull is 7.38."""
+    rows = table(
+        [LAMP], 1,
+        lambda at, seed, name: [frame(), source(0.1), source(0.3, range_limit_m=0.1)],
+    )  # fmt: skip
+    text = Page(campaign_html(campaign([LAMP], {"range_rmse": "5 cm"}), rows, {})).text
+    assert "an RMS error of 22.4 cm (bias +20.0 cm), 3.15 × the physical limit of 7.11 cm." in text
+
+
 UP_TO = Span(Edge(1.0, "end"), Edge(4.3, "crossing", 4.1, 4.52))
 
 
@@ -133,6 +167,10 @@ UP_TO = Span(Edge(1.0, "end"), Edge(4.3, "crossing", 4.1, 4.52))
         (Verdict("in part", (), (UP_TO,), 0.5, 1.0), "up to 4.3 m (4.1–4.52)"),
         (Verdict("in part", (), (Span(Edge(1.0, "end"), Edge(4.3, "crossing", 4.1, float("inf"))),), 1.0, 1.0), "up to 4.3 m (4.1–beyond 8)"),
         (Verdict("in part", (), (Span(Edge(2.0, "crossing", -float("inf"), 2.5), Edge(8.0, "end")),), 1.0, 1.0), "from 2 m (below 1–2.5) up"),
+        (Verdict("in part", (), (Span(Edge(2.0, "crossing", 1.8, 2.5), Edge(4.0, "crossing", -float("inf"), float("inf"), (2.8, 4.8))),), 1.0, 1.0), "from 2 m (1.8–2.5) to 4 m (below 2.8–beyond 4.8)"),
+        (Verdict("in part", (), (Span(Edge(1.0, "end"), Edge(1.868, "crossing", 1.8681, 1.872)),), 1.0, 1.0), "up to about 1.87 m (between 1.7 m and 2.8 m)"),
+        (Verdict("in part", (), (Span(Edge(1.9, "crossing"), Edge(8.0, "end")),), None, 1.0), "from about 1.9 m (between 1.7 m and 2.8 m) up"),
+        (Verdict("in part", (), (Span(Edge(1.0, "end"), Edge(2.8, "crossing")),), None, 1.0), "up to 2.8 m"),
         (Verdict("in part", (), (UP_TO, Span(Edge(4.8, "not defined"), Edge(4.8, "nothing there"))), 1.0, 1.0), "up to 4.3 m (4.1–4.52) and at 4.8 m alone"),
         (Verdict("in part", (), (Span(Edge(1.0, "end"), Edge(2.8, "not defined")),), None, 1.0), "up to 2.8 m (no such figure beyond)"),
         (Verdict("nowhere", (), (), 0.7, 1.0), "nowhere (narrowly: 70 of 100 repetitions agree)"),
@@ -158,6 +196,29 @@ def test_figures_and_bounds_in_words() -> None:
     assert figure_text("range_bias", -0.4) == "−40.0 cm"
     assert figure_text("range_rmse_share", 1.5) == "150 %"
     assert figure_text("range_rmse", float("nan")) == "–"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "bound", "text"),
+    [
+        ("range_rmse_share", 0.000512, None, "0.0512 %"), ("range_rmse_share", 1.4961, None, "150 %"),
+        ("range_rmse_share", 0.0202, 0.02, "2.02 %"), ("range_rmse_share", 0.020003, 0.02, "2.0003 %"),
+        ("range_rmse_share", 0.019996, 0.02, "2.00 %"), ("false_alarms", 0.1042, 0.1, "0.104"),
+        ("false_alarms", 0.1042, None, "0.1"), ("false_alarms", 120.0, None, "120"), ("false_alarms", 0.0, 0.0, "0"),
+        ("recall", 0.9499, 0.95, "94.99 %"), ("recall", 0.95, 0.95, "95.0 %"), ("recall", 0.9999, None, "99.9 %"),
+        ("range_bias", -0.05001, 0.05, "−5.001 cm"), ("range_rmse", 0.0500001, 0.05, "5.00001 cm"),
+        ("bearing_rms", math.radians(0.10004), math.radians(0.1), "0.10004°"), ("range_pull", 154.6, None, "155"),
+    ],
+)  # fmt: skip
+def test_a_figure_in_words_tells_its_verdict(name: str, value: float, bound: float | None, text: str) -> None:
+    assert figure_text(name, value, bound) == text
+
+
+def test_ticks_are_short() -> None:
+    assert tick_text("bearing_rms", math.radians(0.1)) == "0.1°"
+    assert tick_text("range_rmse_share", 0.02) == "2 %"
+    assert tick_text("range_pull", 100.0) == "100"
+    assert tick_text("range_rmse", 0.1) == "10 cm"
 
 
 def test_round_numbers_of_a_log_scale() -> None:

@@ -131,7 +131,23 @@ def test_figures_agree_with_evaluate() -> None:
 def test_bounds_are_read_with_their_units(name: str, text: object, value: float) -> None:
     bound = parse_bound(name, text)
     assert (bound.figure, bound.text) == (name, str(text))
-    assert bound.value == pytest.approx(value, rel=1e-12)
+    assert bound.value == pytest.approx(value, rel=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("kept", "of", "text"),
+    [(19, 20, "95 %"), (57, 60, "95 %"), (7, 20, "35 %"), (41, 100, "41 %"), (47, 100, "47 %"), (47, 100, 0.47)],
+)  # fmt: skip
+def test_a_share_at_its_bound_keeps_it_and_one_less_does_not(kept: int, of: int, text: object) -> None:
+    figure, bound = FIGURES["recall"], parse_bound("recall", text)
+    assert figure.holds(figure.value(kept, of), bound.value)
+    assert not figure.holds(figure.value(kept - 1, of), bound.value)
+
+
+def test_every_whole_per_cent_is_kept_at_exactly_that_share() -> None:
+    figure = FIGURES["recall"]
+    for number in range(1, 101):
+        assert figure.holds(figure.value(number, 100), parse_bound("recall", f"{number} %").value)
 
 
 @pytest.mark.parametrize(
