@@ -1,7 +1,9 @@
 """What all models of a scene file share: closed fields, aliases without unit suffix, presets."""
 
+import copy
 import difflib
 from collections.abc import Mapping
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, get_args
@@ -178,8 +180,14 @@ def _load_preset(name: Any, kind: str, folder: Path, trail: tuple[str, ...]) -> 
         near = difflib.get_close_matches(str(name), known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
         raise ValueError(f"there is no preset {name!r} in {kind}; {hint}")
+    return expand_preset(copy.deepcopy(_own_preset(kind, name)), kind, folder, (*trail, name))
+
+
+@lru_cache(maxsize=256)
+def _own_preset(kind: str, name: str) -> Any:
+    """Return a preset of `data/` as it is written; scenes are changed and built again by the thousand."""
     text = resources.files("nir_render").joinpath("data", kind, f"{name}.yaml").read_text(encoding="utf-8")
-    return expand_preset(parse_yaml(text, f"preset {kind}/{name}"), kind, folder, (*trail, name))
+    return parse_yaml(text, f"preset {kind}/{name}")
 
 
 def merge(base: Any, change: Any) -> Any:

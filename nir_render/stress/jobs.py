@@ -81,7 +81,7 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
         except InputError as error:
             problems += [f"{campaign.path}: at {_place(campaign, values)}: {one}" for one in error.problems]
             continue
-        of_scene = hashlib.sha256(scene.resolved_yaml().encode()).hexdigest()
+        of_scene = hashlib.sha256(scene.document.model_dump_json().encode()).hexdigest()
         if of_scene in known:
             same = _place(campaign, known[of_scene])
             problems.append(f"{campaign.path}: at {_place(campaign, values)}: the same scene as at {same}")
