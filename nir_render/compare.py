@@ -124,6 +124,8 @@ class Verdict:
     tile_drift, frame_drift
         The relative drifts of a tile (median over those that are judged) and of the frame that would have
         been found with a chance of 95 %, whatever the other tests say. Infinite where none would.
+    judged_tiles, tiles
+        How many tiles of 8 pixels are judged, and how many there are.
     """
 
     same: bool
@@ -133,6 +135,8 @@ class Verdict:
     frame_change: float
     tile_drift: float
     frame_drift: float
+    judged_tiles: int
+    tiles: int
 
 
 def compare_parts(
@@ -199,9 +203,11 @@ def judge(images: Sequence[Parts], significance: float) -> list[Verdict]:
     """
     if not images:
         return []
-    corrected = holm(np.concatenate([image.p for image in images]))
+    judged = np.concatenate([image.judged for image in images])
+    corrected = np.ones(judged.size)
+    corrected[judged] = holm(np.concatenate([image.p for image in images])[judged])
     # What one test must reach while all others are still there: Holm's first step.
-    count = max(sum(int(image.judged.sum()) for image in images), 1)
+    count = max(int(judged.sum()), 1)
     begin = np.cumsum([0, *(image.p.size for image in images)])
     return [
         _verdict(image, corrected[begin[i] : begin[i + 1]], significance, 0.5 * significance / count)
@@ -225,6 +231,8 @@ def _verdict(image: Parts, corrected: Array, significance: float, tail: float) -
         frame_change=_change(image, -1),
         tile_drift=float(np.median(drift[tiles])) if tiles.size else np.inf,
         frame_drift=float(drift[-1]),
+        judged_tiles=tiles.size,
+        tiles=image.tiles,
     )
 
 

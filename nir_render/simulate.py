@@ -7,7 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
-from nir_render.camera.exposure_control import ExposureState, first_state, next_state, own_setting
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.exposure_control import ExposureState, Setting, first_state, next_state, own_setting
 from nir_render.camera.sensor import read_out
 from nir_render.camera.shutter import mid_exposure_s, row_delay_s
 from nir_render.errors import InputError
@@ -15,6 +18,7 @@ from nir_render.evaluate.truth import SourceTruth, truth_of
 from nir_render.expected import Expected, Rates, exposed, rates
 from nir_render.randomness import FrameKey
 from nir_render.render_noise import RenderNoise, render_noise
+from nir_render.scene.devices import Camera
 from nir_render.scene.exposure import MOST_GAIN, AutoExposure
 from nir_render.scene.load import Scene
 from nir_render.transport.cache import LightCache
@@ -123,6 +127,36 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
                 states[name] = next_state(states[name], control, camera, frame)
 
 
+def frame_of(
+    electrons: NDArray[np.float64] | NDArray[np.float32],
+    camera: Camera,
+    setting: Setting,
+    time_s: float,
+    key: FrameKey,
+) -> RawFrame:
+    """Return the raw frame of expected electrons, shape (rows, columns); row 0 begins at `time_s`.
+
+    Raises
+    ------
+    InputError
+        A gain outside 1 to 64.
+    """
+    if not 1.0 <= setting.gain <= MOST_GAIN:
+        raise InputError(
+            f"gain is {setting.gain!r}; wanted a factor from 1 to {MOST_GAIN:g} on the system gain"
+        )
+    return RawFrame(
+        camera=key.camera,
+        index=key.frame,
+        time_s=time_s,
+        exposure_s=setting.exposure_s,
+        data_dn=read_out(electrons, camera, setting.exposure_s, key, setting.gain),
+        black_level_dn=camera.sensor.black_level_dn,
+        line_time_s=row_delay_s(camera),
+        gain=setting.gain,
+    )
+
+
 @lru_cache(maxsize=_LIGHTS_KEPT)
 def _last_rates(light: Light, scene: Scene) -> Rates:
     """Return the rates of a light, and keep them for its next exposure."""
@@ -154,16 +188,4 @@ def _settled(of_light: Rates, control: AutoExposure, time_s: float, seed: int) -
 
 
 def _frame(mean: Expected, gain: float, key: FrameKey) -> RawFrame:
-    if not 1.0 <= gain <= MOST_GAIN:
-        raise InputError(f"gain is {gain!r}; wanted a factor from 1 to {MOST_GAIN:g} on the system gain")
-    camera = mean.rates.camera
-    return RawFrame(
-        camera=key.camera,
-        index=key.frame,
-        time_s=mean.time_s,
-        exposure_s=mean.exposure_s,
-        data_dn=read_out(mean.electrons, camera, mean.exposure_s, key, gain),
-        black_level_dn=camera.sensor.black_level_dn,
-        line_time_s=row_delay_s(camera),
-        gain=gain,
-    )
+    return frame_of(mean.electrons, mean.rates.camera, Setting(mean.exposure_s, gain), mean.time_s, key)

@@ -5,7 +5,7 @@ are the same but where rounding falls on the other side.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from nir_render.regress.findings import Finding, Pair, percent
 from nir_render.regress.making import Setting, electrons_of, frame_of
 from nir_render.regress.reference import ReferenceLight, ReferenceShot, leaves
 from nir_render.scene.load import Scene
-from perception import Calibration, calibration_document
+from perception import Calibration, RawFrame, calibration_document
 
 _FLOAT32 = 2.0**-24
 # Of what is computed in float64 by way of Fourier transforms: a share of the image's brightest pixel.
@@ -23,6 +23,7 @@ _FLOAT64 = 1e-12
 # a variate of mean μ by that share of μ; so many electrons, or counts, fall on another whole number.
 _FLIPS = 8.0 * _FLOAT32
 _MARGIN = 6.0  # standard deviations of the number of flips
+_FIELD = 1e-12  # of times, which are a few float64 operations
 _CALIBRATION = 1e-6
 _QUATERNION = 1e-9
 _OF_ROUNDED_FRAMES = 1e-4  # the paper's range constant is fitted to counts, of which one may round otherwise
@@ -65,32 +66,36 @@ def compare_electrons(
 def compare_frame(
     scene: Scene, setting: Setting, shot: ReferenceShot, seed: int, label: str, *, exact: bool
 ) -> Finding:
-    """Compare the raw frame of the reference's electrons, with the reference's noise, with its frame."""
+    """Compare the raw frame of the reference's electrons, with the reference's noise, with its frame.
+
+    Counts, and what goes with them: exposure, gain, black level, times.
+    """
     what = f"{label}raw frame"
     _, camera = scene.camera(setting.camera)
     before = shot.frame.data_dn
     if before.shape != (camera.sensor.rows, camera.sensor.columns):
         return Finding("camera", what, "fail", "the sensor has another size")
-    after = frame_of(camera, setting, shot.electrons, seed).data_dn
-    difference = after.astype(np.int64) - before
+    frame = frame_of(camera, setting, shot.electrons, seed)
+    difference = frame.data_dn.astype(np.int64) - before
     flips = int(np.count_nonzero(difference))
-    same_bits = flips == 0
+    others = _other_fields(shot.frame, frame)
+    same_bits = flips == 0 and not others
     gain = camera.sensor.system_gain_dn_per_e * setting.gain
     step_dn = math.ceil(gain) + 1
     mean = float(np.sum(1.0 + shot.electrons * (1.0 + gain)))
     allowed = math.ceil(_FLIPS * mean + _MARGIN * math.sqrt(_FLIPS * mean)) + 2
     largest_dn = int(np.abs(difference).max())
-    fails = flips > allowed or largest_dn > step_dn or (exact and not same_bits)
-    seen = "equal"
+    fails = flips > allowed or largest_dn > step_dn or max(others.values(), default=0.0) > _FIELD
+    seen = [f"{name} {_short(getattr(shot.frame, name))} → {_short(getattr(frame, name))}" for name in others]
     if flips:
-        seen = f"{flips} of {before.size} pixels differ, by {largest_dn} DN at most"
-        seen += f", on average {difference.mean():+.3g} DN".replace("-", "−")
+        counts = f"{flips} of {before.size} pixels differ, by {largest_dn} DN at most"
+        seen.append(counts + f", on average {difference.mean():+.3g} DN".replace("-", "−"))
     return Finding(
         "camera",
         what,
-        "fail" if fails else "pass",
-        seen,
-        f"{allowed + 1} pixels, or one by {step_dn + 1} DN",
+        "fail" if fails or (exact and not same_bits) else "pass",
+        "; ".join(seen) or "equal",
+        f"{allowed + 1} pixels, or one by {step_dn + 1} DN; {_FIELD:.0e} of exposure, gain and times",
         same_bits=same_bits,
     )
 
@@ -125,6 +130,16 @@ def compare_calibration(scene: Scene, name: str, before: Calibration, *, exact: 
         f"{_CALIBRATION:.0e} of an entry",
         same_bits=same_bits,
     )
+
+
+def _other_fields(before: RawFrame, after: RawFrame) -> dict[str, float]:
+    """Return the relative difference of each field but the counts that is not the same."""
+    pairs = {
+        field.name: (getattr(before, field.name), getattr(after, field.name))
+        for field in fields(RawFrame)
+        if field.name != "data_dn"
+    }
+    return {name: _difference(one, other) for name, (one, other) in pairs.items() if one != other}
 
 
 def _entries(calibration: Calibration) -> dict[str, object]:
@@ -172,5 +187,5 @@ def _difference(one: object, other: object) -> float:
         return 0.0
     if not (isinstance(one, int | float) and isinstance(other, int | float)):
         return math.inf
-    # Angles and places may be 0.
+    # Angles, places and times may be 0.
     return abs(other - one) / max(abs(one), abs(other), 1e-6)

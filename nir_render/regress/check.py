@@ -15,6 +15,7 @@ from nir_render.regress.perception_stage import compare_detections
 from nir_render.regress.reference import Reference, changes_of, document_of, made_by
 from nir_render.regress.reference_files import names_in, read_reference
 from nir_render.regress.suite import references_of, scenes_of
+from nir_render.regress.twice import compare_twice
 from nir_render.scene.load import Scene
 from nir_render.simulate import render
 from nir_render.transport.cache import LightCache
@@ -215,7 +216,12 @@ def _after_light(case: _Case) -> tuple[list[Finding], list[Pair]]:
         for camera, calibration in reference.calibrations.items()
         if camera in scene.all_cameras()
     ]
-    pairs = []
+    findings += [
+        Finding("camera", f"{name} automatic exposure", "skipped", "not judged: exposed as the reference was")
+        for name in scene.cameras()
+        if scene.camera(name)[1].auto_exposure is not None
+    ]
+    pairs, taken = [], []
     for shot in reference.shots:
         setting = case.settings.get((shot.frame.camera, shot.frame.index))
         if setting is None:
@@ -225,13 +231,15 @@ def _after_light(case: _Case) -> tuple[list[Finding], list[Pair]]:
         finding, pair = compare_electrons(scene, setting, shot, light, label, exact=exact)
         frame = compare_frame(scene, setting, shot, reference.seed, label, exact=exact)
         findings.extend([finding, frame])
-        pairs += [pair] if pair is not None else []
+        if pair is not None:
+            pairs.append(pair)
+            taken.append((setting, shot))
     found = detections_of([shot.frame for shot in reference.shots], reference.calibrations)
     findings.extend(
         compare_detections(estimator, before, found.get(estimator, ()), exact=exact)
         for estimator, before in reference.detections.items()
     )
-    return findings, pairs
+    return [*findings, compare_twice(scene, reference, taken, found)], pairs
 
 
 def _check_stock_renders(scene: Scene) -> None:

@@ -90,7 +90,12 @@ def update(
             "--page", metavar="FILE", help="Where old, new and difference are shown; in outputs by default."
         ),
     ] = None,
-    renders: Renders = 16,
+    renders: Annotated[
+        int | None,
+        typer.Option(
+            "--renders", help="Renders of each new reference, 8 or more; as many as before by default."
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Make references anew where something has drifted or a scene has changed; show old and new."""

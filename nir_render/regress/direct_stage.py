@@ -25,20 +25,19 @@ def compare_tables(before: Light, after: Light, label: str, *, exact: bool) -> F
         name = " in ".join(filter(None, key))
         if key not in old or key not in new:
             table, row = (before.direct, old[key]) if key in old else (after.direct, new[key])
-            excess = float(table.visible_fraction[row]) / _rays_share(table, row)
+            excess = int(np.count_nonzero(table.seen[row])) / _allowed(table, row)
             said = f"{name} is {'gone' if key in old else 'new'}"
         else:
             excess, said = _excess(before.direct, old[key], after.direct, new[key], name)
         if excess > worst:
             worst, seen = excess, said
-    rays = max((_rays_share(before.direct, row) for row in old.values()), default=0.0)
     same_bits = _same_bits(before.direct, after.direct)
     return Finding(
         "transport",
         what,
         "fail" if worst > 1.0 or (exact and not same_bits) else "pass",
         seen,
-        f"{_ROUNDING:.0e}, at edges of discs {percent(rays)}",
+        _detectable(before.direct),
         same_bits=same_bits,
     )
 
@@ -53,8 +52,29 @@ def allowed_flips(angular_radius_rad: float, rays: int) -> int:
     return 2 + int(np.ceil(mean + 5.0 * np.sqrt(mean)))
 
 
-def _rays_share(table: DirectTable, row: int) -> float:
-    return allowed_flips(float(table.angular_radius_rad[row]), table.visibility_rays) / table.visibility_rays
+def _allowed(table: DirectTable, row: int) -> int:
+    return allowed_flips(float(table.angular_radius_rad[row]), table.visibility_rays)
+
+
+def _of_irradiance(table: DirectTable, row: int) -> float:
+    """Return the share of a row's irradiance that a ray over its disc may bring.
+
+    It depends on where the ray leaves; for smooth patterns it is below twice the mean.
+    """
+    return 2.0 / (
+        table.visibility_rays * max(float(table.visible_fraction[row]), 1.0 / table.visibility_rays)
+    )
+
+
+def _detectable(table: DirectTable) -> str:
+    rows = range(len(table.group))
+    if not rows:
+        return f"{_ROUNDING:.0e}"
+    rays = max(_allowed(table, row) for row in rows)
+    share = max(_of_irradiance(table, row) for row in rows)
+    return (
+        f"{_ROUNDING:.0e}, or {rays + 1} rays of a disc; its irradiance: {percent(share)} a ray that differs"
+    )
 
 
 def _rows(light: Light) -> dict[Key, int]:
@@ -67,12 +87,16 @@ def _rows(light: Light) -> dict[Key, int]:
 
 def _excess(old: DirectTable, i: int, new: DirectTable, j: int, name: str) -> tuple[float, str]:
     """Return the largest difference of two rows in units of what is allowed, and say it."""
-    rays = _rays_share(old, i)
+    # Both look along the same rays: those that end elsewhere now are known one by one.
+    alike = old.visibility_rays == new.visibility_rays
+    rays = np.count_nonzero(old.seen[i] != new.seen[j]) if alike else np.inf
     fractions = float(old.visible_fraction[i]), float(new.visible_fraction[j])
     before, after = old.irradiance_per_w[i], new.irradiance_per_w[j]
-    cut = 0.0 < min(fractions) < 1.0 or fractions[0] != fractions[1]
-    # What a ray brings depends on where it leaves; for smooth patterns it is below twice the mean.
-    allowed = _ROUNDING + (2.0 * rays / max(fractions[0], rays) if cut else 0.0)
+    allowed = _ROUNDING + rays * _of_irradiance(old, i)
+    # Of the larger one: a ray or two may be the first that arrive.
+    changed = float(
+        np.max(np.abs(after - before) / np.maximum(np.maximum(before, after), 1e-300), initial=0.0)
+    )
     moved_rad = float(np.linalg.norm(old.direction[i] - new.direction[j]))
     dimmed = float(after.sum() / before.sum() - 1.0) if before.sum() else np.inf
     sizes_rad = old.angular_radius_rad[i], new.angular_radius_rad[j]
@@ -81,8 +105,11 @@ def _excess(old: DirectTable, i: int, new: DirectTable, j: int, name: str) -> tu
         (moved_rad / _ROUNDING, f"moved by {moved_rad:.2g} rad"),
         (_relative(*distances_m) / _ROUNDING, "from {:.6g} to {:.6g} m".format(*distances_m)),
         (_relative(*sizes_rad) / _ROUNDING, "from {:.6g} to {:.6g} rad in radius".format(*sizes_rad)),
-        (abs(fractions[1] - fractions[0]) / rays, "seen of it {:.4f}, now {:.4f}".format(*fractions)),
-        (_relative(before, after) / allowed, f"irradiance {percent(dimmed, signed=True)}"),
+        (
+            rays / _allowed(old, i),
+            f"{rays:.0f} rays differ, seen of it {fractions[0]:.4f}, now {fractions[1]:.4f}",
+        ),
+        (changed / allowed, f"irradiance {percent(dimmed, signed=True)}"),
     ]
     worst, said = max(found)
     return worst, f"{name}: {said}"

@@ -81,16 +81,16 @@ def settled(pending: Pending, verdict: Verdict, *, same_bits: bool | None, must_
         word = "fail"
     if must_be_same and not same_bits:
         word = "fail"
-        seen = f"other bits than by the same versions on the same processor; {seen}"
+        seen = f"other bits than by the same versions; {seen}"
     tile = verdict.tile_drift if np.isfinite(verdict.tile_drift) else None
     frame = verdict.frame_drift if np.isfinite(verdict.frame_drift) else None
-    of_tile = "" if pending.along_edges else f"tile {_drift(tile)}, "
+    of_tile = f"tile {_drift(tile)} ({verdict.judged_tiles} of {verdict.tiles}), "
     return Finding(
         "transport",
         pending.what,
         "pass" if word == "pass" else "fail",
         seen,
-        f"{of_tile}{'all' if pending.along_edges else 'frame'} {_drift(frame)}",
+        f"all {_drift(frame)}" if pending.along_edges else f"{of_tile}frame {_drift(frame)}",
         same_bits=same_bits,
         tile_drift=None if pending.along_edges else tile,
         frame_drift=frame,

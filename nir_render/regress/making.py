@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.exposure_control import own_setting
-from nir_render.camera.sensor import read_out
-from nir_render.camera.shutter import mid_exposure_s, row_delay_s
+from nir_render.camera import exposure_control
+from nir_render.camera.shutter import mid_exposure_s
 from nir_render.compare import TILE_PX, sums
 from nir_render.errors import InputError
 from nir_render.expected import exposed, rates
@@ -23,6 +22,7 @@ from nir_render.regress.reference import (
 )
 from nir_render.scene.devices import Camera
 from nir_render.scene.load import Scene
+from nir_render.simulate import frame_of as taken
 from nir_render.simulate import render, simulate
 from nir_render.transport.light import Light
 from nir_render.transport.light_file import light_hash
@@ -58,7 +58,7 @@ def settings_of(scene: Scene, known: Mapping[tuple[str, int], RawFrame] | None =
     for index, time_s in enumerate(scene.document.frame_times_s()):
         for name in scene.cameras():
             _, camera = scene.camera(name)
-            own = own_setting(camera, index)
+            own = exposure_control.own_setting(camera, index)
             exposure_s, gain = own.exposure_s, own.gain
             chosen = None if camera.auto_exposure is None or known is None else known.get((name, index))
             if chosen is not None:
@@ -130,16 +130,8 @@ def electrons_of(scene: Scene, setting: Setting, light: Light) -> NDArray[np.flo
 def frame_of(camera: Camera, setting: Setting, electrons: NDArray[np.float32], seed: int) -> RawFrame:
     """Return the raw frame of expected electrons, its noise keyed as that of a run."""
     key = FrameKey(seed, "read_out", setting.camera, setting.index)
-    return RawFrame(
-        camera=setting.camera,
-        index=setting.index,
-        time_s=setting.time_s,
-        exposure_s=setting.exposure_s,
-        data_dn=read_out(electrons, camera, setting.exposure_s, key, setting.gain),
-        black_level_dn=camera.sensor.black_level_dn,
-        line_time_s=row_delay_s(camera),
-        gain=setting.gain,
-    )
+    chosen = exposure_control.Setting(setting.exposure_s, setting.gain)
+    return taken(electrons, camera, chosen, setting.time_s, key)
 
 
 def detections_of(

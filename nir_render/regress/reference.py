@@ -141,9 +141,24 @@ def made_by() -> dict[str, dict[str, str]]:
     transport = {
         name: value.removeprefix(f"{name} ") for name, value in zip(_OF_TRANSPORT, light, strict=True)
     }
-    other = {"python": platform.python_version(), "processor": transport["processor"]}
+    # NumPy computes with the widest instructions that a processor has and its user allows.
+    instructions = _instructions()
+    transport["instructions"] = instructions
+    other = {
+        "python": platform.python_version(),
+        "processor": transport["processor"],
+        "instructions": instructions,
+    }
     other |= {name: _version(name) for name in _PACKAGES}
     return {"transport": transport, "other": other | {"code": _code_hash()}}
+
+
+@cache
+def _instructions() -> str:
+    """Return how many of its sets of instructions NumPy uses, and a hash of which."""
+    features: Mapping[str, bool] = np._core._multiarray_umath.__cpu_features__  # type: ignore[attr-defined]
+    used = sorted(name for name, enabled in features.items() if enabled)
+    return f"{len(used)} sets, {hashlib.sha256(' '.join(used).encode()).hexdigest()[:12]}"
 
 
 def _version(package: str) -> str:

@@ -14,11 +14,17 @@ def scenes_of(suite: str | Path) -> dict[str, Scene]:
     Raises
     ------
     InputError
-        There is no such folder, no scene in it, a broken one, or one whose samples follow the noise.
+        There is no such folder, no scene in it, one that ends in .yml, a broken one, or one whose samples
+        follow the noise.
     """
     folder = Path(suite)
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give a folder of scene files (*.yaml)")
+    unlike = sorted(folder.glob("*.yml"))
+    if unlike:
+        raise InputError(
+            *(f"{file}: scenes of a suite end in .yaml; rename it, or move it away" for file in unlike)
+        )
     files = sorted(folder.glob("*.yaml"))
     if not files:
         raise InputError(f"{folder}: holds no scene file (*.yaml); put the scenes of the suite there")

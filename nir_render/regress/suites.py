@@ -79,7 +79,7 @@ def create(
             f"{folder}: is there already and is not overwritten; 'nir-render regress update {suite} "
             "--reason '...'' makes references anew where something changed"
         )
-    made = _made(scenes, renders, dict.fromkeys(scenes, ()), "created", progress)
+    made = _made(scenes, dict.fromkeys(scenes, renders), dict.fromkeys(scenes, ()), "created", progress)
     write_references(folder, made, [], lambda: None)
     return tuple(scenes)
 
@@ -91,7 +91,7 @@ def update(
     *,
     every: bool = False,
     page: str | Path | None = None,
-    renders: int = RENDERS,
+    renders: int | None = None,
     progress: Progress | None = None,
 ) -> Update:
     """Make references anew where a check finds a drift, or the scene has changed; the others are kept.
@@ -106,6 +106,8 @@ def update(
         Make all anew.
     page
         Where a page that shows old, new and their difference goes, if anywhere.
+    renders
+        Renders that each light is the mean of; without, as many as it was before.
 
     Raises
     ------
@@ -122,7 +124,9 @@ def update(
     stands = {one.name for one in before.scenes if one.holds and not one.changes and not every}
     anew = {name: scene for name, scene in scenes.items() if name not in stands}
     history = {name: old[name].history if name in old else () for name in anew}
-    made = _made(anew, renders, history, reason.strip(), progress)
+    before_count = {name: old[name].renders if name in old else RENDERS for name in anew}
+    counts = before_count if renders is None else dict.fromkeys(anew, renders)
+    made = _made(anew, counts, history, reason.strip(), progress)
     done = Update(
         reason.strip(),
         tuple(made),
@@ -146,14 +150,16 @@ def _write_page(done: Update, page: str | Path | None) -> None:
 
 def _made(
     scenes: Mapping[str, Scene],
-    renders: int,
+    renders: Mapping[str, int],
     history: Mapping[str, tuple[Mapping[str, str], ...]],
     reason: str,
     progress: Progress | None,
 ) -> dict[str, Reference]:
     settings = {name: settings_of(scene) for name, scene in scenes.items()}
-    lights = sum(len(lights_of(scene, settings[name])[0]) for name, scene in scenes.items())
-    total, done = lights * (renders + 1), 0
+    total = sum(
+        len(lights_of(scene, settings[name])[0]) * (renders[name] + 1) for name, scene in scenes.items()
+    )
+    done = 0
 
     def step() -> None:
         nonlocal done
@@ -163,6 +169,6 @@ def _made(
 
     entry = {"time": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "reason": reason}
     return {
-        name: make_reference(scene, settings[name], renders, (*history[name], entry), step)
+        name: make_reference(scene, settings[name], renders[name], (*history[name], entry), step)
         for name, scene in scenes.items()
     }

@@ -220,3 +220,14 @@ def test_images_of_a_family_share_the_rate() -> None:
     one, many = judge([alone], 1e-3)[0], judge([alone, *others], 1e-3)[0]
     assert many.smallest_p > 20 * one.smallest_p
     assert many.frame_drift > 1.1 * one.frame_drift
+
+
+def test_what_is_not_judged_takes_no_part_in_the_correction() -> None:
+    """A dark image beside it costs a drift nothing."""
+    drifted = compare_parts(_smooth(-1, 1024), _smooth(3, 64, 1.0 + 4.6 / np.sqrt(64 * 48 * 64)))
+    none = np.zeros((480, 640))
+    dark = compare_parts(Estimate(none, none, 1024), Estimate(none, none, 64))
+    alone, beside = judge([drifted], 1e-3)[0], judge([drifted, dark], 1e-3)[0]
+    assert beside.smallest_p == alone.smallest_p
+    assert (alone.judged_tiles, alone.tiles) == (48, 48)
+    assert judge([dark], 1e-3)[0].judged_tiles == 0

@@ -101,6 +101,11 @@ def test_suites_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no scene file"):
         scenes_of(tmp_path / "empty")
+    cases.suite(tmp_path / "short", small=cases.SCENE).joinpath("small.yaml").rename(
+        tmp_path / "short" / "a.yml"
+    )
+    with pytest.raises(InputError, match=r"a\.yml: scenes of a suite end in \.yaml; rename it"):
+        scenes_of(tmp_path / "short")
     noisy = cases.SCENE.replace("samples: 16, ", "")
     with pytest.raises(InputError, match=r"small\.yaml: render: the scenes of a suite fix their samples"):
         scenes_of(cases.suite(tmp_path / "noisy", small=noisy))
