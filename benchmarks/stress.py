@@ -2,8 +2,8 @@
 
     python benchmarks/stress.py [CAMPAIGN] [--workers N]
 
-prints one JSON object: seconds of `nir-render stress` (start, check, page and all), and of the check by job, of
-scenes/campaigns/ranging_clutter.yaml unless another is named. Each is measured once; nothing is kept.
+prints one JSON object: seconds of `nir-render stress` (start, check, page and all), and of the check by job.
+It is scenes/campaigns/ranging_clutter.yaml unless another is named. Each is measured once; nothing is kept.
 """
 
 import argparse
