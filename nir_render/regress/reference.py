@@ -141,14 +141,11 @@ def made_by() -> dict[str, dict[str, str]]:
     transport = {
         name: value.removeprefix(f"{name} ") for name, value in zip(_OF_TRANSPORT, light, strict=True)
     }
-    # NumPy computes with the widest instructions that a processor has and its user allows.
-    instructions = _instructions()
-    transport["instructions"] = instructions
-    other = {
-        "python": platform.python_version(),
-        "processor": transport["processor"],
-        "instructions": instructions,
-    }
+    # NumPy computes with the widest instructions that a processor has and its user allows; sines and
+    # arctangents come from the C library.
+    machine = {"instructions": _instructions(), "libc": " ".join(platform.libc_ver())}
+    transport |= machine
+    other = {"python": platform.python_version(), "processor": transport["processor"], **machine}
     other |= {name: _version(name) for name in _PACKAGES}
     return {"transport": transport, "other": other | {"code": _code_hash()}}
 
