@@ -1,5 +1,6 @@
 """A suite against its references: each stage of each scene, from the reference's own input."""
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,14 +107,7 @@ def check_scenes(
     """Hold scenes against references of the same names; `rendered` makes the light. Errors as `check`."""
     now = made_by()
     total = sum(len(reference.shots) for reference in references.values())
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
+    step = steps(progress, total)
     if progress is not None:
         progress(0, total)
     cases = [_case(name, scenes[name], references[name], seed, now) for name in scenes]
@@ -133,6 +127,18 @@ def check_scenes(
         change for reference in references.values() for change in changes_of(reference.made_by, now)
     )
     return Check(suite, FALSE_ALARM_RATE, tuple(versions), tuple(results))
+
+
+def steps(progress: Progress | None, total: int) -> Callable[[], None]:
+    """Return what counts one more of `total` done, and tells `progress`."""
+    counted = itertools.count(1)
+
+    def step() -> None:
+        done = next(counted)
+        if progress is not None:
+            progress(done, total)
+
+    return step
 
 
 def _references(suite: Path, folder: Path, scenes: Mapping[str, Scene]) -> dict[str, Reference]:

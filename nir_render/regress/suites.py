@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nir_render import run_folder
 from nir_render.errors import InputError
-from nir_render.regress.check import Progress, check_scenes
+from nir_render.regress.check import Progress, check_scenes, steps
 from nir_render.regress.findings import Check
 from nir_render.regress.making import lights_of, make_reference, settings_of
 from nir_render.regress.reference import Reference
@@ -159,14 +159,7 @@ def _made(
     total = sum(
         len(lights_of(scene, settings[name])[0]) * (renders[name] + 1) for name, scene in scenes.items()
     )
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
+    step = steps(progress, total)
     entry = {"time": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "reason": reason}
     return {
         name: make_reference(scene, settings[name], renders[name], (*history[name], entry), step)
