@@ -10,14 +10,15 @@ else
 BIN := .venv/bin
 endif
 
-.PHONY: help setup demo test verify lint bench clean
+.PHONY: help setup demo test verify lint docs bench clean
 
 help:
 	@echo "make setup   make .venv, install the pinned packages, find a usable LLVM"
 	@echo "make demo    render and evaluate scenes/arena.yaml into outputs/arena"
 	@echo "make test    the tests, without the long statistical checks"
 	@echo "make verify  the long statistical checks"
-	@echo "make lint    ruff and mypy"
+	@echo "make lint    ruff, mypy, and the site: warnings are errors"
+	@echo "make docs    the site, in docs/_build/html/index.html; it opens offline"
 	@echo "make bench   every benchmark, one JSON object each"
 	@echo "make clean   remove .venv and the tools' caches; outputs stay"
 
@@ -35,10 +36,15 @@ test: setup
 verify: setup
 	$(BIN)/python -m pytest -m verify $(ARGS) || [ $$? -eq 5 ]
 
-lint: setup
+lint: setup docs
 	$(BIN)/python -m ruff check
 	$(BIN)/python -m ruff format --check
 	$(BIN)/python -m mypy
+
+# Read anew each time: pages follow from the program too.
+docs: setup
+	rm -rf docs/_build docs/reference
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
 bench: setup
 	@set -e; for file in benchmarks/*.py; do \
@@ -46,5 +52,5 @@ bench: setup
 	done
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist docs/_build docs/reference
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 import nir_render as nr
-from nir_render.camera.sensor import read_out
-from nir_render.camera.shot_noise import EXPANSION_MEAN, poisson
-from nir_render.expected import exposed, rates
-from nir_render.randomness import FrameKey, generator
+from nir_render.camera.mean_frame import electron_rates, exposed_frame
+from nir_render.camera.sensor.read_out import read_out
+from nir_render.camera.sensor.shot_noise import EXPANSION_MEAN, poisson
+from nir_render.randomness import RandomKey, generator
 
 RUNS = 15
 CAMERA = "r1.front"
@@ -41,11 +41,11 @@ def main() -> None:
         | {"robots.r1.rig.sources.top.drive": bits}
     )  # fmt: skip
     device = scene.camera(CAMERA)[1]
-    of_light, of_blinking = rates(light, scene), rates(light, blinking)
+    of_light, of_blinking = electron_rates(light, scene.at(0.0)), electron_rates(light, blinking.at(0.0))
     exposure_s = 2.5e-4
-    mean = exposed(of_light, exposure_s)
+    mean = exposed_frame(of_light, exposure_s)
     flat = mean.electrons.astype(np.float32).ravel()
-    key = FrameKey(1, "read_out", CAMERA, 0)
+    key = RandomKey(1, "read_out", CAMERA, 0)
 
     def shot(part: slice, block: int) -> None:
         few = flat[part]
@@ -59,13 +59,13 @@ def main() -> None:
 
     parts: dict[str, Callable[[], object]] = {
         "expose_ms": lambda: frame_of(scene, 1),
-        "mean_ms": lambda: exposed(of_light, exposure_s),
-        "mean_driven_ms": lambda: exposed(of_blinking, exposure_s, 0.01),
+        "mean_ms": lambda: exposed_frame(of_light, exposure_s),
+        "mean_driven_ms": lambda: exposed_frame(of_blinking, exposure_s, 0.01),
         "read_out_ms": lambda: read_out(mean.electrons, device, exposure_s, key),
         "read_out_one_ms": lambda: read_out(mean.electrons, device, exposure_s, key, threads=1),
         "poisson_ms": lambda: [shot(part, number) for number, part in enumerate(blocks)],
         "numpy_poisson_ms": lambda: generator(1, "read_out", CAMERA, 0).poisson(mean.electrons),
-        "rates_ms": lambda: rates(light, scene),
+        "rates_ms": lambda: electron_rates(light, scene.at(0.0)),
     }
     spent_ms: dict[str, list[float]] = {name: [] for name in parts}
     frame_of(scene, 0)

@@ -20,7 +20,7 @@ def main() -> None:
     """Time each estimator on each frame, in turn, and print the medians."""
     cv2.setNumThreads(1)
     scene = nr.load_scene(Path(__file__).parents[1] / "scenes" / "one_source.yaml")
-    calibration = scene.calibration("r1.front")
+    calibration = nr.calibration(scene, "r1.front")
     frames = [nr.expose(nr.render(scene, "r1.front", time_s), scene) for time_s in (0.0, 2.0, 9.0)]
     spent_ms: dict[str, list[float]] = {name: [] for name in perception.ESTIMATORS}
     for _ in range(RUNS):

@@ -33,7 +33,7 @@ def main() -> None:
     seconds = {"check_per_job": (time.perf_counter() - started) / len(jobs)}
     with tempfile.TemporaryDirectory() as place:
         for name, folder in (("from_nothing", "one"), ("with_light_cached", "two"), ("done_already", "two")):
-            command = [sys.executable, "-m", "nir_render.cli", "stress", asked.campaign, "--json"]
+            command = [sys.executable, "-m", "nir_render.command.main", "stress", asked.campaign, "--json"]
             command += ["-o", f"{place}/{folder}", "--light-cache", f"{place}/light"]
             started = time.perf_counter()
             subprocess.run(  # noqa: S603 (our own command)

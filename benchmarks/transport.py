@@ -28,14 +28,14 @@ import yaml
 from numpy.typing import NDArray
 
 import nir_render as nr
-from nir_render.camera.lens import intrinsics_of
-from nir_render.expected import expected
-from nir_render.scene.load import Scene
-from nir_render.scene.motion import camera_pose
-from nir_render.transport import groups, world
-from nir_render.transport.backend import backend
-from nir_render.transport.stock import mitsuba_camera
-from nir_render.upsampling import upsampling_error
+from nir_render.camera.mean_frame import mean_frame
+from nir_render.camera.optics.lens import intrinsics_of
+from nir_render.scene.scene import Scene
+from nir_render.transport.backend.variant import backend
+from nir_render.transport.indirect import groups
+from nir_render.transport.indirect.enlarging_error import upsampling_error
+from nir_render.transport.indirect.stock import mitsuba_camera
+from nir_render.transport.world import mitsuba_scene as world
 
 Array = NDArray[np.float64]
 
@@ -145,9 +145,9 @@ def _camera(columns: int) -> dict[str, Any]:
 
 def ours(scene: Scene, seed: int) -> Any:
     """Return our indirect light."""
-    robot, camera = scene.camera("eye.c")
-    rays = groups.rays_of(camera, camera_pose(robot, camera, 0.0))
-    return groups.indirect(scene, rays, 0.0, seed, np.ones(len(world.groups(scene))))
+    camera = scene.camera("eye.c")[1]
+    rays = groups.rays_of(camera, scene.at(0.0).camera("eye.c").pose)
+    return groups.indirect(scene.at(0.0), rays, seed, np.ones(len(scene.at(0.0).groups)))
 
 
 class Stock:
@@ -155,7 +155,7 @@ class Stock:
 
     def __init__(self, scene: Scene) -> None:
         mi = backend().mi
-        robot, camera = scene.camera("eye.c")
+        _, camera = scene.camera("eye.c")
         fog = scene.document.fog
         medium = None
         if fog is not None:
@@ -167,7 +167,7 @@ class Stock:
                     "phase": {"type": "hg", "g": 0.85},
                 }
             )
-        bodies = world.described(scene, 0.0, emitting=scene.sources())
+        bodies = world.described(scene.at(0.0), emitting=scene.sources())
         if medium is not None:
             for body in bodies.values():
                 if isinstance(body, dict):
@@ -179,7 +179,7 @@ class Stock:
             }
             bodies["air"]["bsdf"] = {"type": "null"}
         self.bodies = mi.load_dict(bodies, optimize=False)
-        self.sensor = mitsuba_camera(camera, camera_pose(robot, camera, 0.0), 1, medium)
+        self.sensor = mitsuba_camera(camera, scene.at(0.0).camera("eye.c").pose, 1, medium)
         self.kind = "path" if fog is None else "volpath"
 
     def render(self, seed: int, straight: bool = True) -> Array:
@@ -241,11 +241,11 @@ def compare(scene_of: Callable[[int], Scene], repeats: int, seeds: int) -> dict[
 
 def _apertures(scene: Scene) -> list[Any]:
     """Return the pixels within 1.5 px of each source's image that is on the sensor."""
-    robot, camera = scene.camera("eye.c")
-    pose, lens = camera_pose(robot, camera, 0.0), intrinsics_of(camera)
+    camera = scene.camera("eye.c")[1]
+    pose, lens = scene.at(0.0).camera("eye.c").pose, intrinsics_of(camera)
     rows, columns = np.mgrid[: lens.height_px, : lens.width_px]
     found = []
-    for center_m in world.source_positions_m(scene, 0.0).values():
+    for center_m in (placed.pose.position_m for placed in scene.at(0.0).sources.values()):
         u_px, v_px = lens.project(pose.to_local(center_m))
         inside = np.hypot(columns - u_px, rows - v_px) <= 1.5
         if inside.any():
@@ -280,9 +280,9 @@ def smooth(repeats: int) -> dict[str, float]:
     )
     light = nr.render(coarse, "eye.c")
     exposure_s = coarse.camera("eye.c")[1].exposure_s
-    mean = expected(light, coarse, exposure_s)
-    error = upsampling_error(mean, coarse, pixels=4096, samples=512)
-    assert not isinstance(error, str)  # noqa: S101 (it was rendered in blocks)
+    mean = mean_frame(light, coarse.at(0.0), exposure_s)
+    error = upsampling_error(mean, pixels=4096, samples=512)
+    assert not isinstance(error, str)
     mean_e = float(mean.electrons.mean())
     temporal_e2 = mean_e + coarse.camera("eye.c")[1].sensor.read_noise_e ** 2
     return {

@@ -16,7 +16,7 @@ def generator(seed: int, stage: str, camera: str, frame: int) -> np.random.Gener
 
 
 @dataclass(frozen=True)
-class FrameKey:
+class RandomKey:
     """Whose random numbers: those of one frame of one camera, in one stage of a run."""
 
     seed: int

@@ -1,31 +1,43 @@
 """The stack that reads raw near-infrared frames: flares, their bearings and their ranges.
 
+It needs a frame and a calibration and nothing else, and runs unchanged on a robot::
+
     frames = perception.read_frames("recording")
     calibrations = perception.read_calibrations("recording")
     for frame in frames:
         hits = perception.detect(frame, calibrations[frame.camera])          # or estimator="paper"
 
-It needs a frame and a calibration and nothing else, and runs unchanged on a robot. The way of the data:
-`recording` → `detection` (`preparation` → `blobs` → `measurement`) → detections. `limits` says how well any
-estimator could do.
+An estimator is named, or is any function of frame and calibration; `detect` shows a whole example.
+
+>>> import perception
+>>> sorted(perception.ESTIMATORS)
+['paper', 'robust']
+
+The way of the data, room by room: `files` (what touches disk) → `estimators` (the one call, and one's own) →
+`paper` (the paper's method to the letter) or `robust` (prepare → blobs → measure → detect) → detections. Both
+stand on `model`: lens, bearing, sensor, ranging, the image of a flare, and in `fisher` how well any estimator
+could do. `calibration` finds the constants from frames at known ranges. `types` is the contract.
 """
 
-from perception.calibrate import (
-    PaperRegression,
+from perception.calibration.rail import calibrate_rail
+from perception.calibration.range_constant import (
     RangeConstantFit,
-    regress_paper_range_constant,
     regress_range_constant,
 )
-from perception.calibration_file import calibration_document, parse_calibration_document
-from perception.detection_file import detection_record, parse_detection
-from perception.json_fields import RecordingError
-from perception.limits import FlareLimit, flare_limit
-from perception.own_estimator import EstimatorError, OwnEstimator, load_estimator
-from perception.pipeline import ESTIMATORS, Estimator, detect
-from perception.rail import calibrate_rail
-from perception.rail_result import RailCalibration
-from perception.ranges_file import encode_ranges, read_ranges
-from perception.recording import (
+from perception.calibration.result import RailCalibration
+from perception.estimators import (
+    ESTIMATORS,
+    Estimator,
+    EstimatorError,
+    OwnEstimator,
+    detect,
+    load_estimator,
+)
+from perception.files.calibration import calibration_document, parse_calibration_document
+from perception.files.detections import detection_record, parse_detection
+from perception.files.fields import RecordingError
+from perception.files.ranges import encode_ranges, read_ranges
+from perception.files.recording import (
     FrameRecord,
     encode_png16,
     frame_record,
@@ -35,6 +47,8 @@ from perception.recording import (
     read_frame_records,
     read_frames,
 )
+from perception.model.fisher import FlareLimit, flare_limit
+from perception.paper import PaperRegression, regress_paper_range_constant
 from perception.types import Calibration, Detection, RawFrame
 
 __all__ = [

@@ -1,10 +1,7 @@
 """Frames as pictures for human eyes."""
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from perception.types import RawFrame
 
 
 def tone_map(
@@ -37,10 +34,20 @@ def tone_map(
     return np.asarray(np.rint(255.0 * curve), dtype=np.uint8)
 
 
-def frame_png(frame: RawFrame) -> bytes:
-    """Encode a frame as an 8-bit PNG, tone-mapped up to its own brightest pixel."""
-    full_scale_dn = max(float(frame.data_dn.max()), frame.black_level_dn + 1.0)
-    done, buffer = cv2.imencode(".png", tone_map(frame.data_dn, frame.black_level_dn, full_scale_dn))
+def frame_png(data_dn: NDArray[np.uint16], black_level_dn: float) -> bytes:
+    """Encode counts as an 8-bit PNG, tone-mapped up to their own brightest pixel.
+
+    Parameters
+    ----------
+    data_dn
+        Counts, shape (rows, columns).
+    black_level_dn
+        The count that becomes black.
+    """
+    import cv2
+
+    full_scale_dn = max(float(data_dn.max()), black_level_dn + 1.0)
+    done, buffer = cv2.imencode(".png", tone_map(data_dn, black_level_dn, full_scale_dn))
     if not done:
-        raise RuntimeError("OpenCV could not encode the frame as PNG")
+        raise RuntimeError("OpenCV could not encode the counts as PNG")
     return buffer.tobytes()

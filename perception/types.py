@@ -10,6 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+FrameKey = tuple[str, int]
+"""Which frame of a recording: camera and index."""
+
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
@@ -33,7 +36,7 @@ class RawFrame:
         """Show the frame as a picture in a notebook, tone-mapped."""
         from perception.picture import frame_png
 
-        return frame_png(self)
+        return frame_png(self.data_dn, self.black_level_dn)
 
 
 @dataclass(frozen=True, eq=False)

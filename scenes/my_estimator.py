@@ -12,10 +12,10 @@ detections. A frame holds nothing else: no truth, no other frame. Whatever Pytho
 import numpy as np
 
 from perception import Calibration, Detection, RawFrame
-from perception.bearing import bearing_body
-from perception.photometry import aperture_flux
-from perception.ranging import range_from_flux
-from perception.sensor import electrons, gain_dn_per_e, noise_floor_e2
+from perception.model.bearing import bearing_body
+from perception.model.ranging import range_from_flux
+from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2
+from perception.robust.fit import aperture_flux
 
 APERTURE_PX = 12.0
 RING_PX = (16.0, 24.0)  # the background is measured between these radii

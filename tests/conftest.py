@@ -11,7 +11,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         _skip(items, "mitsuba", "needs Mitsuba, which is not installed")
         return
     if any(item.get_closest_marker("vectorised") for item in items):
-        from nir_render.transport.backend import backend
+        from nir_render.transport.backend.variant import backend
 
         if not backend().vectorised:
             _skip(items, "vectorised", "needs an LLVM or CUDA variant")

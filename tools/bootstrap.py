@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nir_render.transport.llvm import Choice
+    from nir_render.transport.backend.llvm import Choice
 
 ROOT = Path(__file__).resolve().parent.parent
 OLDEST = (3, 11)
@@ -216,7 +216,7 @@ def ensure_llvm() -> str:
 
     Return the library in use, empty if none is or it is unknown.
     """
-    from nir_render.transport.llvm import install
+    from nir_render.transport.backend.llvm import install
 
     choice = choose_aloud()
     apt = install.apt_command()
@@ -235,8 +235,8 @@ def ensure_llvm() -> str:
 
 def choose_aloud() -> "Choice":
     """Choose an LLVM, and say what is being tried, which was chosen, and why not those before it."""
-    from nir_render.transport import llvm
-    from nir_render.transport.llvm.probe import Answer, probe
+    from nir_render.transport.backend import llvm
+    from nir_render.transport.backend.llvm.probe import Answer, probe
 
     own = "the library that Dr.Jit takes by itself"
 

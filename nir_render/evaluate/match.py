@@ -4,16 +4,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from nir_render.evaluate.truth import SourceTruth
-from perception import flare_model
+from nir_render.truth.lamps import Outline
+from nir_render.truth.sources import SourceTruth
+from perception.model import flare as flare_model
 from perception.types import Calibration, Detection
 
 GATE_PX = 3.0
 MIN_VISIBLE_FRACTION = 0.5
 MIN_PEAK_SNR = 5.0
+_LAMP_MARGIN_PX = 5.0
 
 
 @dataclass(frozen=True)
@@ -70,3 +73,10 @@ def image_radius_px(truth: SourceTruth, calibration: Calibration) -> float:
         return 0.0
     angle_rad = math.asin(calibration.source_radius_m / truth.range_m)
     return float(flare_model.image_radius_px(truth.u_px, truth.v_px, angle_rad, calibration))
+
+
+def on_a_lamp(detection: Detection, outlines_px: Sequence[Outline]) -> bool:
+    """Tell whether a detection lies on a lamp, or within 5 px of one."""
+    place = (detection.u_px, detection.v_px)
+    corners = (np.array(outline, dtype=np.float32) for outline in outlines_px)
+    return any(cv2.pointPolygonTest(one, place, measureDist=True) >= -_LAMP_MARGIN_PX for one in corners)

@@ -7,18 +7,16 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nir_render.evaluate.lamps import on_a_lamp
-from nir_render.evaluate.match import countable, match
-from nir_render.evaluate.truth import SourceTruth
-from perception.bearing import direction_camera
-from perception.limits import flare_limit
-from perception.sensor import at_gain
-from perception.types import Calibration, Detection
+from nir_render.evaluate.match import countable, match, on_a_lamp
+from nir_render.truth.lamps import LampTruth, Outline
+from nir_render.truth.sources import SourceTruth
+from perception.model.bearing import direction_camera
+from perception.model.fisher import flare_limit
+from perception.model.sensor import at_gain
+from perception.types import Calibration, Detection, FrameKey
 
-FrameKey = tuple[str, int]
-Item = TypeVar("Item", SourceTruth, Detection)
+Item = TypeVar("Item", SourceTruth, LampTruth, Detection)
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ def evaluate(
     truth: Iterable[SourceTruth],
     calibrations: Mapping[str, Calibration],
     detections: Mapping[str, Iterable[Detection]],
-    lamps: Mapping[FrameKey, Sequence[NDArray[np.float32]]] | None = None,
+    lamps: Iterable[LampTruth] = (),
 ) -> Evaluation:
     """Score the detections of each estimator.
 
@@ -68,39 +66,74 @@ def evaluate(
     detections
         By estimator: all its detections.
     lamps
-        Outlines of lamps and the sun by frame, in pixels: what is found there is counted apart.
+        Where lamps and the sun stand: what is found there is counted apart.
     """
-    truth_in = _by_frame(truth)
+    truth_in, lamps_in = _by_frame(truth), _by_frame(lamps)
     found_in = {name: _by_frame(found) for name, found in detections.items()}
-    scores: list[Score] = []
-    false_alarms: dict[str, list[Detection]] = {name: [] for name in detections}
-    ghosts = dict.fromkeys(detections, 0)
-    lamps_reported = dict.fromkeys(detections, 0)
-    for key in frames:
-        calibration = calibrations[key[0]]
-        rows = truth_in.get(key, [])
-        matched: list[dict[str, Detection]] = [{} for _ in rows]
-        for name in detections:
-            real = [detection for detection in found_in[name].get(key, []) if not detection.ghost]
-            ghosts[name] += len(found_in[name].get(key, [])) - len(real)
-            pairing = match(rows, real, calibration)
-            outlines = (lamps or {}).get(key, ())
-            on_lamps = [on_a_lamp(real[j], outlines) for j in pairing.unmatched]
-            lamps_reported[name] += sum(on_lamps)
-            false_alarms[name] += [
-                real[j] for j, lamp in zip(pairing.unmatched, on_lamps, strict=True) if not lamp
-            ]
-            for i, j in pairing.pairs:
-                matched[i][name] = real[j]
-                ghosts[name] += rows[i].ghost_of is not None
-        scores += [
-            Score(row, countable(row, calibration), *source_limits(row, calibration), said)
-            for row, said in zip(rows, matched, strict=True)
-        ]
-    mirrored = tuple(score for score in scores if score.truth.ghost_of is not None)
-    scores = [score for score in scores if score.truth.ghost_of is None]
-    counted = [score for score in scores if score.countable]
-    summary = {
+    frame_scores = [
+        _score_frame(
+            truth_in.get(key, []),
+            {name: found.get(key, []) for name, found in found_in.items()},
+            [lamp.outline_px for lamp in lamps_in.get(key, [])],
+            calibrations[key[0]],
+        )
+        for key in frames
+    ]
+    scores = [score for frame in frame_scores for score in frame.scores]
+    sources = [score for score in scores if score.truth.ghost_of is None]
+    return Evaluation(
+        scores=tuple(sources),
+        false_alarms={
+            name: tuple(alarm for frame in frame_scores for alarm in frame.false_alarms[name])
+            for name in detections
+        },
+        summary=_summary(sources, frame_scores, list(detections)),
+        ghosts=tuple(score for score in scores if score.truth.ghost_of is not None),
+    )
+
+
+@dataclass(frozen=True)
+class _FrameScores:
+    """One frame: the score of each truth row, and by estimator what belongs to no source."""
+
+    scores: tuple[Score, ...]
+    false_alarms: Mapping[str, list[Detection]]
+    ghosts_reported: Mapping[str, int]
+    lamps_reported: Mapping[str, int]
+
+
+def _score_frame(
+    rows: Sequence[SourceTruth],
+    detections: Mapping[str, Sequence[Detection]],
+    outlines_px: Sequence[Outline],
+    calibration: Calibration,
+) -> _FrameScores:
+    hits: list[dict[str, Detection]] = [{} for _ in rows]
+    alarms: dict[str, list[Detection]] = {}
+    ghosts, lamps = dict.fromkeys(detections, 0), dict.fromkeys(detections, 0)
+    for name, found in detections.items():
+        sources = [detection for detection in found if not detection.ghost]
+        pairing = match(rows, sources, calibration)
+        unmatched = [sources[j] for j in pairing.unmatched]
+        alarms[name] = [detection for detection in unmatched if not on_a_lamp(detection, outlines_px)]
+        lamps[name] = len(unmatched) - len(alarms[name])
+        ghosts[name] = len(found) - len(sources)
+        for i, j in pairing.pairs:
+            hits[i][name] = sources[j]
+            ghosts[name] += rows[i].ghost_of is not None
+    scores = tuple(
+        Score(row, countable(row, calibration), *source_limits(row, calibration), hit)
+        for row, hit in zip(rows, hits, strict=True)
+    )
+    return _FrameScores(scores, alarms, ghosts, lamps)
+
+
+def _summary(
+    sources: Sequence[Score], frames: Sequence[_FrameScores], estimators: Sequence[str]
+) -> dict[str, Any]:
+    """Return the numbers of `summary.json`."""
+    counted = [score for score in sources if score.countable]
+    return {
         "format": 1,
         "frames": len(frames),
         "sources_visible": len(counted),
@@ -109,15 +142,15 @@ def evaluate(
         "estimators": {
             name: {
                 **_estimator_numbers(counted, name),
-                "false_alarms_per_frame": len(false_alarms[name]) / len(frames) if frames else None,
-                "ghosts_reported": ghosts[name],
-                "lamps_reported": lamps_reported[name],
+                "false_alarms_per_frame": (
+                    sum(len(frame.false_alarms[name]) for frame in frames) / len(frames) if frames else None
+                ),
+                "ghosts_reported": sum(frame.ghosts_reported[name] for frame in frames),
+                "lamps_reported": sum(frame.lamps_reported[name] for frame in frames),
             }
-            for name in detections
+            for name in estimators
         },
     }
-    alarms = {name: tuple(found) for name, found in false_alarms.items()}
-    return Evaluation(tuple(scores), alarms, summary, mirrored)
 
 
 def source_limits(truth: SourceTruth, calibration: Calibration) -> tuple[float, float]:

@@ -5,8 +5,8 @@ result = regress.check("scenes/regression")        # result.holds, result.scenes
 regress.update("scenes/regression", reason="the floor is darker now")
 """
 
-from nir_render.regress.check import FALSE_ALARM_RATE, check
-from nir_render.regress.findings import Check, Finding, SceneCheck
-from nir_render.regress.suites import Update, create, update
+from nir_render.regress.checking import FALSE_ALARM_RATE, check
+from nir_render.regress.findings import Check, Finding, SceneCheck, Update
+from nir_render.regress.update import create, update
 
 __all__ = ["FALSE_ALARM_RATE", "Check", "Finding", "SceneCheck", "Update", "check", "create", "update"]

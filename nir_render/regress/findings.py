@@ -1,11 +1,17 @@
-"""What a check says: findings, one for each thing compared, and the pictures that go with them."""
+"""What a check says: findings, one for each thing compared, and the pictures that go with them.
+
+And what an update of references did.
+"""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from nir_render.regress.reference import Reference
 
 Word = Literal["pass", "fail", "skipped"]
 
@@ -42,7 +48,7 @@ class Finding:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class ImagePair:
     """An image before and after, shape (rows, columns); `error` that of tiles of 8 × 8 pixels' differences.
 
     `error` is None of what is no Monte Carlo. `unit` is that of the images.
@@ -62,7 +68,7 @@ class SceneCheck:
     name: str
     changes: tuple[str, ...]
     findings: tuple[Finding, ...]
-    pairs: tuple[Pair, ...] = ()
+    pairs: tuple[ImagePair, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -111,6 +117,34 @@ class Check:
                 for scene in self.scenes
             },
         }
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What an update did.
+
+    Attributes
+    ----------
+    made, kept, removed
+        Scenes whose references are new, as they were, and gone.
+    before
+        What a check against the old references said, of the scenes that had any.
+    old, new
+        The references of the scenes that were made anew, before (where there were any) and after.
+    """
+
+    reason: str
+    made: tuple[str, ...]
+    kept: tuple[str, ...]
+    removed: tuple[str, ...]
+    before: Check
+    old: Mapping[str, Reference]
+    new: Mapping[str, Reference]
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything was written."""
+        return bool(self.made or self.removed)
 
 
 def percent(value: float, *, signed: bool = False) -> str:

@@ -1,7 +1,6 @@
 """What a reference holds: what each stage was given, what it made of it, and what made it."""
 
 import hashlib
-import importlib.metadata
 import os
 import platform
 from collections.abc import Mapping
@@ -13,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.scene.load import Scene
-from nir_render.scene.world import Mesh
-from nir_render.transport.light import Light
+from nir_render.light.light import Light
+from nir_render.scene.documents.shapes import Mesh
+from nir_render.scene.scene import Scene
+from nir_render.transport.fingerprint import code_hash, package_versions
 from perception.types import Calibration, Detection, RawFrame
 
 _PACKAGES = ("numpy", "scipy", "opencv-python-headless")
@@ -134,8 +134,8 @@ def leaves(node: Any, path: str = "") -> dict[str, Any]:
 
 def made_by() -> dict[str, dict[str, str]]:
     """Return what the bits follow from besides the scene, by name: of light, and of all that comes after."""
-    from nir_render.transport.backend import backend  # Mitsuba loads only where light is rendered
-    from nir_render.transport.key import versions
+    from nir_render.transport.backend.variant import backend  # Mitsuba loads only where light is rendered
+    from nir_render.transport.cache_key import versions
 
     light = versions(backend().variant, backend().compiler)
     transport = {
@@ -146,7 +146,7 @@ def made_by() -> dict[str, dict[str, str]]:
     machine = {"instructions": _instructions(), "libc": " ".join(platform.libc_ver())}
     transport |= machine
     other = {"python": platform.python_version(), "processor": transport["processor"], **machine}
-    other |= {name: _version(name) for name in _PACKAGES}
+    other |= package_versions(*_PACKAGES)
     return {"transport": transport, "other": other | {"code": _code_hash()}}
 
 
@@ -158,24 +158,18 @@ def _instructions() -> str:
     return f"{len(used)} sets, {hashlib.sha256(' '.join(used).encode()).hexdigest()[:12]}"
 
 
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:  # OpenCV comes under several names
-        return "not installed"
-
-
 @cache
 def _code_hash() -> str:
     import nir_render
     import perception
 
-    hashed = hashlib.sha256()
-    for package in (nir_render, perception):
-        root = Path(str(package.__file__)).parent
-        for file in sorted(root.rglob("*.py")):
-            hashed.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return hashed.hexdigest()
+    roots = [Path(str(package.__file__)).parent for package in (nir_render, perception)]
+    return code_hash(*((root, sorted(root.rglob("*.py"))) for root in roots))
+
+
+def by_group_and_node(values: NDArray[Any]) -> NDArray[Any]:
+    """Return values of shape (group, node, …) with groups and nodes on one axis, nodes running fastest."""
+    return values.reshape(-1, *values.shape[2:])
 
 
 def edge_image(values: NDArray[Any]) -> NDArray[np.float64]:

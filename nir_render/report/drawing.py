@@ -1,6 +1,7 @@
 """What all plots share: the sheet they are drawn on, its legend, and how it becomes SVG."""
 
 import io
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -9,9 +10,17 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from nir_render.report.samples import Values
+from nir_render.evaluate.estimator_errors import Values
 
 _WIDTH_IN = 11.0
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A plot as SVG, and what it shows, for those who do not see it."""
+
+    svg: str
+    description: str
 
 
 def sheet(height_in: float) -> Figure:

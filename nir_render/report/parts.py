@@ -1,74 +1,106 @@
-"""The parts that pages are put together from: the page itself, tables, plots, marks, facts."""
+"""Pages by templates: one environment that escapes whatever is no markup, and what templates are filled with.
+
+Templates lie beside the page that they make, and are named by their place in the package, such as
+"report/page.html". `report/base.html` is the page around all of them, `report/kit.html` has tables, plots and
+marks.
+"""
 
 import base64
-import importlib.resources
 from collections.abc import Mapping, Sequence
-from html import escape
-from string import Template
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
 from nir_render.report import style
-from nir_render.report.pictures import marker_svg
+
+_MARKS = {
+    "s": "M{left} {top}h{size}v{size}h-{size}z",
+    "+": "M{left} {y}h{size}M{x} {top}v{size}",
+    "x": "M{left} {top}l{size} {size}m-{size} 0l{size} -{size}",
+    "D": "M{x} {top}l{half} {half}l-{half} {half}l-{half} -{half}z",
+    "^": "M{x} {top}l{half} {size}h-{size}z",
+    "v": "M{x} {bottom}l{half} -{size}h-{size}z",
+}
+"""Paths of SVG, by matplotlib's name of the marker."""
 
 
-def page(title: str, subtitle: Sequence[str], body: Sequence[str]) -> str:
-    """Return an HTML document; title and subtitle are plain text, the body's parts are HTML already."""
-    template = (
-        importlib.resources.files("nir_render.report").joinpath("page.html").read_text(encoding="utf-8")
-    )
-    return Template(template).substitute(
-        title=escape(title),
-        subtitle=escape(" · ".join(subtitle)),
-        body="\n".join(body),
-        ground=style.GROUND,
-        panel=style.PANEL,
-        line=style.LINE,
-        ink=style.INK,
-        faint=style.FAINT,
-        good=style.GOOD,
-        fair=style.FAIR,
-        bad=style.BAD,
-    )
+@dataclass(frozen=True)
+class Table:
+    """A table of a page: headings, and cells that are text or `Markup`."""
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
 
 
-def table(headings: Sequence[str], rows: Sequence[Sequence[str]], text: Sequence[int] = ()) -> str:
-    """Return a table; cells are HTML already, headings are not. Columns of `text` are set as such."""
-
-    def kind(column: int) -> str:
-        return ' class="text"' if column in text else ""
-
-    head = "".join(f"<th{kind(column)}>{escape(heading)}</th>" for column, heading in enumerate(headings))
-    lines = [
-        "<tr>" + "".join(f"<td{kind(column)}>{cell}</td>" for column, cell in enumerate(row)) + "</tr>"
-        for row in rows
-    ]
-    header = f"<thead><tr>{head}</tr></thead>" if head else ""
-    return f'<div class="scroll"><table>{header}<tbody>{"".join(lines)}</tbody></table></div>'
+def render_page(template: str, **values: Any) -> str:
+    """Fill a template; whatever is no `Markup` is escaped, and what a template asks for must be there."""
+    return _environment().get_template(template).render(**values)
 
 
-def plot(svg: str, said: str) -> str:
-    """Return a plot as an image of its own: names within one SVG cannot clash with those of another."""
-    data = base64.b64encode(svg.encode()).decode()
-    return f'<figure class="plot"><img alt="{escape(said)}" src="data:image/svg+xml;base64,{data}"></figure>'
+def marker(name: str, names: Sequence[str], x: float, y: float, size: float) -> Markup:
+    """Draw an estimator's mark around a place, as a path of SVG."""
+    look = style.look(name, names)
+    half = 0.5 * size
+    lengths = {
+        "x": x,
+        "y": y,
+        "left": x - half,
+        "top": y - half,
+        "bottom": y + half,
+        "half": half,
+        "size": size,
+    }
+    path = _MARKS[look.marker].format_map({key: f"{value:.2f}" for key, value in lengths.items()})
+    return Markup('<path d="{}" stroke="{}" class="mark"/>').format(path, look.colour)
 
 
-def mark(name: str, names: Sequence[str]) -> str:
-    """Return an estimator's mark, to stand within a line."""
-    return f'<svg viewBox="0 0 16 16" width="16" height="16">{marker_svg(name, names, 8, 8, 11)}</svg>'
+def named_mark(name: str, names: Sequence[str]) -> Markup:
+    """Return an estimator's mark, to stand within a line, and its name."""
+    path = marker(name, names, 8, 8, 11)
+    return Markup('<svg viewBox="0 0 16 16" width="16" height="16">{}</svg> {}').format(path, name)
 
 
-def facts_table(facts: Mapping[str, Any]) -> str:
-    """Return nested facts as a table of two columns; empty ones are left out."""
-    return table([], [[escape(name), escape(value)] for name, value in _flat(facts)], text=(1,))
+def data_uri(content: bytes | str, mime: str) -> str:
+    """Return an address that holds its content: names within an SVG so clash with no other's."""
+    data = content.encode() if isinstance(content, str) else content
+    return f"data:{mime};base64,{base64.b64encode(data).decode()}"
 
 
-def _flat(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Name every leaf of nested facts: `seconds render`."""
-    leaves: list[tuple[str, str]] = []
+def facts_table(facts: Mapping[str, Any], but: Sequence[str] = ()) -> Table:
+    """Return nested facts as a table of two columns, a row for each leaf, `seconds render`.
+
+    Empty ones are left out, and those of the names in `but`.
+    """
+    return Table((), _fact_rows({key: value for key, value in facts.items() if key not in but}))
+
+
+def _fact_rows(facts: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
     for key, value in facts.items():
         name = f"{prefix} {key}".strip().replace("_", " ")
         if isinstance(value, Mapping):
-            leaves += _flat(value, name)
+            rows += _fact_rows(value, name)
         elif value not in ("", None):
-            leaves.append((name, str(value)))
-    return leaves
+            rows.append((name, str(value)))
+    return rows
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("nir_render", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    colours = ("GROUND", "PANEL", "LINE", "INK", "FAINT", "TRUTH", "GOOD", "FAIR", "BAD")
+    environment.globals["colours"] = {name.lower(): getattr(style, name) for name in colours}
+    environment.globals["marker"] = marker
+    environment.globals["named_mark"] = named_mark
+    environment.filters["data_uri"] = data_uri
+    environment.filters["px"] = lambda value: f"{value:.2f}"
+    return environment

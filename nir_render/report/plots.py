@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
+from nir_render.evaluate.estimator_errors import EstimatorErrors, Values, limit_curve
 from nir_render.report.drawing import legend, rounded_up, sheet, short, svg_of, symmetric_log
-from nir_render.report.samples import Samples, Values, limit_curve
 from nir_render.report.style import BAD, FAINT, LIMIT, MATPLOTLIB, look
 from nir_render.report.wording import metres
 
@@ -19,33 +19,33 @@ _RASTER_BEYOND = 1500
 _PULL_SHOWN = 5.0
 
 
-def range_error_plot(samples: Mapping[str, Samples]) -> str:
+def range_error_plot(by_estimator: Mapping[str, EstimatorErrors]) -> str:
     """Draw signed range errors against true range on a symmetric log scale, and below what was missed."""
-    strip_in = 0.35 + 0.22 * len(samples)
+    strip_in = 0.35 + 0.22 * len(by_estimator)
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(4.6 + strip_in)
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[4.6, strip_in])
-        some = next(iter(samples.values()))
+        some = next(iter(by_estimator.values()))
         x, limit_m = _band(some.range_m, some.range_limit_m)
         if x.size:
             above.fill_between(x, -limit_m, limit_m, color=LIMIT, alpha=0.22, linewidth=0, label="limit ±1 σ")
             for sign in (-1.0, 1.0):
                 above.plot(x, sign * limit_m, color=LIMIT, linewidth=0.9)
         above.axhline(0.0, color=FAINT, linewidth=0.7)
-        for name, own in samples.items():
-            _scatter(above, own.range_m, own.error_m, name, list(samples))
+        for name, own in by_estimator.items():
+            _scatter(above, own.range_m, own.error_m, name, list(by_estimator))
         linear_m = rounded_up(float(limit_m.max())) if x.size and limit_m.max() > 0.0 else 0.1
         ticks_m = linear_m * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-        symmetric_log(above, linear_m, ticks_m, [own.error_m for own in samples.values()] + [limit_m])
+        symmetric_log(above, linear_m, ticks_m, [own.error_m for own in by_estimator.values()] + [limit_m])
         above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _metres_tick(value)))
         above.set_ylabel("range error, estimated − true")
         legend(above)
-        _found_strip(below, samples)
+        _found_strip(below, by_estimator)
         below.set_xlabel("true range, m")
         return _svg(figure)
 
 
-def pull_plot(samples: Mapping[str, Samples]) -> str:
+def pull_plot(by_estimator: Mapping[str, EstimatorErrors]) -> str:
     """Draw range errors in units of their own limit: against true range, and as a histogram."""
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(4.2)
@@ -53,34 +53,34 @@ def pull_plot(samples: Mapping[str, Samples]) -> str:
         for reach, alpha in ((2.0, 0.10), (1.0, 0.16)):
             left.axhspan(-reach, reach, color=LIMIT, alpha=alpha, linewidth=0)
         left.axhline(0.0, color=FAINT, linewidth=0.7)
-        for name, own in samples.items():
-            _scatter(left, own.range_m, own.pull, name, list(samples))
-        symmetric_log(left, 3.0, np.arange(-3.0, 4.0), [own.pull for own in samples.values()])
+        for name, own in by_estimator.items():
+            _scatter(left, own.range_m, own.pull, name, list(by_estimator))
+        symmetric_log(left, 3.0, np.arange(-3.0, 4.0), [own.pull for own in by_estimator.values()])
         left.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
         left.set_ylabel("range error / limit σ")
         left.set_xlabel("true range, m")
         legend(left)
-        _pull_histogram(right, samples)
+        _pull_histogram(right, by_estimator)
         return _svg(figure)
 
 
-def bearing_plot(samples: Mapping[str, Samples]) -> str:
+def bearing_plot(by_estimator: Mapping[str, EstimatorErrors]) -> str:
     """Draw the angle between estimated and true bearing against true range, on a log scale."""
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(3.8)
         axes = figure.subplots()
-        some = next(iter(samples.values()))
+        some = next(iter(by_estimator.values()))
         x, limit_deg = _band(some.range_m, some.bearing_limit_deg)
         if x.size:
             axes.plot(x, limit_deg, color=LIMIT, linewidth=1.4, label="limit, RMS")
-        for name, own in samples.items():
+        for name, own in by_estimator.items():
             # An angle of exactly zero has no place on a log scale, and says nothing but that.
             _scatter(
                 axes,
                 own.range_m,
                 np.where(own.bearing_deg > 0.0, own.bearing_deg, np.nan),
                 name,
-                list(samples),
+                list(by_estimator),
             )
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}°"))
@@ -115,10 +115,10 @@ def _scatter(axes: Axes, x: Values, y: Values, name: str, names: list[str]) -> N
     )
 
 
-def _found_strip(axes: Axes, samples: Mapping[str, Samples]) -> None:
+def _found_strip(axes: Axes, by_estimator: Mapping[str, EstimatorErrors]) -> None:
     """One row per estimator: which sources it found, and which it missed."""
-    for row, (name, own) in enumerate(samples.items()):
-        colour = look(name, list(samples)).colour
+    for row, (name, own) in enumerate(by_estimator.items()):
+        colour = look(name, list(by_estimator)).colour
         many = own.found.size > _RASTER_BEYOND
         for chosen, drawn, size in ((own.found, colour, 6.0), (~own.found, BAD, 9.0)):
             place = own.range_m[chosen]
@@ -127,17 +127,17 @@ def _found_strip(axes: Axes, samples: Mapping[str, Samples]) -> None:
                 markersize=size if drawn is colour else 5.0, rasterized=many,
                 label="missed" if drawn is BAD and row == 0 else None,
             )  # fmt: skip
-    axes.set_ylim(len(samples) - 0.4, -0.6)
-    labels = [f"{short(name)}  {int(own.found.sum())}/{own.found.size}" for name, own in samples.items()]
-    axes.set_yticks(range(len(samples)), labels)
+    axes.set_ylim(len(by_estimator) - 0.4, -0.6)
+    labels = [f"{short(name)}  {int(own.found.sum())}/{own.found.size}" for name, own in by_estimator.items()]
+    axes.set_yticks(range(len(by_estimator)), labels)
     axes.grid(visible=False)
     axes.set_title("found |  missed ×", fontsize=8, loc="right", color=FAINT, pad=3)
 
 
-def _pull_histogram(axes: Axes, samples: Mapping[str, Samples]) -> None:
+def _pull_histogram(axes: Axes, by_estimator: Mapping[str, EstimatorErrors]) -> None:
     x = np.linspace(-_PULL_SHOWN, _PULL_SHOWN, 201)
     axes.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), color=LIMIT, linewidth=1.2, label="at the limit")
-    for name, own in samples.items():
+    for name, own in by_estimator.items():
         known = own.pull[np.isfinite(own.pull)]
         within = known[np.abs(known) <= _PULL_SHOWN]
         label = f"{name}: {within.size} of {known.size} within ±{_PULL_SHOWN:g}"
@@ -145,13 +145,13 @@ def _pull_histogram(axes: Axes, samples: Mapping[str, Samples]) -> None:
         edges = np.linspace(-_PULL_SHOWN, _PULL_SHOWN, int(np.clip(2.0 * np.sqrt(known.size), 12, 50)) + 1)
         count, _ = np.histogram(within, edges)
         density = count / (max(known.size, 1) * (edges[1] - edges[0]))
-        colour = look(name, list(samples)).colour
+        colour = look(name, list(by_estimator)).colour
         axes.stairs(density, edges, color=colour, linewidth=1.3, label=label)
     axes.set_xlabel("range error / limit σ")
     axes.set_ylabel("share of flares per σ")
     axes.set_xlim(-_PULL_SHOWN, _PULL_SHOWN)
     top = max(axes.get_ylim()[1], 0.45)
-    axes.set_ylim(0.0, top * (1.12 + 0.09 * len(samples)))
+    axes.set_ylim(0.0, top * (1.12 + 0.09 * len(by_estimator)))
     legend(axes, loc="upper left")
 
 

@@ -11,11 +11,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from nir_render.evaluate.match import image_radius_px
-from nir_render.evaluate.metrics import FrameKey, Score
-from nir_render.report.frames import key_of, spread, whole_picture
+from nir_render.evaluate.metrics import Score
+from nir_render.report.pictures import key_of, spread, whole_picture
 from nir_render.report.style import GROUND, LINE, MATPLOTLIB, TRUTH, look
 from perception.picture import tone_map
-from perception.types import Calibration, RawFrame
+from perception.types import Calibration, FrameKey, RawFrame
 
 _WHOLE_IN, _CLOSE_IN = 5.0, 2.3
 _WHOLE_CAMERAS = 4

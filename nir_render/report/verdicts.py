@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nir_render.report.samples import Excess, Samples, excess, honesty
+from nir_render.evaluate.estimator_errors import EstimatorErrors, Excess, excess, honesty
 from nir_render.report.wording import counted, degrees, metres, share, times
 
 Level = Literal["good", "fair", "bad", "none"]
@@ -40,34 +40,34 @@ class Verdict:
     sentence: str
 
 
-def verdicts_of(numbers: Mapping[str, Any], samples: Samples) -> tuple[Verdict, ...]:
+def verdicts_of(numbers: Mapping[str, Any], errors: EstimatorErrors) -> tuple[Verdict, ...]:
     """Judge one estimator.
 
     Parameters
     ----------
     numbers
         Its part of `summary.json`.
-    samples
+    errors
         What it said of the countable sources.
     """
     return (
-        _recall(samples),
+        _recall(errors),
         _false_alarms(numbers["false_alarms_per_frame"]),
-        _range(samples),
-        _bearing(samples),
-        _claims(samples),
+        _range(errors),
+        _bearing(errors),
+        _claims(errors),
     )
 
 
-def _recall(samples: Samples) -> Verdict:
-    total, found = samples.found.size, int(samples.found.sum())
+def _recall(errors: EstimatorErrors) -> Verdict:
+    total, found = errors.found.size, int(errors.found.sum())
     if total == 0:
         return Verdict("Recall", "–", "none", "No source was there to be found.")
     level: Level = "good" if found == total else "fair" if found >= LEAST_RECALL_FAIR * total else "bad"
     if found == total:
         said = f"Found {'the one source' if total == 1 else f'all {total} sources'} that could be seen."
     else:
-        missed = samples.range_m[~samples.found]
+        missed = errors.range_m[~errors.found]
         said = (
             f"Missed {total - found} of {counted(total, 'source')} that could be seen, "
             f"the nearest at {metres(float(missed.min()))}."
@@ -89,13 +89,13 @@ def _false_alarms(per_frame: float | None) -> Verdict:
     return Verdict("False alarms", f"{per_frame:.2g} per frame", level, said)
 
 
-def _range(samples: Samples) -> Verdict:
-    known = np.isfinite(samples.error_m)
+def _range(errors: EstimatorErrors) -> Verdict:
+    known = np.isfinite(errors.error_m)
     if not known.any():
         return Verdict("Range", "–", "none", "No source was ranged.")
-    rmse_m = float(np.sqrt(np.mean(samples.error_m[known] ** 2)))
-    mae_m, bias_m = float(np.mean(np.abs(samples.error_m[known]))), float(np.mean(samples.error_m[known]))
-    compared = excess(samples.error_m, samples.range_limit_m)
+    rmse_m = float(np.sqrt(np.mean(errors.error_m[known] ** 2)))
+    mae_m, bias_m = float(np.mean(np.abs(errors.error_m[known]))), float(np.mean(errors.error_m[known]))
+    compared = excess(errors.error_m, errors.range_limit_m)
     if compared is None:
         return Verdict("Range", f"RMSE {metres(rmse_m)}", "none", "No flare has a finite limit.")
     said = (
@@ -105,16 +105,16 @@ def _range(samples: Samples) -> Verdict:
     return Verdict("Range", f"RMSE {metres(rmse_m)}", _level(compared), said)
 
 
-def _bearing(samples: Samples) -> Verdict:
-    compared = excess(samples.bearing_deg, samples.bearing_limit_deg, directions=2)
+def _bearing(errors: EstimatorErrors) -> Verdict:
+    compared = excess(errors.bearing_deg, errors.bearing_limit_deg, directions=2)
     if compared is None:
         return Verdict("Bearing", "–", "none", "No source was found.")
     said = _against(compared, degrees(compared.limit_rms))
     return Verdict("Bearing", f"RMS {degrees(compared.rms)}", _level(compared), said)
 
 
-def _claims(samples: Samples) -> Verdict:
-    held = honesty(samples.error_m, samples.claimed_m)
+def _claims(errors: EstimatorErrors) -> Verdict:
+    held = honesty(errors.error_m, errors.claimed_m)
     if held is None:
         return Verdict("Claimed σ", "none", "none", "Says nothing about how far its ranges may be off.")
     slight = 1.0 / NEES_SLACK <= held.mean_square <= NEES_SLACK

@@ -1,19 +1,28 @@
-"""What no single field can tell: cameras inside solids, exposures longer than the clock leaves, ..."""
+"""Checks across fields of a document: cameras inside solids, exposures longer than the clock leaves, ..."""
+
+import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.emission import emission_spectrum
-from nir_render.camera.response import efficiency_of
-from nir_render.camera.shutter import row_delay_s
-from nir_render.scene.devices import Camera
-from nir_render.scene.document import SceneDocument
-from nir_render.scene.motion import camera_pose, rotation_of
-from nir_render.scene.world import Box, Cylinder, Dielectric, Pane, Rectangle, ShapeDocument, Sphere
+from nir_render.errors import shown
+from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.document import Robot, SceneDocument
+from nir_render.scene.documents.materials import Dielectric, Pane
+from nir_render.scene.documents.sensor import Sensor
+from nir_render.scene.documents.shapes import Box, Cylinder, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.emission import emission_spectrum
+from nir_render.scene.motion import camera_positions_m, robot_positions_m
+from nir_render.scene.pose import rotation_of
+from nir_render.spectra.nodes import BAND_M
 
-_BAND_M = 940e-9
 _SLACK_M = 1e-15  # what float64 rounds away
 _SLACK = 1e-9
+_MOST_AT_ONCE = 10_000  # poses
+
+Array = NDArray[np.float64]
+Solid = Sphere | Box | Cylinder
 
 
 def check(document: SceneDocument) -> list[str]:
@@ -30,7 +39,12 @@ def check(document: SceneDocument) -> list[str]:
 
 
 def _indivisible_sensors(document: SceneDocument) -> list[str]:
-    problems = [indivisible_sensor(document, name) for name in _observing(document)]
+    if not document.has_indirect_light():
+        return []
+    scale = document.render.indirect.scale
+    problems = [
+        indivisible_sensor(name, camera.sensor, scale) for name, camera in _observing(document).items()
+    ]
     return [problem for problem in problems if problem is not None]
 
 
@@ -45,11 +59,9 @@ def _camera_of(document: SceneDocument, name: str) -> Camera:
     return document.robots[robot].rig.cameras[camera]
 
 
-def indivisible_sensor(document: SceneDocument, name: str) -> str | None:
+def indivisible_sensor(name: str, sensor: Sensor, scale: int) -> str | None:
     """Return what is wrong where the pixels of the indirect light do not fit the sensor of `robot.camera`."""
-    sensor = _camera_of(document, name).sensor
-    scale = document.render.indirect.scale
-    if not document.has_indirect_light() or not (sensor.columns % scale or sensor.rows % scale):
+    if not (sensor.columns % scale or sensor.rows % scale):
         return None
     return (
         f"render.indirect.scale: {scale} does not divide the sensor of {name}, {sensor.columns} × "
@@ -69,7 +81,7 @@ def _exposures_beyond_the_clock(document: SceneDocument) -> list[str]:
         robot, camera_name = name.split(".")
         place = f"robots.{robot}.rig.cameras.{camera_name}"
         rows, auto = camera.sensor.rows, camera.auto_exposure
-        read_out_s = rows * row_delay_s(camera)
+        read_out_s = rows * camera.shutter.row_delay_s
         read_out = f"the read-out of {rows} rows, {1e3 * read_out_s:.4g} ms,"
         if read_out_s > period_s:
             problems.append(
@@ -114,13 +126,13 @@ def _sheets_and_solids(document: SceneDocument) -> list[str]:
         material = document.materials[shape.material]
         if isinstance(material, Pane) and not isinstance(shape, Rectangle):
             problems.append(
-                f"shapes.{name}.material: {shape.material!r} is a pane, a thin sheet: only a rectangle can "
-                f"be of it, not a {shape.type}; solid glass is of the type 'dielectric'"
+                f"shapes.{name}.material: {shown(shape.material)} is a pane, a thin sheet: only a rectangle "
+                f"can be of it, not a {shape.type}; solid glass is of the type 'dielectric'"
             )
         if isinstance(material, Dielectric) and isinstance(shape, Rectangle):
             problems.append(
-                f"shapes.{name}.material: {shape.material!r} is a solid dielectric, and a rectangle has no "
-                "inside; use the type 'pane' for a sheet of glass, or a box"
+                f"shapes.{name}.material: {shown(shape.material)} is a solid dielectric, and a rectangle has "
+                "no inside; use the type 'pane' for a sheet of glass, or a box"
             )
     return problems
 
@@ -146,11 +158,11 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
     if document.sun is not None:
         spectra["sun"] = emission_spectrum(document.sun)
     for place, spectrum in spectra.items():
-        if not spectrum.low_m - _SLACK_M <= _BAND_M <= spectrum.high_m + _SLACK_M:
+        if not spectrum.low_m - _SLACK_M <= BAND_M <= spectrum.high_m + _SLACK_M:
             problems.append(f"{place}: covers {spectrum.range_nm()}, not 940 nm")
     for name, robot in document.robots.items():
         for camera_name, camera in robot.rig.cameras.items():
-            efficiency = efficiency_of(camera)
+            efficiency = camera.sensor.efficiency()
             for place, spectrum in spectra.items():
                 if (
                     efficiency.low_m > spectrum.low_m + _SLACK_M
@@ -166,36 +178,85 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
 
 
 def _cameras_inside_solids(document: SceneDocument) -> list[str]:
+    """Tell of cameras that are in a body at the time of a frame. Meshes are tested when built."""
+    solids = _solids(document.shapes)
+    if not solids:
+        return []
+    clock = document.clock
+    frames_s = clock.start_s + np.arange(clock.frames) / clock.frame_rate_hz
     problems = []
     for name, robot in document.robots.items():
+        # Where the robot stands still, the first frame tells of all.
+        times_s = frames_s if robot.motion else frames_s[:1]
+        places_m = robot_positions_m(robot, times_s)
         for camera_name, camera in robot.rig.cameras.items():
-            for time_s in document.frame_times_s():
-                point_m = camera_pose(robot, camera, time_s).position_m
-                inside = solid_around(document, point_m)
-                if inside is not None:
-                    problems.append(
-                        f"robots.{name}.rig.cameras.{camera_name}: the camera is inside shapes.{inside} "
-                        f"at {time_s:g} s, at [{', '.join(f'{x:.4g}' for x in point_m)}] m; move one of them"
-                    )
-                    break
+            met = [
+                (*found, body_name)
+                for body_name, body in solids.items()
+                if (found := _first_time_inside(body, robot, camera, times_s, places_m)) is not None
+            ]
+            if met:
+                time_s, point_m, inside = min(met, key=lambda found: found[0])
+                problems.append(
+                    f"robots.{name}.rig.cameras.{camera_name}: the camera is inside shapes.{inside} "
+                    f"at {time_s:g} s, at [{', '.join(f'{x:.4g}' for x in point_m)}] m; move one of them"
+                )
     return problems
 
 
-def solid_around(document: SceneDocument, point_m: NDArray[np.float64]) -> str | None:
-    """Return the name of a closed shape that holds a point, or None. Meshes are tested when built."""
-    return next((name for name, body in document.shapes.items() if _contains(body, point_m)), None)
+def _first_time_inside(
+    body: Solid, robot: Robot, camera: Camera, times_s: Array, places_m: Array
+) -> tuple[float, Array] | None:
+    """Return when, of times, a camera is in a body for the first time, and where it is then.
+
+    `places_m` is where its robot is, shape (n, 3): only where that is near enough is the camera looked for,
+    as this takes the robot's orientation.
+    """
+    center_m, radius_m = _bounding_sphere(body)
+    reach_m = (radius_m + float(np.linalg.norm(camera.position_m))) * (1.0 + _SLACK)
+    near = np.flatnonzero(np.linalg.norm(places_m - center_m, axis=-1) <= reach_m)
+    for part in np.split(near, range(_MOST_AT_ONCE, len(near), _MOST_AT_ONCE)):
+        if len(part) == 0:
+            continue
+        points_m = camera_positions_m(robot, camera, times_s[part])
+        inside = np.flatnonzero(_contains(body, points_m))
+        if len(inside):
+            return float(times_s[part[inside[0]]]), points_m[inside[0]]
+    return None
 
 
-def _contains(body: ShapeDocument, point_m: NDArray[np.float64]) -> bool:
+def _bounding_sphere(body: Solid) -> tuple[Array, float]:
+    """Return centre and radius of a sphere around a body."""
     match body:
         case Sphere():
-            return float(np.linalg.norm(point_m - body.center_m)) < body.radius_m
+            return np.array(body.center_m), body.radius_m
         case Box():
-            local_m = (point_m - body.center_m) @ rotation_of(body.orientation)
-            return bool((np.abs(local_m) < 0.5 * np.array(body.size_m)).all())
+            return np.array(body.center_m), 0.5 * float(np.linalg.norm(body.size_m))
+        case Cylinder():
+            start_m, end_m = np.array(body.start_m), np.array(body.end_m)
+            half_m = 0.5 * float(np.linalg.norm(end_m - start_m))
+            return 0.5 * (start_m + end_m), math.hypot(half_m, body.radius_m)
+
+
+def solid_around(shapes: Mapping[str, ShapeDocument], point_m: NDArray[np.float64]) -> str | None:
+    """Return the name of a closed shape that holds a point, or None. Meshes are tested when built."""
+    return next((name for name, body in _solids(shapes).items() if _contains(body, point_m)), None)
+
+
+def _solids(shapes: Mapping[str, ShapeDocument]) -> dict[str, Solid]:
+    return {name: body for name, body in shapes.items() if isinstance(body, Sphere | Box | Cylinder)}
+
+
+def _contains(body: Solid, points_m: Array) -> NDArray[np.bool_]:
+    """Tell which points, shape (..., 3), are in a body, shape (...)."""
+    match body:
+        case Sphere():
+            return np.asarray(np.linalg.norm(points_m - body.center_m, axis=-1) < body.radius_m)
+        case Box():
+            local_m = (points_m - body.center_m) @ rotation_of(body.orientation)
+            return np.asarray((np.abs(local_m) < 0.5 * np.array(body.size_m)).all(axis=-1))
         case Cylinder():
             axis = np.subtract(body.end_m, body.start_m)
-            along = float((point_m - body.start_m) @ axis / (axis @ axis))
-            off_m = float(np.linalg.norm(point_m - body.start_m - along * axis))
-            return 0.0 < along < 1.0 and off_m < body.radius_m
-    return False
+            along = (points_m - body.start_m) @ axis / (axis @ axis)
+            off_m = np.linalg.norm(points_m - body.start_m - along[..., None] * axis, axis=-1)
+            return np.asarray((along > 0.0) & (along < 1.0) & (off_m < body.radius_m))

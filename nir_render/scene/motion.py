@@ -1,53 +1,20 @@
-"""Poses: where robots, and what they carry, are at a time.
-
-A pose takes local coordinates to outer ones: x_outer = rotation @ x_local + position.
-"""
-
-from dataclasses import dataclass
-from typing import Self
+"""Motion: where the robots of a scene file, and what they carry, stand at a time."""
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
-from nir_render.scene.devices import Camera
-from nir_render.scene.document import Robot
-from nir_render.scene.fields import Orientation
-
-# Columns: the camera's x (right), y (down) and z (forward) in a mount that looks along x, y left, z up.
-_MOUNT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """A rotation, shape (3, 3), and a position in metres, shape (3,)."""
-
-    rotation: NDArray[np.float64]
-    position_m: NDArray[np.float64]
-
-    def __matmul__(self, inner: Self) -> "Pose":
-        """Return the pose of what stands at `inner` within this one."""
-        return Pose(self.rotation @ inner.rotation, self.rotation @ inner.position_m + self.position_m)
-
-    def to_local(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return outer points, shape (..., 3), in this pose's coordinates."""
-        return (points_m - self.position_m) @ self.rotation
-
-
-def rotation_of(orientation: Orientation) -> NDArray[np.float64]:
-    """Return the rotation matrix of yaw, pitch and roll, shape (3, 3)."""
-    angles_rad = [orientation.yaw_rad, orientation.pitch_rad, orientation.roll_rad]
-    return np.asarray(Rotation.from_euler("ZYX", angles_rad).as_matrix())
+from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.document import Robot, Waypoint
+from nir_render.scene.pose import Pose, rotation_of
 
 
 def robot_pose(robot: Robot, time_s: float) -> Pose:
     """Return the robot's pose in the world; before its first and after its last waypoint it stands still."""
     if not robot.motion:
         return Pose(rotation_of(robot.orientation), np.array(robot.position_m))
-    # A waypoint is two knots, its arrival and the end of its hold; np.interp and Slerp want them to increase.
-    stops = [(way.time_s, way) for way in robot.motion]
-    stops += [(way.time_s + way.hold_s, way) for way in robot.motion if way.hold_s > 0.0]
-    stops.sort(key=lambda stop: stop[0])
+    from scipy.spatial.transform import Rotation, Slerp
+
+    stops = _stops(robot)
     times_s = np.array([time for time, _ in stops])
     now_s = float(np.clip(time_s, times_s[0], times_s[-1]))
     positions_m = np.array([way.position_m for _, way in stops])
@@ -58,11 +25,31 @@ def robot_pose(robot: Robot, time_s: float) -> Pose:
     return Pose(Slerp(times_s, Rotation.from_matrix(np.array(rotations)))(now_s).as_matrix(), position_m)
 
 
-def camera_pose_on_robot(camera: Camera) -> Pose:
-    """Return the pose of the camera's axes (x right, y down, z forward) on its robot."""
-    return Pose(rotation_of(camera.orientation) @ _MOUNT_FROM_CAMERA, np.array(camera.position_m))
+def _stops(robot: Robot) -> list[tuple[float, Waypoint]]:
+    """Return the knots of a motion: a waypoint is two, its arrival and the end of its hold; they increase."""
+    stops = [(way.time_s, way) for way in robot.motion]
+    stops += [(way.time_s + way.hold_s, way) for way in robot.motion if way.hold_s > 0.0]
+    return sorted(stops, key=lambda stop: stop[0])
 
 
-def camera_pose(robot: Robot, camera: Camera, time_s: float) -> Pose:
-    """Return the pose of the camera's axes in the world at a time."""
-    return robot_pose(robot, time_s) @ camera_pose_on_robot(camera)
+def robot_positions_m(robot: Robot, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where a robot is at times, shape (n,), in the world, shape (n, 3), without its orientation."""
+    if not robot.motion:
+        return np.broadcast_to(np.array(robot.position_m), (len(times_s), 3))
+    knots_s, ways = zip(*_stops(robot), strict=True)
+    knots_m = np.array([way.position_m for way in ways])
+    return np.stack([np.interp(times_s, knots_s, knots_m[:, axis]) for axis in range(3)], axis=-1)
+
+
+def camera_positions_m(robot: Robot, camera: Camera, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where a camera is at times, shape (n,), in the world, shape (n, 3)."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    ground_m = robot_positions_m(robot, times_s)
+    if not robot.motion:
+        return ground_m + rotation_of(robot.orientation) @ camera.position_m
+    knots_s, ways = zip(*_stops(robot), strict=True)
+    turns = Rotation.from_matrix(np.array([rotation_of(way.orientation) for way in ways]))
+    if len(turns) > 1:
+        turns = Slerp(knots_s, turns)(np.clip(times_s, knots_s[0], knots_s[-1]))
+    return np.asarray(ground_m + turns.apply(camera.position_m))

@@ -2,22 +2,22 @@
 
 from typing import Any
 
-from nir_render.scene import devices, world
-from nir_render.scene.bandpass import Bandpass
-from nir_render.scene.base import PresetDocument, preset_names
-from nir_render.scene.document import SceneDocument
-from nir_render.scene.lens import Lens
-from nir_render.scene.sensor import Sensor
-from nir_render.scene.units import VISIBILITY
+from nir_render.scene.documents.camera import Camera, Rig
+from nir_render.scene.documents.document import SceneDocument
+from nir_render.scene.documents.emitters import Lamp, Source
+from nir_render.scene.documents.files import PresetDocument, preset_names
+from nir_render.scene.documents.lens import Bandpass, Lens
+from nir_render.scene.documents.sensor import Sensor
+from nir_render.scene.text.units import VISIBILITY
 
 _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
-    devices.Source,
+    Source,
     Lens,
     Bandpass,
     Sensor,
-    devices.Camera,
-    devices.Rig,
-    world.Lamp,
+    Camera,
+    Rig,
+    Lamp,
 )
 
 

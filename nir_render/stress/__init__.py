@@ -2,5 +2,5 @@
 
 The way of the data: a campaign document (`campaign`, its `axes`) becomes jobs (`jobs`), which worker
 processes do one by one (`execute`, `workers`), each leaving one file; the files become one table (`table`),
-of which `figures` and `limits` are made.
+of which `metrics` and their `reach` are made.
 """

@@ -9,10 +9,14 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import yaml
 from pydantic import Field, model_validator
 
-from nir_render.scene.base import Document
-from nir_render.scene.units import Reading, read_quantity
+from nir_render.errors import shown
+from nir_render.scene.documents.base import Document, KeyProblem
+from nir_render.scene.text.units import Reading, read_quantity
 
 MOST_VALUES = 1000
+
+DottedPath = Annotated[str, Field(max_length=200)]
+Label = Annotated[str, Field(max_length=100)]
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,10 @@ class AxisDocument(Document):
 
     example: ClassVar[str] = "{path: robots.r2.position.x, from: 1 m, to: 6 m, count: 6}"
 
-    path: str | Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    title: str | None = None
+    path: DottedPath | Annotated[tuple[DottedPath, ...], Field(min_length=1)] | None = None
+    title: Label | None = None
     values: Annotated[tuple[Any, ...], Field(min_length=1, max_length=MOST_VALUES)] | None = None
-    labels: tuple[str, ...] | None = None
+    labels: tuple[Label, ...] | None = None
     start: Annotated[Any, Field(alias="from")] = None
     to: Any = None
     count: Annotated[int, Field(ge=2, le=MOST_VALUES)] | None = None
@@ -77,9 +81,9 @@ class AxisDocument(Document):
     read_keys: ClassVar[tuple[str, ...]] = ("from",)
 
     @classmethod
-    def check_keys(cls, data: Any) -> None:
+    def key_problems(cls, data: Any) -> list[KeyProblem]:
         """Look at the keys alone: values of an axis may be anything that a scene file holds."""
-        super().check_keys(dict.fromkeys(data) if isinstance(data, Mapping) else data)
+        return super().key_problems(dict.fromkeys(data) if isinstance(data, Mapping) else data)
 
     @model_validator(mode="before")
     @classmethod
@@ -111,14 +115,14 @@ class AxisDocument(Document):
         values = self._range() if self.values is None else self.values
         read = [read_quantity(value) for value in values]
         title = self.title or (name if self.path is not None else name.rpartition(".")[2].replace("_", " "))
-        known = [one for one in read if one is not None]
-        if self.labels is not None or None in read or len({one.quantity for one in known}) > 1:
+        readings = [reading for reading in read if reading is not None]
+        if self.labels is not None or None in read or len({reading.quantity for reading in readings}) > 1:
             labels = self.labels or tuple(_label(value) for value in values)
             _refuse_repeats(labels)
             return Axis(name, title, paths, values, labels)
-        unit = known[0].unit
-        si = tuple(one.value_si for one in known)
-        numbers = tuple(_in_unit(one, known[0]) for one in known)
+        unit = readings[0].unit
+        si = tuple(reading.value_si for reading in readings)
+        numbers = tuple(_in_unit(reading, readings[0]) for reading in readings)
         labels = tuple(f"{number:.4g} {unit}".rstrip() for number in numbers)
         _refuse_repeats(si)
         if len(set(labels)) != len(labels):
@@ -149,15 +153,15 @@ class AxisDocument(Document):
         first, last = read_quantity(self.start), read_quantity(self.to)
         if first is None or last is None:
             wrong = self.start if first is None else self.to
-            raise ValueError(f"{wrong!r} is no number with a unit; a range goes such as {self.example}")
+            raise ValueError(f"{shown(wrong)} is no number with a unit; a range goes such as {self.example}")
         if first.quantity is not last.quantity:
             raise ValueError(
-                f"{self.start!r} and {self.to!r} are a {first.quantity.name} and a {last.quantity.name}; "
-                "wanted two of one kind"
+                f"{shown(self.start)} and {shown(self.to)} are a {first.quantity.name} and a "
+                f"{last.quantity.name}; wanted two of one kind"
             )
         begin, end = first.number, _in_unit(last, first)
         if begin == end:
-            raise ValueError("'from' and 'to' are the same")
+            raise ValueError("'from' and 'to' are the same; write two ends")
         count = self.count or 2
         if self.spacing == "log" and min(begin, end) <= 0.0:
             raise ValueError("a log range needs 'from' and 'to' above 0")
@@ -176,19 +180,19 @@ class AxisDocument(Document):
         return tuple(f"{number:.12g} {first.unit}" for number in rounded)
 
 
-def _in_unit(one: Reading, of: Reading) -> float:
+def _in_unit(reading: Reading, like: Reading) -> float:
     """Return a number in the unit of another; in its own it keeps its digits."""
-    if one.unit == of.unit:
-        return one.number
-    unit = read_quantity(f"1 {of.unit}")
-    assert unit is not None  # noqa: S101 (it was read before)
-    return float(f"{one.value_si / unit.value_si:.12g}")
+    if reading.unit == like.unit:
+        return reading.number
+    unit = read_quantity(f"1 {like.unit}")
+    assert unit is not None  # it was read before
+    return float(f"{reading.value_si / unit.value_si:.12g}")
 
 
 def _refuse_repeats(values: tuple[Any, ...]) -> None:
     for value in values:
         if values.count(value) > 1:
-            raise ValueError(f"the value {value!r} stands twice")
+            raise ValueError(f"the value {shown(value)} stands twice; take one of them out")
 
 
 def _label(value: Any) -> str:

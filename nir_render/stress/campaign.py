@@ -1,6 +1,7 @@
 """A campaign document: which scene is swept along which axes, and what is to hold there."""
 
 import difflib
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,15 +10,19 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
-from nir_render.errors import InputError
-from nir_render.scene.base import Document, document_key, read_yaml
-from nir_render.scene.explain import explain
-from nir_render.scene.load import Scene, load_scene
-from nir_render.stress.axes import Axis, AxisDocument
-from nir_render.stress.figures import FIGURES, Bound, known_figure, parse_bound
+from nir_render.errors import InputError, shown
+from nir_render.scene.documents.base import Document, document_key
+from nir_render.scene.documents.files import exists
+from nir_render.scene.explain import Places, explain
+from nir_render.scene.load import load_scene
+from nir_render.scene.scene import Scene
+from nir_render.scene.text.yaml_text import read_yaml
+from nir_render.stress.axes import Axis, AxisDocument, DottedPath
+from nir_render.stress.metrics import METRICS, Bound, known_metric, parse_bound
 
-_MOST_SEEDS = 100_000
-_DEFAULT_FIGURES = ("range_rmse", "recall", "ranged", "false_alarms")
+MOST_JOBS = 100_000
+_MOST_CHECKED = 200  # values of axes, each of which makes a scene
+_DEFAULT_METRICS = ("range_rmse", "recall", "ranged", "false_alarms")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +30,7 @@ class Campaign:
     """A campaign, read and checked, but for its combinations of values.
 
     `scene` is the base scene with the campaign's own changes; `settings` are these, by dotted path.
-    `figures` are names of `FIGURES`; those with a bound are among them. `path` names the file in errors.
+    `metrics` are names of `METRICS`; those with a bound are among them. `path` names the file in errors.
     """
 
     name: str
@@ -35,7 +40,7 @@ class Campaign:
     axes: tuple[Axis, ...]
     seeds: tuple[int, ...]
     estimators: tuple[str, ...]
-    figures: tuple[str, ...]
+    metrics: tuple[str, ...]
     bounds: tuple[Bound, ...]
     path: str
 
@@ -48,17 +53,15 @@ class CampaignDocument(Document):
     """
 
     format: Literal[1]
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]*$")]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}$")]
     description: str = ""
     scene: str
-    settings: Annotated[dict[str, Any], Field(alias="set")] = {}
-    axes: Annotated[dict[str, AxisDocument], Field(min_length=1)]
-    seeds: Annotated[int, Field(ge=1, le=_MOST_SEEDS)] | Annotated[tuple[int, ...], Field(min_length=1)] = (
-        1,
-    )
+    settings: Annotated[dict[DottedPath, Any], Field(alias="set")] = {}
+    axes: Annotated[dict[DottedPath, AxisDocument], Field(min_length=1)]
+    seeds: Annotated[int, Field(ge=1, le=MOST_JOBS)] | Annotated[tuple[int, ...], Field(min_length=1)] = (1,)
     estimators: Annotated[tuple[str, ...], Field(min_length=1)] = ("paper", "robust")
-    figures: Annotated[tuple[str, ...], Field(min_length=1)] = _DEFAULT_FIGURES
-    bounds: dict[str, Any] = {}
+    figures: Annotated[tuple[str, ...], Field(min_length=1)] = _DEFAULT_METRICS
+    bounds: dict[DottedPath, Any] = {}
 
     read_keys: ClassVar[tuple[str, ...]] = ("set",)
 
@@ -71,8 +74,8 @@ class CampaignDocument(Document):
 
     @field_validator("figures")
     @classmethod
-    def _figures_known(cls, figures: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(known_figure(name) for name in figures))
+    def _metrics_known(cls, figures: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(known_metric(name) for name in figures))
 
 
 def load_campaign(path: str | Path) -> Campaign:
@@ -84,36 +87,46 @@ def load_campaign(path: str | Path) -> Campaign:
         A line per problem. What only a combination of values does wrong is found by `jobs.plan`.
     """
     file = Path(path)
-    if not file.is_file():
-        raise InputError(f"{file}: there is no such campaign file")
+    if not exists(file):
+        raise InputError(f"{file}: there is no such campaign file; check its name and folder")
     try:
         raw = read_yaml(file)
     except ValueError as error:
-        raise InputError(str(error)) from None
+        raise InputError(*str(error).split("\n")) from None
     if isinstance(raw, Mapping) and "robots" in raw and "axes" not in raw:
         raise InputError(f"{file}: is a scene; a campaign names one ('scene: …') and 'axes' to change in it")
     try:
         document = CampaignDocument.model_validate(raw)
     except ValidationError as error:
         raise InputError(*explain(error, raw, str(file))) from None
+    places = Places(str(file))
     problems: list[str] = []
     axes, bounds = [], []
     for name, written in document.axes.items():
         try:
             axes.append(written.axis(name))
         except ValueError as error:
-            problems.append(f"{file}: axes.{name}: {error}")
+            problems.append(places.tell(("axes", name), ("axes", name), str(error)))
     for name, value in document.bounds.items():
         try:
             bounds.append(parse_bound(name, value))
         except ValueError as error:
-            problems.append(f"{file}: bounds.{name}: {error}")
+            problems.append(places.tell(("bounds", name), ("bounds", name), str(error)))
     problems += [f"{file}: {problem}" for problem in _clashes(axes, document.settings)]
+    estimators = tuple(dict.fromkeys(_beside(file, name) for name in document.estimators))
+    place = ("estimators",)
+    problems += [places.tell(place, place, problem) for problem in _not_estimators(estimators)]
+    seeds = range(1, document.seeds + 1) if isinstance(document.seeds, int) else document.seeds
+    sizes = [len(axis.values) for axis in axes]
+    if not problems and math.prod(sizes) * len(seeds) > MOST_JOBS:
+        problems.append(
+            f"{file}: {' × '.join(map(str, sizes))} values and {len(seeds)} seeds are "
+            f"{math.prod(sizes) * len(seeds)} jobs; at most {MOST_JOBS} are taken at once: split the campaign"
+        )
     if problems:
         raise InputError(*problems)
-    scene = _base_scene(file, document)
-    _check_axes(file, scene, axes)
-    seeds = range(1, document.seeds + 1) if isinstance(document.seeds, int) else document.seeds
+    scene = _base_scene(file, document, places)
+    _check_axes(places, scene, axes)
     return Campaign(
         document.name,
         document.description,
@@ -121,11 +134,32 @@ def load_campaign(path: str | Path) -> Campaign:
         document.settings,
         tuple(axes),
         tuple(seeds),
-        tuple(dict.fromkeys(_beside(file, name) for name in document.estimators)),
-        tuple(name for name in FIGURES if name in document.figures or name in document.bounds),
+        estimators,
+        tuple(name for name in METRICS if name in document.figures or name in document.bounds),
         tuple(bounds),
         str(file),
     )
+
+
+def campaign_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of what a person writes; an axis may be values alone."""
+    from perception import ESTIMATORS  # the stack loads where it is asked for: scenes are validated without
+
+    schema = CampaignDocument.model_json_schema(by_alias=True)
+    definitions, properties = schema["$defs"], schema["properties"]
+    values = {"type": "array", "minItems": 1, "description": "the values; the axis's name is the dotted path"}
+    definitions["AxisDocument"] = {"title": "Axis", "anyOf": [values, definitions["AxisDocument"]]}
+    metrics = {name: {"description": metric.explained} for name, metric in METRICS.items()}
+    properties["bounds"] = {
+        "type": "object",
+        "properties": {name: {**own, "type": ["string", "number"]} for name, own in metrics.items()},
+        "additionalProperties": False,
+    }
+    properties["figures"]["items"] = {"enum": list(METRICS)}
+    properties["estimators"]["items"] = {"type": "string", "examples": [*ESTIMATORS, "file.py:function"]}
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "nir_render campaign"
+    return schema
 
 
 def is_campaign(path: Path) -> bool:
@@ -137,17 +171,21 @@ def is_campaign(path: Path) -> bool:
     return isinstance(raw, Mapping) and "axes" in raw
 
 
-def _base_scene(file: Path, document: CampaignDocument) -> Scene:
+def _base_scene(file: Path, document: CampaignDocument, places: Places) -> Scene:
     try:
         return load_scene(os.path.normpath(file.parent / document.scene), document.settings)
     except InputError as error:
-        raise InputError(*(f"{file}: scene: {_bare(problem)}" for problem in error.problems)) from None
+        told = (places.tell(("scene",), ("scene",), _bare(problem)) for problem in error.problems)
+        raise InputError(*told) from None
 
 
-def _check_axes(file: Path, scene: Scene, axes: list[Axis]) -> None:
-    """Refuse an axis whose path is no part of the scene, or a value that is none for it."""
+def _check_axes(places: Places, scene: Scene, axes: list[Axis]) -> None:
+    """Refuse an axis whose path is no part of the scene, or a value that is none for it.
+
+    Of very many values some are tried, first and last among them: what else is wrong `jobs.plan` finds.
+    """
     nowhere = [
-        f"{file}: axes.{axis.name}: {problem}"
+        places.tell(("axes", axis.name), ("axes", axis.name), problem)
         for axis in axes
         for path in axis.paths
         for problem in _nowhere(scene.document, path)
@@ -160,12 +198,20 @@ def _check_axes(file: Path, scene: Scene, axes: list[Axis]) -> None:
             path: value for other in axes if other is not axis for path, value in other.settings(0).items()
         }
         problems: list[str] = []
-        for index, label in enumerate(axis.labels):
+        for index in _spread(len(axis.labels), _MOST_CHECKED // len(axes)):
+            label = axis.labels[index] if len(axis.labels[index]) <= 100 else shown(axis.labels[index])
             alone = _problems(scene, axis.settings(index))
             if alone and _problems(scene, {**others, **axis.settings(index)}):
-                problems += [f"{file}: axes.{axis.name}: {label}: {_bare(one)}" for one in alone]
+                place = ("axes", axis.name)
+                problems += [places.tell(place, place, f"{label}: {_bare(problem)}") for problem in alone]
         if problems:
             raise InputError(*problems)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """Return indices below `count`, all or at most `most` of them, evenly from the first to the last."""
+    tried = min(count, max(most, 2))
+    return [round(number * (count - 1) / max(tried - 1, 1)) for number in range(tried)]
 
 
 def _nowhere(document: Document, path: str) -> Iterator[str]:
@@ -187,7 +233,7 @@ def _nowhere(document: Document, path: str) -> Iterator[str]:
                 near = difflib.get_close_matches(key, node, n=1)
                 hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(node) or 'none'}"
                 yield (
-                    f"there is no {key!r} in {'.'.join(way[:depth])}; {hint} "
+                    f"there is no {shown(key)} in {'.'.join(way[:depth])}; {hint} "
                     "(what is new is written in the scene, or under 'set')"
                 )
                 return
@@ -223,6 +269,17 @@ def _clashes(axes: list[Axis], settings: Mapping[str, Any]) -> list[str]:
 def _beside(file: Path, estimator: str) -> str:
     """Return an estimator's name; one's own, `file.py:function`, counts from the campaign's folder."""
     return str(file.parent / estimator) if ".py" in estimator else estimator
+
+
+def _not_estimators(names: Sequence[str]) -> list[str]:
+    """Return what is wrong with estimators: unknown ones, files that cannot be loaded, two of one name."""
+    from nir_render.run.perceive import chosen_estimators
+
+    try:
+        chosen_estimators(names)
+    except InputError as error:
+        return [problem.removeprefix("--estimator ") for problem in error.problems]
+    return []
 
 
 def _bare(problem: str) -> str:

@@ -1,4 +1,4 @@
-"""Where a figure, known at the values of an axis, keeps its bound: spans between crossings, and how sure."""
+"""One metric along one axis: where it crosses its bound, between which values it keeps it, and how sure."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.stress.figures import Figure, Values
+from nir_render.stress.metrics import Metric, Values
 
 Reason = Literal["crossing", "end", "nothing there", "not defined"]
 _LOW, _HIGH = 0.16, 0.84
@@ -16,8 +16,8 @@ _LOW, _HIGH = 0.16, 0.84
 class Edge:
     """One end of a span, in the axis's own unit.
 
-    `reason` says why it ends there: the figure crosses the bound (`value` is interpolated between the two
-    neighbours); the axis ends; or the next value has nothing to judge, or no figure, and `value` is the last
+    `reason` says why it ends there: the metric crosses the bound (`value` is interpolated between the two
+    neighbours); the axis ends; or the next value has nothing to judge, or no metric, and `value` is the last
     that holds. `low` and `high` hold 68 of 100 repetitions, and `value`; None where nothing was repeated.
     `within` are the axis's values between which repetitions were searched for this crossing: those of no
     other span. An end of the interval is infinite where a repetition has none there: it keeps the bound
@@ -42,15 +42,15 @@ class Span:
 def spans(
     x: Values,
     log: bool,
-    figure: Figure,
+    metric: Metric,
     bound: float,
     value: Values,
     asked: NDArray[np.bool_],
     draws: Values | None,
 ) -> tuple[Span, ...]:
-    """Return the intervals of an axis in which a figure keeps its bound, in order.
+    """Return the intervals of an axis in which a metric keeps its bound, in order.
 
-    Between neighbours the figure is taken as a straight line, in the logarithm where it is an error above 0
+    Between neighbours the metric is taken as a straight line, in the logarithm where it is an error above 0
     and against the logarithm of the axis where `log`.
 
     Parameters
@@ -58,15 +58,15 @@ def spans(
     x
         The axis's values, increasing, shape (n,).
     value
-        The figure there, shape (n,); NaN where it is not defined.
+        The metric there, shape (n,); NaN where it is not defined.
     asked
         Whether there was anything to judge, shape (n,).
     draws
-        The figure in repetitions, shape (repetitions, n); None where there are none.
+        The metric in repetitions, shape (repetitions, n); None where there are none.
     """
     scaled = np.log(x) if log else x
-    holds = figure.holds(value, bound)
-    places = _crossings(scaled, figure, bound, value[None])[0]
+    holds = metric.holds(value, bound)
+    places = _crossings(scaled, metric, bound, value[None])[0]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
     found = []
     # Repetitions are searched for a crossing where no other span is: for a start after the span before has
@@ -76,27 +76,27 @@ def spans(
         start = _edge(x, log, first - 1, first, places, value, asked)
         end = _edge(x, log, after - 1, after, places, value, asked)
         if draws is not None:
-            again = _crossings(scaled, figure, bound, draws)
-            kept = figure.holds(draws, bound)
+            crossings = _crossings(scaled, metric, bound, draws)
+            kept = metric.holds(draws, bound)
             start = _with_interval(
-                start, x[left:after], log, again[:, left : after - 1], kept[:, left:after], falls=False
+                start, x[left:after], log, crossings[:, left : after - 1], kept[:, left:after], falls=False
             )
             end = _with_interval(
-                end, x[first:right], log, again[:, first : right - 1], kept[:, first:right], falls=True
+                end, x[first:right], log, crossings[:, first : right - 1], kept[:, first:right], falls=True
             )
         found.append(Span(start, end))
     return tuple(found)
 
 
-def kept_length(x: Values, log: bool, figure: Figure, bound: float, value: Values) -> Values:
-    """Return over how much of an axis a figure keeps its bound, in x or its logarithm.
+def kept_length(x: Values, log: bool, metric: Metric, bound: float, value: Values) -> Values:
+    """Return over how much of an axis a metric keeps its bound, in x or its logarithm.
 
-    The sum of what `spans` gives, for many figures at once: `value` has the shape (…, n).
+    The sum of what `spans` gives, for many metrics at once: `value` has the shape (…, n).
     """
     scaled = np.log(x) if log else x
-    holds = figure.holds(value, bound)
+    holds = metric.holds(value, bound)
     left, right = holds[..., :-1], holds[..., 1:]
-    place = _crossings(scaled, figure, bound, value)
+    place = _crossings(scaled, metric, bound, value)
     part = np.where(left & right, np.diff(scaled), 0.0)
     part = np.where(left & ~right, place - scaled[:-1], part)
     part = np.where(~left & right, scaled[1:] - place, part)
@@ -113,17 +113,17 @@ def interval(draws: Values) -> tuple[float, float]:
     return float(ordered[int(low)]), float(ordered[int(high)])
 
 
-def _crossings(scaled: Values, figure: Figure, bound: float, value: Values) -> Values:
+def _crossings(scaled: Values, metric: Metric, bound: float, value: Values) -> Values:
     """Return where each gap between neighbours crosses the bound, shape (…, n − 1); NaN where it does not.
 
     Beside a value that is not defined, the neighbour that holds is the last.
     """
-    size = value if figure.higher_is_better else np.abs(value)
-    holds = figure.holds(value, bound)
+    size = value if metric.higher_is_better else np.abs(value)
+    holds = metric.holds(value, bound)
     left, right = size[..., :-1], size[..., 1:]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (bound - left) / (right - left)
-        if not figure.higher_is_better and bound > 0.0:
+        if not metric.higher_is_better and bound > 0.0:
             by_ratio = (np.log(bound) - np.log(left)) / (np.log(right) - np.log(left))
             share = np.where((left > 0.0) & (right > 0.0), by_ratio, share)
     share = np.where(np.isfinite(left) & np.isfinite(right), share, np.where(holds[..., :-1], 0.0, 1.0))
@@ -139,14 +139,14 @@ def _edge(
     if right == x.size:
         return Edge(float(x[-1]), "end")
     place = float(np.exp(places[left]) if log else places[left])
-    for side, other in ((left, right), (right, left)):
-        if not np.isfinite(value[side]):
-            return Edge(float(x[other]), "not defined" if asked[side] else "nothing there")
+    for outside, inside in ((left, right), (right, left)):
+        if not np.isfinite(value[outside]):
+            return Edge(float(x[inside]), "not defined" if asked[outside] else "nothing there")
     return Edge(place, "crossing")
 
 
 def _with_interval(
-    edge: Edge, x: Values, log: bool, again: Values, kept: NDArray[np.bool_], *, falls: bool
+    edge: Edge, x: Values, log: bool, crossings: Values, kept: NDArray[np.bool_], *, falls: bool
 ) -> Edge:
     """Find the same crossing in each repetition: the nearest in the same direction.
 
@@ -157,7 +157,7 @@ def _with_interval(
     ----------
     x
         The axis's values in which to search, shape (m,).
-    again, kept
+    crossings, kept
         Where each repetition crosses the bound, shape (repetitions, m − 1), and where it keeps it,
         shape (repetitions, m).
     """
@@ -165,11 +165,11 @@ def _with_interval(
         return edge
     place = np.log(edge.value) if log else edge.value
     same = kept[:, :-1] if falls else kept[:, 1:]
-    away = np.where(np.isfinite(again) & same, np.abs(again - place), np.inf)
+    away = np.where(np.isfinite(crossings) & same, np.abs(crossings - place), np.inf)
     nearest = np.argmin(away, axis=1)
-    rows = np.arange(len(again))
+    rows = np.arange(len(crossings))
     beyond = np.where(kept[:, -1] if falls else ~kept[:, 0], np.inf, -np.inf)
-    low, high = interval(np.where(np.isfinite(away[rows, nearest]), again[rows, nearest], beyond))
+    low, high = interval(np.where(np.isfinite(away[rows, nearest]), crossings[rows, nearest], beyond))
     low, high = (float(np.exp(end)) if log and np.isfinite(end) else end for end in (low, high))
     return Edge(
         edge.value, edge.reason, min(low, edge.value), max(high, edge.value), (float(x[0]), float(x[-1]))

@@ -5,16 +5,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from nir_render.evaluate.lamps import lamp_outlines_px
 from nir_render.evaluate.metrics import Evaluation, Score, angle_deg, evaluate
-from nir_render.scene.load import Scene
-from nir_render.simulate import Shot, simulate
+from nir_render.scene.scene import Scene
+from nir_render.simulation.calibration import calibration
+from nir_render.simulation.clock import Shot, simulate
 from nir_render.transport.cache import LightCache
 from perception import Calibration, Detection, Estimator, detect
 
 Row = dict[str, Any]
 
-_OF_TRUTH = (
+_TRUTH_FIELDS = (
     *(
         "robot",
         "source",
@@ -27,7 +27,7 @@ _OF_TRUTH = (
     ),
     *("background_e", "peak_snr", "saturated_px"),
 )
-_SAID = (
+_DETECTION_FIELDS = (
     *("u_px", "v_px", "u_sigma_px", "v_sigma_px", "flux_dn", "mean_dn", "background_dn", "area_px"),
     *("saturated", "merged", "range_m", "range_sigma_m"),
 )
@@ -52,33 +52,36 @@ def execute(
         camera = shot.frame.camera
         hashed.update(f"{camera} {shot.frame.index}\0".encode() + shot.frame.data_dn.tobytes())
         if camera not in calibrations:
-            calibrations[camera] = scene.calibration(camera)
-        found = {name: detect(shot.frame, calibrations[camera], one) for name, one in estimators.items()}
+            calibrations[camera] = calibration(scene, camera)
+        found = {
+            name: detect(shot.frame, calibrations[camera], estimator)
+            for name, estimator in estimators.items()
+        }
         rows += _rows(scene, shot, calibrations[camera], found)
     return rows, hashed.hexdigest()
 
 
 def _rows(
-    scene: Scene, shot: Shot, calibration: Calibration, found: Mapping[str, Sequence[Detection]]
+    scene: Scene, shot: Shot, known: Calibration, found: Mapping[str, Sequence[Detection]]
 ) -> list[Row]:
     frame = shot.frame
     key = (frame.camera, frame.index)
-    lamps = {key: lamp_outlines_px(scene, frame.camera, frame.time_s)}
-    result = evaluate([key], shot.truth, {frame.camera: calibration}, found, lamps)
+    result = evaluate([key], shot.truth, {frame.camera: known}, found, shot.lamps)
     at = {"camera": frame.camera, "index": frame.index, "time_s": frame.time_s}
     rows: list[Row] = []
     for name in found:
-        of_estimator = {**at, "estimator": name}
-        rows.append({**of_estimator, "kind": "frame", **_of_frame(scene, shot, result, name)})
+        estimator_fields = {**at, "estimator": name}
+        rows.append({**estimator_fields, "kind": "frame", **_frame_fields(scene, shot, result, name)})
         for kind, scores in (("source", result.scores), ("ghost", result.ghosts)):
-            rows += [{**of_estimator, "kind": kind, **_of_source(score, name)} for score in scores]
+            rows += [{**estimator_fields, "kind": kind, **_source_fields(score, name)} for score in scores]
         rows += [
-            {**of_estimator, "kind": "false_alarm", **_said(alarm)} for alarm in result.false_alarms[name]
+            {**estimator_fields, "kind": "false_alarm", **_detection_fields(alarm)}
+            for alarm in result.false_alarms[name]
         ]
     return rows
 
 
-def _of_frame(scene: Scene, shot: Shot, result: Evaluation, name: str) -> Row:
+def _frame_fields(scene: Scene, shot: Shot, result: Evaluation, name: str) -> Row:
     counts = result.summary["estimators"][name]
     return {
         "exposure_s": shot.frame.exposure_s,
@@ -91,27 +94,27 @@ def _of_frame(scene: Scene, shot: Shot, result: Evaluation, name: str) -> Row:
     }
 
 
-def _of_source(score: Score, name: str) -> Row:
-    truth, said = score.truth, score.detections.get(name)
-    row: Row = {field: getattr(truth, field) for field in _OF_TRUTH}
+def _source_fields(score: Score, name: str) -> Row:
+    truth, detection = score.truth, score.detections.get(name)
+    row: Row = {field: getattr(truth, field) for field in _TRUTH_FIELDS}
     row |= {"true_u_px": truth.u_px, "true_v_px": truth.v_px, "true_range_m": truth.range_m}
     row |= {
         "range_limit_m": _or_none(score.range_limit_m),
         "bearing_limit_deg": _or_none(score.bearing_limit_deg),
     }
-    row |= {"countable": score.countable, "found": said is not None}
-    row["ranged"] = said is not None and math.isfinite(said.range_m)
-    if said is not None:
-        row |= _said(said)
-        row["range_error_m"] = _or_none(said.range_m - truth.range_m)
-        row["bearing_error_deg"] = angle_deg(said.bearing_body, truth.bearing_body)
+    row |= {"countable": score.countable, "found": detection is not None}
+    row["ranged"] = detection is not None and math.isfinite(detection.range_m)
+    if detection is not None:
+        row |= _detection_fields(detection)
+        row["range_error_m"] = _or_none(detection.range_m - truth.range_m)
+        row["bearing_error_deg"] = angle_deg(detection.bearing_body, truth.bearing_body)
     return row
 
 
-def _said(detection: Detection) -> Row:
+def _detection_fields(detection: Detection) -> Row:
     return {
         field: _or_none(value) if isinstance(value := getattr(detection, field), float) else value
-        for field in _SAID
+        for field in _DETECTION_FIELDS
     }
 
 

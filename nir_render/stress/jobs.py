@@ -10,17 +10,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from nir_render import run
 from nir_render.errors import InputError
-from nir_render.scene.load import Scene
+from nir_render.run.manifest import versions as run_versions
+from nir_render.run.perceive import chosen_estimators
+from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
-from perception.own_estimator import OwnEstimator
+from nir_render.transport.fingerprint import code_hash
+from perception.estimators import OwnEstimator
 
-MOST_JOBS = 100_000
 # What shows results, and what is asked for, do not change them.
 _NOT_IN_A_RESULT = (
-    *("report/", "regress/", "export/", "cli.py", "console.py", "doctor.py", "examples.py", "estimate.py"),
-    *("calibrate_run.py", "stress/"),
+    *("command/", "stress/", "regress/", "report/"),
+    *("run/calibrate.py", "run/doctor.py", "run/examples.py", "run/time_estimate.py"),
 )
 _OF_STRESS = ("stress/execute.py", "stress/table.py")
 _DIGITS = 32
@@ -58,20 +59,13 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
     Raises
     ------
     InputError
-        A combination of values that makes no scene, or one whose camera cannot see; too many jobs; an
-        estimator that is unknown.
+        A combination of values that makes no scene, or one whose camera cannot see.
     """
     sizes = [len(axis.values) for axis in campaign.axes]
-    count = math.prod(sizes) * len(campaign.seeds)
-    if count > MOST_JOBS:
-        raise InputError(
-            f"{campaign.path}: {' × '.join(map(str, sizes))} values and {len(campaign.seeds)} seeds are "
-            f"{count} jobs; at most {MOST_JOBS} are taken at once: split the campaign"
-        )
     made_by = _made_by(campaign)
     jobs: list[Job] = []
     problems: list[str] = []
-    known: dict[str, tuple[int, ...]] = {}
+    values_of_scene: dict[str, tuple[int, ...]] = {}
     for built, values in enumerate(itertools.product(*map(range, sizes))):
         progress(built, math.prod(sizes))
         settings = settings_of(campaign, values)
@@ -79,20 +73,22 @@ def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: N
             scene = campaign.scene.with_({**settings, "seed": 0})
             geometry = _geometry(scene)
         except InputError as error:
-            problems += [f"{campaign.path}: at {_place(campaign, values)}: {one}" for one in error.problems]
+            problems += [
+                f"{campaign.path}: at {_place(campaign, values)}: {problem}" for problem in error.problems
+            ]
             continue
-        of_scene = hashlib.sha256(scene.document.model_dump_json().encode()).hexdigest()
-        if of_scene in known:
-            same = _place(campaign, known[of_scene])
+        scene_hash = hashlib.sha256(scene.document.model_dump_json().encode()).hexdigest()
+        if scene_hash in values_of_scene:
+            same = _place(campaign, values_of_scene[scene_hash])
             problems.append(f"{campaign.path}: at {_place(campaign, values)}: the same scene as at {same}")
-        known[of_scene] = values
+        values_of_scene[scene_hash] = values
         for seed in campaign.seeds:
-            parts = (of_scene, f"seed {seed}", geometry, *made_by)
+            parts = (scene_hash, f"seed {seed}", geometry, *made_by)
             key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:_DIGITS]
             jobs.append(Job(key, values, seed, {**settings, "seed": seed}, f"{seed} {geometry}"))
     progress(math.prod(sizes), math.prod(sizes))
     if problems:
-        raise InputError(*_first(problems))
+        raise InputError(*_first_of(problems))
     return jobs
 
 
@@ -116,24 +112,22 @@ def _geometry(scene: Scene) -> str:
     hashed = hashlib.sha256()
     for time_s in scene.document.frame_times_s():
         for camera in scene.cameras():
-            hashed.update(geometry_of(scene, camera, time_s).encode())
+            hashed.update(geometry_of(scene.at(time_s), camera).encode())
     return hashed.hexdigest()
 
 
 def _made_by(campaign: Campaign) -> tuple[str, ...]:
     """Return what a result follows from besides its scene: estimators, code, versions, machine."""
-    from nir_render.transport.backend import backend
-    from nir_render.transport.key import versions
+    from nir_render.transport.backend.variant import backend
+    from nir_render.transport.cache_key import versions
 
-    try:
-        estimators = run.chosen_estimators(campaign.estimators)
-    except InputError as error:
-        problems = (problem.removeprefix("--estimator ") for problem in error.problems)
-        raise InputError(*(f"{campaign.path}: estimators: {problem}" for problem in problems)) from None
-    own = [one.path.resolve() for one in estimators.values() if isinstance(one, OwnEstimator)]
-    contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in _with_imports(own))
-    packages = (f"{name} {version}" for name, version in run.versions().items() if name != "platform")
-    return (*estimators, *contents, _code(), *packages, *versions(backend().variant, backend().compiler))
+    estimators = chosen_estimators(campaign.estimators)
+    own_files = [
+        estimator.path.resolve() for estimator in estimators.values() if isinstance(estimator, OwnEstimator)
+    ]
+    contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in _with_imports(own_files))
+    packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")
+    return (*estimators, *contents, _code_hash(), *packages, *versions(backend().variant, backend().compiler))
 
 
 def _with_imports(estimators: list[Path]) -> list[Path]:
@@ -145,13 +139,10 @@ def _with_imports(estimators: list[Path]) -> list[Path]:
 
 
 @cache
-def _code() -> str:
+def _code_hash() -> str:
     """Return the hash of all code and tables that results follow from."""
     root = Path(__file__).parents[2]
-    hashed = hashlib.sha256()
-    for file in _code_files(root):
-        hashed.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return hashed.hexdigest()
+    return code_hash((root, _code_files(root)))
 
 
 def _code_files(root: Path) -> Iterator[Path]:
@@ -163,6 +154,6 @@ def _code_files(root: Path) -> Iterator[Path]:
             yield file
 
 
-def _first(problems: list[str], most: int = 10) -> list[str]:
+def _first_of(problems: list[str], most: int = 10) -> list[str]:
     more = len(problems) - most
     return problems if more <= 0 else [*problems[:most], f"… and {more} more"]

@@ -1,4 +1,4 @@
-"""A campaign's table as sums per job, of which every figure is made, for any part of the campaign."""
+"""A campaign's table as sums per job, of which every metric is made, for any part of the campaign."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,10 +11,10 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from nir_render.stress.axes import Axis
-from nir_render.stress.figures import FIGURES, Figure, Values
+from nir_render.stress.metrics import METRICS, Metric, Values
 
 TOTAL, COUNT, ASKED, LIMIT, LIMITED = range(5)
-"""The sums of a figure: its terms; how many there are; of how many rows there could be; the limit's; its."""
+"""The sums of a metric: its terms; how many there are; of how many rows there could be; the limit's; its."""
 
 _COLUMNS = {
     "source": (
@@ -27,7 +27,7 @@ _COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class JobSums:
-    """What each job adds to each figure of each estimator.
+    """What each job adds to each metric of each estimator.
 
     Attributes
     ----------
@@ -39,15 +39,15 @@ class JobSums:
         Index into each axis's values, shape (jobs, axes).
     estimators
         In the order in which the table has them.
-    of
-        By estimator and figure: `TOTAL`, `COUNT`, `ASKED`, `LIMIT` and `LIMITED`, shape (5, jobs).
+    by_metric
+        By estimator and metric: `TOTAL`, `COUNT`, `ASKED`, `LIMIT` and `LIMITED`, shape (5, jobs).
     """
 
     jobs: tuple[str, ...]
     seeds: NDArray[np.int64]
     place: NDArray[np.int64]
     estimators: tuple[str, ...]
-    of: Mapping[tuple[str, str], Values]
+    by_metric: Mapping[tuple[str, str], Values]
 
 
 def job_sums(axes: Sequence[Axis], table: pa.Table) -> JobSums:
@@ -74,9 +74,9 @@ def job_sums(axes: Sequence[Axis], table: pa.Table) -> JobSums:
             mask = chosen.to_numpy()
             rows = {column: _numbers(table[column]).compress(mask) for column in columns}
             at = index[mask]
-            for figure in FIGURES.values():
-                if figure.kind == kind:
-                    sums[name, figure.name] = _sums(figure, rows, at, len(jobs))
+            for metric in METRICS.values():
+                if metric.kind == kind:
+                    sums[name, metric.name] = _sums(metric, rows, at, len(jobs))
     place = np.stack(places, axis=1) if places else np.zeros((len(jobs), 0), dtype=np.int64)
     return JobSums(jobs, of_job["seed"].to_numpy(), place, estimators, sums)
 
@@ -116,9 +116,9 @@ def slices(place: NDArray[np.int64], axis: int) -> tuple[NDArray[np.int64], NDAr
     return combinations, index.reshape(-1)
 
 
-def _sums(figure: Figure, rows: Mapping[str, NDArray[Any]], at: NDArray[np.int64], size: int) -> Values:
-    terms = figure.term(rows)
-    limits = figure.limit(rows) if figure.limit else np.full(terms.shape, np.nan)
+def _sums(metric: Metric, rows: Mapping[str, NDArray[Any]], at: NDArray[np.int64], size: int) -> Values:
+    terms = metric.term(rows)
+    limits = metric.limit(rows) if metric.limit else np.full(terms.shape, np.nan)
     known, limited = np.isfinite(terms), np.isfinite(limits)
     parts = (
         np.where(known, terms, 0.0),

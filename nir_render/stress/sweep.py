@@ -13,17 +13,20 @@ import yaml
 
 from nir_render.errors import InputError
 from nir_render.report.wording import counted
-from nir_render.run import versions
-from nir_render.run_folder import disk_error, locked, read_json, write_file, write_json, write_lines
+from nir_render.run.folder import disk_error, locked, read_json, write_file, write_json, write_lines
+from nir_render.run.manifest import versions
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.jobs import Job
+from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
-from nir_render.stress.workers import Work, part_file, run_jobs
-from nir_render.transport.backend import backend
+from nir_render.stress.workers.pool import Work, part_file, run_jobs
+from nir_render.transport.backend.variant import backend
 
 MANIFEST = "campaign.json"
 TABLE, PAGE, JOBS = "table.parquet", "report.html", "jobs.jsonl"
 _PARTS, _LIGHT, _SCRATCH, _LOCK = "jobs", "light", ".workers", ".lock"
+
+_MOST_WORKERS = 8  # by default: each takes a GiB or more
 
 Progress = Callable[[int, int], None]
 
@@ -41,7 +44,7 @@ class Sweep:
     """A campaign that has ended.
 
     `table` holds the rows of all jobs that are done; `failed` what went wrong with the others, by job's key;
-    `reused` how many had been done before; `warnings` what the reader of its figures should know.
+    `reused` how many had been done before; `warnings` what the reader of its metrics should know.
     """
 
     campaign: Campaign
@@ -58,7 +61,7 @@ def sweep(
     jobs: Sequence[Job],
     folder: Path,
     *,
-    workers: int,
+    workers: int | None,
     progress: Progress,
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
@@ -72,7 +75,7 @@ def sweep(
     folder
         New, empty, or that of a campaign of the same name: what is done there is not done again.
     workers
-        How many processes work; the machine's cores are shared among them.
+        How many processes work; without, as many as cores, at most 8. The cores are shared among them.
     light
         Where light is kept for other jobs and campaigns; in the folder by default.
     light_limit_bytes
@@ -92,15 +95,15 @@ def sweep(
         done, failed = len(jobs) - len(missing), dict[str, str]()
         progress(done, len(jobs))
         if missing:
-            workers = min(workers, len(missing))
+            workers = min(min(cores(), _MOST_WORKERS) if workers is None else workers, len(missing))
             kept = folder / _LIGHT if light is None else light
             threads = max(cores() // workers, 1)
             work = Work(campaign.scene, campaign.estimators, parts, kept, light_limit_bytes, threads)
             try:
                 with closing(run_jobs(work, missing, workers, folder / _SCRATCH)) as ending:
-                    for one in ending:
-                        if one.error is not None:
-                            failed[one.job.key] = one.error
+                    for ended in ending:
+                        if ended.error is not None:
+                            failed[ended.job.key] = ended.error
                         done += 1
                         progress(done, len(jobs))
             except KeyboardInterrupt:
@@ -115,12 +118,29 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def done_before(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> int:
-    """Return how many jobs of a campaign a folder holds already; errors as `sweep`."""
-    if not folder.exists():
-        return 0
-    check_folder(folder, campaign)
-    return sum(read_part(part_file(folder / _PARTS, job)) is not None for job in jobs)
+def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[str, Any]:
+    """Return what a sweep has to do, as one JSON object: jobs, those that the folder holds, geometries.
+
+    Errors as `sweep`.
+    """
+    done = 0
+    if folder.exists():
+        check_folder(folder, campaign)
+        done = sum(read_part(part_file(folder / _PARTS, job)) is not None for job in jobs)
+    geometries = len({job.light for job in jobs})
+    return {"campaign": campaign.name, "jobs": len(jobs), "done": done, "geometries": geometries}
+
+
+def sweep_record(result: Sweep) -> dict[str, Any]:
+    """Return what a sweep has done and found, as one JSON object."""
+    return {
+        "format": 1,
+        "folder": str(result.folder),
+        "jobs": len(result.jobs),
+        "done_before": result.reused,
+        "failed": len(result.failed),
+        **summary_of(result.campaign, result.table),
+    }
 
 
 def check_folder(folder: Path, campaign: Campaign) -> None:
@@ -229,7 +249,7 @@ def _noise_warnings(table: pa.Table) -> Iterator[str]:
 
 def write_report(result: Sweep) -> Path:
     """Write the page of a sweep beside its table; returns its path."""
-    from nir_render.report.campaign_page import campaign_html
+    from nir_render.stress.page.page import campaign_html
 
     facts = read_json(result.folder / MANIFEST)
     commands = {job.key: command(result.campaign, job) for job in result.jobs}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from nir_render.run_folder import write_file
+from nir_render.run.folder import write_file
 from nir_render.stress.axes import Axis
 from nir_render.stress.execute import Row
 from nir_render.stress.jobs import Job
@@ -115,8 +115,12 @@ def gathered(jobs: Sequence[Job], parts: Sequence[pa.Table], axes: Sequence[Axis
             scalar = pa.scalar(value, _NUMBER if is_number else _TEXT)
             columns.append((f"axis.{axis.name}", pa.repeat(scalar, len(part))))
         names, arrays = zip(*columns, strict=True)
-        own = pa.table(list(arrays), names=list(names))
-        tables.append(pa.table([*own.columns, *part.columns], names=[*own.column_names, *part.column_names]))
+        job_columns = pa.table(list(arrays), names=list(names))
+        tables.append(
+            pa.table(
+                [*job_columns.columns, *part.columns], names=[*job_columns.column_names, *part.column_names]
+            )
+        )
     return pa.concat_tables(tables)
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.errors import InputError
-from nir_render.transport.light import Light
-from nir_render.transport.light_file import ASIDE, bytes_of, read_light, write_light
+from nir_render.light.light import Light
+from nir_render.light.npz import ASIDE, bytes_of, read_light, write_light
 
 _SUFFIX = ".light.npz"
 _ABANDONED_AFTER_S = 3600.0

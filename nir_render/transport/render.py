@@ -7,32 +7,30 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.emission import emission_units
-from nir_render.camera.enlarge import Enlargement, part_of
-from nir_render.camera.response import response
 from nir_render.errors import InputError
+from nir_render.light.enlarge import Enlargement, part_of
+from nir_render.light.light import DirectTable, Indirect, Light
 from nir_render.scene.checks import indivisible_sensor, solid_around
-from nir_render.scene.devices import Camera
-from nir_render.scene.load import Scene
-from nir_render.scene.motion import camera_pose
-from nir_render.transport import groups, noise, stock, world
-from nir_render.transport.backend import backend
+from nir_render.scene.snapshot import Snapshot
+from nir_render.spectra.nodes import BAND_M
+from nir_render.transport.backend.variant import backend
 from nir_render.transport.cache import LightCache
-from nir_render.transport.direct import direct_table
-from nir_render.transport.facets import facets
-from nir_render.transport.kernel.tables import World
-from nir_render.transport.key import Sampled, Site, geometry_key, light_key, plan_key, versions
-from nir_render.transport.light import DirectTable, Indirect, Light
-from nir_render.transport.sharpen import enlargement_of, flare_pilot, sharpened
+from nir_render.transport.cache_key import Sampled, Site, geometry_key, light_key, plan_key, versions
+from nir_render.transport.direct.table import direct_table
+from nir_render.transport.indirect import groups, sample_plan, stock
+from nir_render.transport.indirect.guide import group_power
+from nir_render.transport.indirect.kernel.tables import DeviceScene
+from nir_render.transport.indirect.sharpen import enlargement_of, flare_pilot, sharpened
+from nir_render.transport.world import mitsuba_scene
+from nir_render.transport.world.facets import facets
 
-_STEP, _STEPS = 4, 6
 _PILOT = "pilot"
 
 Samples = NDArray[np.int64] | int
 
 
-def render(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCache | None = None) -> Light:
-    """Return the light that reaches a camera, `robot.camera`, with the geometry at a time.
+def render(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None = None) -> Light:
+    """Return the light that reaches a camera, `robot.camera`, in the world at one time.
 
     What `cache` holds is not rendered again. Equal geometry gives equal bits at any time.
 
@@ -41,27 +39,28 @@ def render(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCach
     InputError
         No such camera, or the camera is inside a body.
     """
-    work = _work(scene, camera, time_s, seed, cache)
-    samples, short_pixels = work.samples()
-    return replace(work.light(samples), time_s=time_s, seed=seed, short_pixels=short_pixels)
+    rendering = _rendering(snapshot, camera, seed, cache)
+    samples, short_pixels = rendering.samples()
+    light = rendering.light(samples)
+    return replace(light, time_s=snapshot.time_s, seed=seed, short_pixels=short_pixels)
 
 
-def mean_samples(scene: Scene, camera: str, time_s: float, seed: int) -> float:
+def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
     """Return how many samples a pixel of the film gets on average; 0 without indirect light.
 
     Errors as `render`.
     """
-    samples, _ = _work(scene, camera, time_s, seed, None).samples()
+    samples, _ = _rendering(snapshot, camera, seed, None).samples()
     return 0.0 if samples is None else float(np.mean(samples))
 
 
-def geometry_of(scene: Scene, camera: str, time_s: float) -> str:
-    """Return the hash of the geometry that a camera sees at a time; errors as `render`."""
-    return geometry_key(_work(scene, camera, time_s, 0, None).site)
+def geometry_of(snapshot: Snapshot, camera: str) -> str:
+    """Return the hash of the geometry that a camera sees; errors as `render`."""
+    return geometry_key(_rendering(snapshot, camera, 0, None).site)
 
 
 @dataclass(frozen=True, eq=False)
-class _Work:
+class _Rendering:
     """The light of one camera at one time, to be found or rendered."""
 
     site: Site
@@ -73,12 +72,12 @@ class _Work:
 
         And in how many pixels they are cut below what the target for the noise asks for.
         """
-        document = self.site.scene.document
-        share = document.render.noise
-        if not document.has_indirect_light():
+        snapshot = self.site.snapshot
+        share = snapshot.render.noise
+        if not snapshot.has_indirect_light():
             return None, 0
         if share is None or not backend().vectorised:
-            return stock.samples_of(self.site.scene), 0
+            return stock.samples_of(snapshot.render.indirect), 0
         key = plan_key(self.site, self._geometry, self.seed, _made_by())
         given, wanted = self.cache.plan(key, lambda: self._planned(share))
         return given, int((given < wanted).sum())
@@ -97,41 +96,47 @@ class _Work:
         return light
 
     def _planned(self, noise_share: float) -> NDArray[np.int64]:
-        shape = groups.film_shape(self._rays, self.site.scene.document.render.indirect.scale)
+        shape = groups.film_shape(self._rays, self.site.snapshot.render.indirect.scale)
         pilot = self._kept(_PILOT, self._pilot, counts=False)
-        pixels = noise.flare_pixels(pilot, self.site.camera)
+        pixels = sample_plan.flare_pixels(pilot, self.site.camera)
         flares = self._kept((_PILOT, pixels), lambda: self._flares(pixels), counts=False)
-        return noise.samples_map(pilot, flares, self.site.scene, noise_share, shape)
+        return sample_plan.samples_map(pilot, flares, self.site.snapshot, noise_share, shape)
 
     def _pilot(self) -> Light:
         site = self.site
         key = groups.light_seed(self.seed, "pilot", site.name, self._geometry)
-        return self._light(groups.pilot(site.scene, self._rays, site.time_s, key, self._power))
+        return self._light(groups.pilot(site.snapshot, self._rays, key, self._power))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
         key = groups.light_seed(self.seed, "flares", site.name, self._geometry)
-        how = part_of(self._enlargement, pixels)
-        scale = site.scene.document.render.indirect.scale
-        blocks = noise.flare_blocks(self._light(None), site.camera, scale, how)
-        return self._light(flare_pilot(site.scene, self._built, self._rays, key, blocks, how))
+        enlargement = part_of(self._enlargement, pixels)
+        scale = site.snapshot.render.indirect.scale
+        blocks = sample_plan.flare_blocks(self._light(None), site.camera, scale, enlargement)
+        return self._light(flare_pilot(site.snapshot, self._built, self._rays, key, blocks, enlargement))
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
-        scene, time_s, name = self.site.scene, self.site.time_s, self.site.name
+        snapshot, name = self.site.snapshot, self.site.name
         key = groups.light_seed(self.seed, "indirect", name, self._geometry)
         if not backend().vectorised:
-            return stock.indirect(scene, name, self.site.camera, self.site.pose, time_s, key, self._direct)
-        light = groups.indirect(scene, self._rays, time_s, key, self._power, samples)
+            return stock.indirect(snapshot, name, key, self._direct)
+        light = groups.indirect(snapshot, self._rays, key, self._power, samples)
         if light is None:
             return None
-        return sharpened(scene, self._built, self._rays, key, light, self._enlargement)
+        return sharpened(snapshot, self._built, self._rays, key, light, self._enlargement)
 
     def _light(self, indirect: Indirect | None) -> Light:
         site = self.site
-        mirrors = facets(site.scene).name if backend().vectorised else ()
-        groups_of_light = world.groups(site.scene)
+        snapshot = site.snapshot
         return Light(
-            site.name, site.time_s, self.seed, groups_of_light, (940e-9,), self._direct, indirect, mirrors
+            camera=site.name,
+            time_s=snapshot.time_s,
+            seed=self.seed,
+            groups=snapshot.groups,
+            wavelengths_m=(BAND_M,),
+            direct=self._direct,
+            indirect=indirect,
+            mirrors=facets(snapshot).name if backend().vectorised else (),
         )
 
     @cached_property
@@ -144,51 +149,40 @@ class _Work:
 
     @cached_property
     def _power(self) -> NDArray[np.float64]:
-        return group_power(self.site.scene, self.site.camera)
+        return group_power(self.site.snapshot, self.site.camera)
 
     @cached_property
-    def _built(self) -> World:
-        return groups.world_on_device(self.site.scene, self.site.time_s, self._power)
+    def _built(self) -> DeviceScene:
+        return groups.world_on_device(self.site.snapshot, self._power)
 
     @cached_property
     def _enlargement(self) -> Enlargement:
-        return enlargement_of(self._built, self._rays, self.site.scene.document.render.indirect.scale)
+        return enlargement_of(self._built, self._rays, self.site.snapshot.render.indirect.scale)
 
     @cached_property
     def _direct(self) -> DirectTable:
         site = self.site
-        world.check_meshes(site.scene, site.pose.position_m, f"the camera {site.name} at {site.time_s:g} s")
-        return direct_table(site.scene, site.pose, site.time_s, specular=backend().vectorised)
+        snapshot, pose = site.snapshot, site.pose
+        what = f"the camera {site.name} at {snapshot.time_s:g} s"
+        mitsuba_scene.check_meshes(snapshot, pose.position_m, what)
+        return direct_table(snapshot, pose, specular=backend().vectorised)
 
 
-def _work(scene: Scene, camera: str, time_s: float, seed: int, cache: LightCache | None) -> _Work:
-    """Return the work of a camera that stands where it can see; errors as `render`."""
-    robot, device = scene.camera(camera)
-    pose = camera_pose(robot, device, time_s)
-    inside = solid_around(scene.document, pose.position_m)
+def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None) -> _Rendering:
+    """Return the rendering for a camera that stands where it can see; errors as `render`."""
+    placed = snapshot.camera(camera)
+    inside = solid_around(snapshot.shapes, placed.pose.position_m)
     if inside is not None:
         raise InputError(
-            f"{scene.path}: the camera {camera} is inside shapes.{inside} at {time_s:g} s; move one"
+            f"{snapshot.origin}: the camera {camera} is inside shapes.{inside} at {snapshot.time_s:g} s; "
+            "move one"
         )
-    indivisible = indivisible_sensor(scene.document, camera)
-    if indivisible is not None:
-        raise InputError(f"{scene.path}: {indivisible}")
-    site = Site(scene, camera, device, pose, time_s)
-    return _Work(site, seed, LightCache() if cache is None else cache)
+    if snapshot.has_indirect_light():
+        indivisible = indivisible_sensor(camera, placed.camera.sensor, snapshot.render.indirect.scale)
+        if indivisible is not None:
+            raise InputError(f"{snapshot.origin}: {indivisible}")
+    return _Rendering(Site(snapshot, camera), seed, LightCache() if cache is None else cache)
 
 
 def _made_by() -> tuple[str, ...]:
     return versions(backend().variant, backend().compiler)
-
-
-def group_power(scene: Scene, camera: Camera) -> NDArray[np.float64]:
-    """Return what each group counts when lights are chosen: the electrons that it brings, roughly.
-
-    In steps of 4 below the strongest: so a light is rendered anew seldom when a source's power, the spectrum
-    or the filter change, which otherwise matter only afterwards. It moves nothing but noise.
-    """
-    known = scene.emitters().values()
-    brought = np.array([emission_units(one) * float(response(camera, one)(0.0)) for one in known])
-    strongest = brought.max() if brought.size else 1.0
-    steps = np.round(np.log(np.maximum(brought, 1e-30) / max(strongest, 1e-30)) / np.log(_STEP))
-    return np.asarray(float(_STEP) ** np.maximum(steps, -_STEPS))

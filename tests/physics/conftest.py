@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from nir_render import Scene, load_scene
+from tests.paths import SCENES
 
 SceneMaker = Callable[[Mapping[str, Any]], Scene]
 Loader = Callable[[dict[str, Any]], Scene]
@@ -17,7 +18,7 @@ Loader = Callable[[dict[str, Any]], Scene]
 @pytest.fixture
 def scene_with() -> SceneMaker:
     """Make the one-source scene, changed."""
-    base = load_scene(Path(__file__).parents[2] / "scenes" / "one_source.yaml")
+    base = load_scene(SCENES / "one_source.yaml")
     still = base.with_({"robots.r2": {"rig": "infra_swarm"}, "clock.frames": 1})
 
     def make(changes: Mapping[str, Any]) -> Scene:

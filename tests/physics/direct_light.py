@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render import Light, Scene, expected_electrons
-from nir_render.scene.motion import camera_pose
-from nir_render.transport import world
-from nir_render.transport.direct import direct_table
-from nir_render.transport.facets import facets
+from nir_render.transport.direct.table import direct_table
+from nir_render.transport.world.facets import facets
 
 FOCAL_PX, CX_PX, CY_PX = 480.0, 639.5, 479.5
 APERTURE_M2 = math.pi * 0.9e-3**2 / 4.0
@@ -21,9 +19,9 @@ PLAIN = {"robots.r1.rig.cameras.front.filter": None, "robots.r1.rig.sources.top.
 
 def direct_light(scene: Scene, camera: str = "r1.front") -> Light:
     """Return the light of a camera at 0 s without its indirect part: nothing is rendered."""
-    robot, device = scene.camera(camera)
-    table = direct_table(scene, camera_pose(robot, device, 0.0), 0.0, specular=True)
-    return Light(camera, 0.0, 1, world.groups(scene), (940e-9,), table, None, facets(scene).name)
+    world = scene.at(0.0)
+    table = direct_table(world, world.camera(camera).pose, specular=True)
+    return Light(camera, 0.0, 1, world.groups, (940e-9,), table, None, facets(world).name)
 
 
 def rows_of(light: Light, group: str, mirror: str | None = None) -> list[int]:

@@ -2,7 +2,7 @@
 
 The frames are those that `nir_render.expose` makes of a scene whose whole field shows one radiance of 940 nm
 light, through a long lens at f/8: as the standard asks for, cos⁴ θ is 1 to 1e-5. What the standard's code is
-told of the light is the closed form n_p = A t E λ / (h c) (PHYSICS section 1), E = π L / (4 N²).
+told of the light is the closed form n_p = A t E λ / (h c) (docs/physics.md, From source to pixel), E = π L / (4 N²).
 """
 
 import math
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import nir_render as nr
-from nir_render.scene.devices import Camera
-from nir_render.transport.light import DirectTable, Indirect, Light
+from nir_render.light.light import DirectTable, Indirect, Light
+from nir_render.scene.documents.camera import Camera
 
 Frame = NDArray[np.uint16]
 Distort = Callable[[Frame, int], Frame]

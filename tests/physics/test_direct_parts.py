@@ -16,7 +16,7 @@ import pytest
 from scipy.integrate import quad
 
 from nir_render import Scene
-from nir_render.camera.emission import emission_spectrum, emission_units
+from nir_render.scene.emission import emission_spectrum, emission_units
 from tests.physics.conftest import SceneMaker, source_at
 from tests.physics.direct_light import (
     APERTURE_M2,

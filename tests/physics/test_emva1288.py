@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nir_render.saturation import Compression
-from nir_render.scene.base import preset_names
-from nir_render.scene.sensor import Sensor
+from nir_render.scene.documents.files import preset_names
+from nir_render.scene.documents.sensor import Compression, Sensor
 from tests.physics.emva import LEVELS, Frame, Sheet, bench_scene, measure
 
 SEEDS = 5

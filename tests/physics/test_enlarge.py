@@ -17,18 +17,18 @@ import numpy as np
 import pytest
 
 from nir_render import Scene, load_scene, render
-from nir_render.camera.enlarge import Labels
-from nir_render.expected import diffuse_image, expected, fluxes
-from nir_render.render_noise import temporal_variance_e2
-from nir_render.scene.motion import camera_pose
-from nir_render.transport import groups, world
-from nir_render.transport.backend import backend
-from nir_render.transport.labels import labels_of
-from nir_render.transport.light import Light
-from nir_render.upsampling import _squares, upsampling_error
+from nir_render.camera.by_spectrum import group_fluxes
+from nir_render.camera.mean_frame import MeanFrame, diffuse_image, mean_frame
+from nir_render.camera.render_noise import temporal_variance_e2
+from nir_render.light.light import Light
+from nir_render.transport.backend.variant import backend
+from nir_render.transport.indirect import groups
+from nir_render.transport.indirect.enlargement import Labels
+from nir_render.transport.indirect.enlarging_error import _squares, upsampling_error
+from nir_render.transport.indirect.labels import labels_of
+from tests.paths import SCENES
 
 pytestmark = pytest.mark.mitsuba
-SCENES = Path(__file__).parents[2] / "scenes"
 SMALL = {
     "robots.r1.rig.cameras.front.sensor.columns": 320,
     "robots.r1.rig.cameras.front.sensor.rows": 240,
@@ -49,9 +49,9 @@ def _scene(name: str, scale: int, samples: int) -> Scene:
 
 
 def _labels(scene: Scene, camera: str) -> Labels:
-    robot, device = scene.camera(camera)
-    rays = groups.rays_of(device, camera_pose(robot, device, 0.0))
-    built = groups.world_on_device(scene, 0.0, np.ones(len(world.groups(scene))))
+    device = scene.camera(camera)[1]
+    rays = groups.rays_of(device, scene.at(0.0).camera(camera).pose)
+    built = groups.world_on_device(scene.at(0.0), np.ones(len(scene.at(0.0).groups)))
     return labels_of(built, rays.origin_m, rays.corners)
 
 
@@ -111,7 +111,7 @@ def _images(
             indirect = type(indirect)(
                 indirect.radiance_per_w, indirect.variance, indirect.scale, indirect.samples
             )
-        return diffuse_image(light, indirect, scene, fluxes(light, scene), EXPOSURE_S)
+        return EXPOSURE_S * diffuse_image(light, indirect, scene.at(0.0), group_fluxes(light, scene.at(0.0)))
 
     sharp, plain = ([electrons(light, edges) for light in lights] for edges in (True, False))
     return scene, lights, sharp, plain, [electrons(light, False) for light in full]
@@ -126,8 +126,8 @@ def test_the_error_is_below_a_hundredth_of_the_sensors_noise(name: str, scale: i
     edges = lights[0].indirect.edges
     assert edges is not None
     assert edges.enlargement.patch.size <= 0.05 * full[0].size
-    mean = expected(lights[0], scene, EXPOSURE_S)
-    sensor_e2 = float(temporal_variance_e2(mean, scene.camera("r1.front")[1]).mean())
+    mean = mean_frame(lights[0], scene.at(0.0), EXPOSURE_S)
+    sensor_e2 = float(temporal_variance_e2(mean).mean())
 
     def share(images: list[np.ndarray]) -> tuple[float, float]:
         square_e2 = (images[0] - full[0]) * (images[1] - full[1])
@@ -142,7 +142,7 @@ def test_the_error_is_below_a_hundredth_of_the_sensors_noise(name: str, scale: i
     # Edges apart, energy is kept: the same total within 0.5 %.
     assert sharp[0].sum() == pytest.approx(full[0].sum(), rel=0.005)
     # What a run measures of itself is that figure.
-    told = upsampling_error(mean, scene)
+    told = upsampling_error(mean)
     assert not isinstance(told, str)
     assert told.pixels <= 256
     assert abs(told.share - error) < 4.0 * np.hypot(told.standard_error, sigma)
@@ -177,21 +177,26 @@ def test_an_error_in_few_pixels_is_found(scale: int, tmp_path: Path) -> None:
     scene = load_scene(path)
     camera = scene.camera("r1.front")[1]
     light = render(scene, "r1.front", seed=0)
-    mean = expected(light, scene, camera.exposure_s)
-    sensor_e2 = float(temporal_variance_e2(mean, camera).mean())
+    mean = mean_frame(light, scene.at(0.0), camera.exposure_s)
+    sensor_e2 = float(temporal_variance_e2(mean).mean())
     assert light.indirect is not None
     assert light.indirect.edges is not None
     how = light.indirect.edges.enlargement
     every = np.setdiff1d(np.arange(160 * 120), how.patch)
-    square_e2 = _squares(light, scale, how, scene, fluxes(light, scene), camera.exposure_s, every, 256)
+    square_e2 = _squares(mean, group_fluxes(light, scene.at(0.0)), every, 256)
     truth = float(square_e2.sum()) / (160 * 120) / sensor_e2
     assert np.sort(square_e2)[-20:].sum() > 0.5 * square_e2.sum()
     for seed in range(12):
-        told = upsampling_error(replace(mean, light=replace(light, seed=seed)), scene)
+        told = upsampling_error(_of_light(mean, replace(light, seed=seed)))
         assert not isinstance(told, str)
         assert told.standard_error < 0.1 * truth
         assert abs(told.share - truth) < 4.0 * told.standard_error
         assert told.largest > 1.0
+
+
+def _of_light(mean: MeanFrame, light: Light) -> MeanFrame:
+    """Return the frame as if it had been made of another light."""
+    return replace(mean, rates=replace(mean.rates, light=light))
 
 
 def test_where_there_is_nothing_to_measure_it_says_why() -> None:
@@ -199,9 +204,9 @@ def test_where_there_is_nothing_to_measure_it_says_why() -> None:
     light = render(scene, "r1.front", seed=1)
     assert light.indirect is not None
     assert light.indirect.edges is None
-    mean = expected(light, scene, EXPOSURE_S)
-    assert upsampling_error(mean, scene) == "rendered at full resolution"
-    assert upsampling_error(replace(mean, light=replace(light, indirect=None)), scene) == "no indirect light"
+    mean = mean_frame(light, scene.at(0.0), EXPOSURE_S)
+    assert upsampling_error(mean) == "rendered at full resolution"
+    assert upsampling_error(_of_light(mean, replace(light, indirect=None))) == "no indirect light"
 
 
 def test_a_dark_frame_is_measured_too(tmp_path: Path) -> None:
@@ -209,7 +214,7 @@ def test_a_dark_frame_is_measured_too(tmp_path: Path) -> None:
     path = tmp_path / "floor.yaml"
     path.write_text(FLOOR % 2)
     scene = load_scene(path)
-    mean = expected(render(scene, "r1.front", seed=0), scene, 1e-6)
-    told = upsampling_error(mean, scene)
+    mean = mean_frame(render(scene, "r1.front", seed=0), scene.at(0.0), 1e-6)
+    told = upsampling_error(mean)
     assert not isinstance(told, str)
     assert 0.0 < told.share < 1e-4

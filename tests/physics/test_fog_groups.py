@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nir_render.transport.kernel import scatter
+from nir_render.transport.indirect.kernel import fog_scatter
 from tests.physics.conftest import Loader
 from tests.physics.documents import (
     camera_document,
@@ -41,7 +41,7 @@ def test_each_of_many_sources_shines_in_fog_as_if_alone(make: Loader, number: in
     all light in the latter.
     """
     columns, rows, focal_px, renders = 32, 24, 16.0, 8
-    assert number > scatter._WEIGHED_LIGHTS
+    assert number > fog_scatter._WEIGHED_LIGHTS
     random = np.random.default_rng(5)
     places_m = np.stack(
         [random.uniform(2, 14, number), random.uniform(-6, 6, number), random.uniform(-3, 3, number)], 1

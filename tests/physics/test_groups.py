@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
 from nir_render import Light, Scene, expected_electrons, load_scene, render
-from nir_render.compare import Comparison, compare_batches
-from nir_render.transport.backend import backend
+from nir_render.transport.backend.variant import backend
 from tests.physics.rooms import FOCAL_PX, HEIGHT_PX, ROOMS, SIGMA_PX, WIDTH_PX, groups, plain
 from tests.physics.stock import stock_radiance
+from tests.statistics import Comparison, compare_batches
 
 pytestmark = pytest.mark.mitsuba
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from nir_render import Scene, render
-from nir_render.transport.backend import backend
+from nir_render.transport.backend.variant import backend
 from tests.physics.documents import (
     FOCAL_PX,
     camera_document,

@@ -10,7 +10,8 @@ import yaml
 from numpy.typing import NDArray
 
 from nir_render import Scene, load_scene, render
-from nir_render.expected import diffuse_image, fluxes
+from nir_render.camera.by_spectrum import group_fluxes
+from nir_render.camera.mean_frame import diffuse_image
 from tests.physics.documents import rectangle_document
 from tests.physics.rooms import ROOMS, plain
 
@@ -107,7 +108,9 @@ def test_light_by_way_of_a_mirror_makes_no_false_flare(tmp_path: Path) -> None:
     for seed in range(4):
         light = render(scene, "eye.c", seed=seed)
         assert light.indirect is not None
-        images.append(diffuse_image(light, light.indirect, scene, fluxes(light, scene), 10e-3))
+        images.append(
+            10e-3 * diffuse_image(light, light.indirect, scene.at(0.0), group_fluxes(light, scene.at(0.0)))
+        )
     stack = np.stack(images)
     off_e = np.abs(stack - (stack.sum(axis=0) - stack) / 3.0)
     assert stack.max() > 20.0  # the mirror does light the floor
@@ -118,7 +121,7 @@ _RENDER = """
 import sys
 import numpy as np
 from nir_render import load_scene, render
-from nir_render.transport.backend import set_threads
+from nir_render.transport.backend.variant import set_threads
 for threads in (1, 2, 3):
     set_threads(threads)
     light = render(load_scene(sys.argv[1], {"render.indirect.samples": 16}), "r1.c", seed=3).indirect

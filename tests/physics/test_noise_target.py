@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from nir_render import Light, Scene, load_scene, render
-from nir_render.compare import compare_batches
-from nir_render.expected import diffuse_image, expected, flare_apertures, fluxes
-from nir_render.render_noise import aperture_variances_e2, render_noise, render_variance_e2
+from nir_render.camera.by_spectrum import group_fluxes
+from nir_render.camera.mean_frame import diffuse_image, flare_apertures, mean_frame
+from nir_render.camera.render_noise import aperture_variances_e2, render_noise, render_variance_e2
 from tests.physics.rooms import plain
+from tests.statistics import compare_batches
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.vectorised]
 
@@ -72,16 +73,19 @@ def _images(lights: list[Light], scene: Scene) -> Array:
     images = []
     for light in lights:
         assert light.indirect is not None
-        images.append(diffuse_image(light, light.indirect, scene, fluxes(light, scene), exposure_s))
+        images.append(
+            exposure_s
+            * diffuse_image(light, light.indirect, scene.at(0.0), group_fluxes(light, scene.at(0.0)))
+        )
     return np.stack(images)
 
 
 def _group_images(light: Light, scene: Scene) -> Array:
     """The same of each group alone, shape (groups, rows, columns)."""
     assert light.indirect is not None
-    exposure_s, flux = scene.camera("r1.c")[1].exposure_s, fluxes(light, scene)
+    exposure_s, flux = scene.camera("r1.c")[1].exposure_s, group_fluxes(light, scene.at(0.0))
     alone = [np.where(np.arange(flux.size) == group, flux, 0.0) for group in range(flux.size)]
-    return np.stack([diffuse_image(light, light.indirect, scene, one, exposure_s) for one in alone])
+    return exposure_s * np.stack([diffuse_image(light, light.indirect, scene.at(0.0), one) for one in alone])
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -100,7 +104,7 @@ def test_the_share_between_seeds_keeps_the_target_and_the_mean_is_right(case: Ca
     scene = _scene(case, tmp_path, {"render.noise": f"{case.percent} % of temporal variance"})
     camera = scene.camera("r1.c")[1]
     lights = [render(scene, "r1.c", seed=seed) for seed in range(SEEDS)]
-    means = [expected(light, scene, camera.exposure_s) for light in lights]
+    means = [mean_frame(light, scene.at(0.0), camera.exposure_s) for light in lights]
     images = _images(lights, scene)
     temporal_e2 = np.mean([mean.electrons for mean in means], axis=0) + camera.sensor.read_noise_e**2
     share = np.median(images.var(axis=0, ddof=1) / temporal_e2)
@@ -117,13 +121,13 @@ def test_the_share_between_seeds_keeps_the_target_and_the_mean_is_right(case: Ca
     largest = stats.chi2.ppf(1.0 - 1e-3 / len(apertures), SEEDS - 1) / (SEEDS - 1)
     assert max(shares) <= target * largest, shares
     # The manifest states what each render says of itself: that it keeps the target,
-    noises = [render_noise(mean, scene) for mean in means]
+    noises = [render_noise(mean) for mean in means]
     assert np.median([noise.median_share for noise in noises]) <= target
     assert np.median([noise.aperture_share for noise in noises]) <= target
     # and it is true: no bound, but the variance between seeds,
     exposure_s = camera.exposure_s
     stated_e2 = np.mean(
-        [aperture_variances_e2(light, scene, exposure_s, apertures) for light in lights], axis=0
+        [aperture_variances_e2(light, scene.at(0.0), exposure_s, apertures) for light in lights], axis=0
     )
     stated = stated_e2 / [aperture.sum(temporal_e2) for aperture in apertures]
     least = stats.chi2.ppf(1e-3 / len(apertures), SEEDS - 1) / (SEEDS - 1)
@@ -132,7 +136,7 @@ def test_the_share_between_seeds_keeps_the_target_and_the_mean_is_right(case: Ca
     # in the frame: squares of each seed's deviations, group by group, less what it states, whose expectation is 0.
     by_group = np.stack([_group_images(light, scene) for light in lights])
     squares = ((by_group - by_group.mean(axis=0)) ** 2).sum(axis=1) * SEEDS / (SEEDS - 1)
-    own_e2 = np.stack([render_variance_e2(light, scene, exposure_s) for light in lights])
+    own_e2 = np.stack([render_variance_e2(light, scene.at(0.0), exposure_s) for light in lights])
     excess = ((squares - own_e2) / temporal_e2).mean(axis=(1, 2))
     error = excess.std(ddof=1) / np.sqrt(SEEDS)
     assert abs(excess.mean()) < 4.0 * error
@@ -157,4 +161,4 @@ def test_a_scene_without_flares_has_no_aperture_to_care_for(tmp_path: Path) -> N
     )
     light = render(scene, "r1.c")
     assert light.direct.group.size == 0
-    assert render_noise(expected(light, scene, 1e-6), scene).aperture_share == 0.0
+    assert render_noise(mean_frame(light, scene.at(0.0), 1e-6)).aperture_share == 0.0

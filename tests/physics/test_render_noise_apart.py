@@ -8,9 +8,9 @@ import yaml
 from numpy.typing import NDArray
 
 import nir_render as nr
-from nir_render.expected import expected
-from nir_render.noise_facts import noise_facts, noise_warning
-from nir_render.render_noise import render_noise
+from nir_render.camera.mean_frame import mean_frame
+from nir_render.camera.render_noise import render_noise
+from nir_render.run.manifest import noise_facts, noise_warning
 from tests.physics.documents import rectangle_document, scene_document, source_document
 
 pytestmark = [
@@ -83,7 +83,7 @@ def test_the_gain_of_one_light_and_of_independent_renders(tmp_path: Path) -> Non
     ]
     assert np.mean(same) == pytest.approx(sensor.system_gain_dn_per_e, rel=1e-3)
     noises = {
-        f"eye.c {n}": render_noise(expected(light, scene, EXPOSURE_S), scene)
+        f"eye.c {n}": render_noise(mean_frame(light, scene.at(0.0), EXPOSURE_S))
         for n, light in enumerate(lights)
     }
     stated = noise_facts(None, noises)["share_behind_lens"]
@@ -98,7 +98,7 @@ def test_frames_above_the_stated_share_are_flagged(tmp_path: Path) -> None:
     scene = wall_scene(tmp_path, **{"render.noise": "5 % of temporal variance"})
     light = nr.render(scene, "eye.c", seed=1)
     noises = {
-        f"eye.c {number}": render_noise(expected(light, scene, times * EXPOSURE_S), scene)
+        f"eye.c {number}": render_noise(mean_frame(light, scene.at(0.0), times * EXPOSURE_S))
         for number, times in enumerate((1.0, 40.0))
     }
     facts = noise_facts(0.05, noises)

@@ -8,9 +8,10 @@ import pytest
 import yaml
 
 from nir_render import LightCache, Scene, load_scene, render, simulate
-from nir_render.transport import groups, stock
+from nir_render.scene.snapshot import Snapshot
 from nir_render.transport import render as transport
-from nir_render.transport.backend import backend
+from nir_render.transport.backend.variant import backend
+from nir_render.transport.indirect import groups, stock
 from tests.physics.rooms import plain
 
 pytestmark = pytest.mark.mitsuba
@@ -49,13 +50,13 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     times_s: list[float] = []
     whole, other = groups.indirect, stock.indirect
 
-    def by_groups(scene: Scene, rays: Any, time_s: float, *rest: Any) -> Any:
-        times_s.append(time_s)
-        return whole(scene, rays, time_s, *rest)
+    def by_groups(snapshot: Snapshot, *rest: Any) -> Any:
+        times_s.append(snapshot.time_s)
+        return whole(snapshot, *rest)
 
-    def by_stock(scene: Scene, name: str, camera: Any, pose: Any, time_s: float, *rest: Any) -> Any:
-        times_s.append(time_s)
-        return other(scene, name, camera, pose, time_s, *rest)
+    def by_stock(snapshot: Snapshot, *rest: Any) -> Any:
+        times_s.append(snapshot.time_s)
+        return other(snapshot, *rest)
 
     monkeypatch.setattr(groups, "indirect", by_groups)
     monkeypatch.setattr(stock, "indirect", by_stock)

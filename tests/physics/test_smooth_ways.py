@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from nir_render import render
-from nir_render.transport.backend import backend
+from nir_render.transport.backend.variant import backend
 from tests.physics.conftest import Loader
 from tests.physics.documents import (
     camera_document,

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 
 from nir_render import Scene, expected_electrons, load_scene, render
-from nir_render.camera.exposure import blur
-from nir_render.camera.lens import intrinsics_of
-from nir_render.compare import compare_batches
-from nir_render.expected import expected
+from nir_render.camera.beams import blur
+from nir_render.camera.mean_frame import mean_frame
+from nir_render.camera.optics.lens import intrinsics_of
 from nir_render.spectra.illuminants import incandescent_flux_w, planck_shape
-from nir_render.transport.backend import backend
+from nir_render.transport.backend.variant import backend
+from tests.statistics import compare_batches
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.verify]
 
@@ -166,10 +166,10 @@ def ours_e(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     parts = []
     for seed in range(8):
         light = render(scene.with_({"render.indirect.samples": 64}), "r1.c", seed=seed)
-        mean = expected(light, scene, EXPOSURE_S)
+        mean = mean_frame(light, scene.at(0.0), EXPOSURE_S)
         direct = np.zeros((HEIGHT, WIDTH))
         for window in mean.windows:
-            window.add_to(direct)
+            window.add_into(direct)
         parts.append(mean.electrons - direct)
     return direct, np.stack(parts)
 

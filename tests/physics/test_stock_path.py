@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import constants
 
 from nir_render import expected_electrons, render
-from nir_render.camera.lens import intrinsics_of
-from nir_render.camera.response import LIGHT_SPEED_M_PER_S, PLANCK_J_S, incidence
-from nir_render.spectra.bandpass import transmission
-from nir_render.transport.backend import backend
+from nir_render.camera.optics.lens import intrinsics_of
+from nir_render.camera.optics.response import incidence
+from nir_render.transport.backend.variant import backend
 from tests.physics.conftest import SceneMaker, source_at
 
 pytestmark = pytest.mark.mitsuba
@@ -66,8 +66,8 @@ def _stock_electrons(
     column, row = round(u_px) - _CROP_PX // 2, round(v_px) - _CROP_PX // 2
     nm = np.linspace(_LOW_NM, _HIGH_NM, 801)
     cosines, weights = incidence(camera, np.array([np.arccos(direction[2])]))
-    filtered = weights @ transmission(camera.filter, nm[None, :] * 1e-9, cosines[0][:, None])
-    sensitivity = 0.9 * filtered * 0.15 * nm * 1e-9 / (PLANCK_J_S * LIGHT_SPEED_M_PER_S)
+    filtered = weights @ camera.filter.transmission(nm[None, :] * 1e-9, cosines[0][:, None])
+    sensitivity = 0.9 * filtered * 0.15 * nm * 1e-9 / (constants.h * constants.c)
     sigma_nm = 42.0 / np.sqrt(8.0 * np.log(2.0))
     density_per_nm = np.exp(-0.5 * ((nm - 940.0) / sigma_nm) ** 2) / (sigma_nm * np.sqrt(2.0 * np.pi))
     radiance = source.flux_w / (4.0 * np.pi**2 * source.radius_m**2) * density_per_nm

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from nir_render.cli import main
+from nir_render.command.main import main
+from tests.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 SCENE = str(ROOT / "scenes" / "one_source.yaml")
 QUICK = ("--set", "clock.frames=2")
 
@@ -43,5 +43,12 @@ def nir_render(*arguments: str, cwd: Path) -> Done:
 
 def nir_render_process(*arguments: str, cwd: Path, **more: Any) -> Done:
     """Call the command in a folder, in a process of its own, where warnings are errors."""
-    command = [sys.executable, "-W", "error", "-c", "from nir_render.cli import main; main()", *arguments]
+    command = [
+        sys.executable,
+        "-W",
+        "error",
+        "-c",
+        "from nir_render.command.main import main; main()",
+        *arguments,
+    ]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, timeout=240, **more)

@@ -10,19 +10,20 @@ RMS in the body frame for each camera; a robot that two cameras see at one place
 import dataclasses
 import json
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+import nir_render as nr
 from nir_render import Scene, load_scene, simulate
-from nir_render.camera.sensor import read_out
+from nir_render.camera.mean_frame import mean_frame
+from nir_render.camera.sensor.read_out import read_out
 from nir_render.evaluate.match import countable, match
 from nir_render.evaluate.metrics import angle_deg, source_limits
-from nir_render.evaluate.truth import SourceTruth
-from nir_render.expected import expected
-from nir_render.randomness import FrameKey
+from nir_render.randomness import RandomKey
+from nir_render.truth.sources import SourceTruth
 from perception import Calibration, Detection, detect
+from tests.paths import SCENES
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.verify]
 
@@ -46,12 +47,12 @@ class Tally:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(Path(__file__).parents[2] / "scenes" / "arena.yaml").with_({"clock.frames": 1})
+    return load_scene(SCENES / "arena.yaml").with_({"clock.frames": 1})
 
 
 @pytest.fixture(scope="module")
 def calibrations(scene: Scene) -> dict[str, Calibration]:
-    return {name: scene.calibration(name) for name in scene.cameras()}
+    return {name: nr.calibration(scene, name) for name in scene.cameras()}
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +62,10 @@ def tally(scene: Scene, calibrations: dict[str, Calibration]) -> Tally:
         for shot in simulate(scene, seed=render_seed):
             name = shot.frame.camera
             camera = scene.camera(name)[1]
-            mean_e = expected(shot.light, scene, shot.frame.exposure_s).electrons
+            mean_e = mean_frame(shot.light, scene.at(0.0), shot.frame.exposure_s).electrons
             for draw in range(DRAWS):
                 seed = 1000 * render_seed + draw
-                key = FrameKey(seed, "read_out", name, 0)
+                key = RandomKey(seed, "read_out", name, 0)
                 # Another camera of the same make for each draw: the limit counts fixed patterns as noise.
                 other = camera.model_copy(update={"serial": f"{name} {seed}"})
                 data_dn = read_out(mean_e, other, shot.frame.exposure_s, key, shot.frame.gain)

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from perception import parse_calibration_document, read_calibrations, read_ranges
-from tests.system.command import ROOT, nir_render
+from tests.paths import ROOT
+from tests.system.command import nir_render
 
 pytestmark = pytest.mark.mitsuba
 

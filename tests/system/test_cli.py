@@ -4,13 +4,15 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from tests.system.command import QUICK, ROOT, SCENE, nir_render, nir_render_process
+from tests.paths import ROOT
+from tests.system.command import QUICK, SCENE, nir_render, nir_render_process
 
 pytestmark = pytest.mark.mitsuba
 
@@ -54,7 +56,8 @@ def test_robust_ranging_is_right_and_near_the_limit(run_folder: Path) -> None:
     assert robust["bearing_rms_deg"] < 0.02
     assert robust["range_rmse_m"] < 3.0 * summary["range_limit_rmse_m"]
     paper = summary["estimators"]["paper"]
-    assert paper["range_mae_m"] > 0.5  # the mean grey of a blob does not follow 1/d² (PHYSICS section 5)
+    # The mean grey of a blob does not follow 1/d² (docs/physics.md, Ranging).
+    assert paper["range_mae_m"] > 0.5
 
 
 def test_the_resolved_scene_renders_to_the_same_bits(run_folder: Path, tmp_path: Path) -> None:
@@ -116,6 +119,25 @@ def test_doctor_and_validate_and_schema(tmp_path: Path) -> None:
     assert nir_render("validate", SCENE, cwd=tmp_path).returncode == 0
     schema = nir_render("schema", cwd=tmp_path)
     assert json.loads(schema.stdout) == json.loads((ROOT / "scenes" / "scene.schema.json").read_text())
+
+
+def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
+    done = nir_render("--version", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"nir-render {version('nir-render')}\n")
+
+
+def test_validate_refuses_what_a_plan_refuses(tmp_path: Path) -> None:
+    """An estimator that is none: both tell it, with its file and line."""
+    (tmp_path / "campaign.yaml").write_text(
+        f"{{format: 1, name: c, scene: {SCENE}, axes: {{clock.frames: [1, 2]}}, estimators: [robsut, paper]}}"
+    )
+    for call in (["validate", "campaign.yaml"], ["stress", "campaign.yaml", "--plan"]):
+        done = nir_render(*call, cwd=tmp_path)
+        assert done.returncode == 2
+        assert "campaign.yaml:1: estimators: robsut: unknown; known: paper, robust" in " ".join(
+            done.stderr.split()
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["campaign.yaml"]
 
 
 BAD_SCENES: dict[str, tuple[dict[str, Any], str]] = {
@@ -191,8 +213,8 @@ def test_bad_calls_end_with_status_2_and_leave_nothing(
 
 def test_an_estimate_keeps_to_the_threads(tmp_path: Path) -> None:
     """It is of the render that the same words would start."""
-    count = "from nir_render.transport.backend import backend; print(backend().dr.thread_count())"
-    code = f"import sys; from nir_render.cli import app; app(sys.argv[1:], standalone_mode=False); {count}"
+    count = "from nir_render.transport.backend.variant import backend; print(backend().dr.thread_count())"
+    code = f"import sys; from nir_render.command.main import app; app(sys.argv[1:], standalone_mode=False); {count}"
     arguments = ["render", SCENE, "--estimate", "--threads", "3", "--json"]
     command = [sys.executable, "-W", "error", "-c", code, *arguments]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)

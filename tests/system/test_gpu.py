@@ -4,13 +4,13 @@ import ctypes
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from tests.paths import ROOT
+
 pytestmark = [pytest.mark.mitsuba, pytest.mark.verify]
 
-REPOSITORY = Path(__file__).parents[2]
 TESTS = [
     "tests/unit/transport",
     "tests/physics/test_groups.py",
@@ -33,7 +33,7 @@ def test_the_integrator_passes_in_cuda_ad_mono(tests: str) -> None:
         pytest.skip("no CUDA GPU: cuda_ad_mono is not tried")
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-m", "", tests],
-        cwd=REPOSITORY,
+        cwd=ROOT,
         env={**os.environ, "NIR_RENDER_VARIANT": "cuda_ad_mono"},
         capture_output=True,
         text=True,

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.command import QUICK, ROOT, SCENE, nir_render, nir_render_process
+from tests.paths import ROOT
+from tests.system.command import QUICK, SCENE, nir_render, nir_render_process
 
 pytestmark = pytest.mark.mitsuba
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from tests.system.command import ROOT, nir_render
+from tests.paths import ROOT
+from tests.system.command import nir_render
 
 pytestmark = pytest.mark.mitsuba
 
@@ -60,7 +61,7 @@ import nir_render as nr, perception
 scene = nr.load_scene("scenes/arena.yaml")
 light = nr.render(scene, camera="r1.front", time_s=0.0, seed=1)
 frame = nr.expose(light, scene, exposure_s=2e-3, seed=1)
-hits = perception.detect(frame, scene.calibration("r1.front"), estimator="robust")
+hits = perception.detect(frame, nr.calibration(scene, "r1.front"), estimator="robust")
 assert len(hits) >= 2 and any(hit.saturated for hit in hits)
 assert frame._repr_png_().startswith(b"\\x89PNG") and "r2.top" in light._repr_html_()
 """,

@@ -15,26 +15,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from nir_render.compare import Parts, judge
+from nir_render.command.regress import app
 from nir_render.errors import InputError
+from nir_render.light.light import Light
 from nir_render.regress import FALSE_ALARM_RATE, check
-from nir_render.regress.camera_stage import compare_electrons, compare_frame
-from nir_render.regress.check import check_scenes
-from nir_render.regress.command import app
+from nir_render.regress.checking import check_scenes
 from nir_render.regress.findings import SceneCheck
-from nir_render.regress.light_stage import compare_indirect
-from nir_render.regress.making import settings_of
+from nir_render.regress.make import frame_settings
 from nir_render.regress.reference import Reference
-from nir_render.regress.reference_files import read_reference
-from nir_render.regress.suite import scenes_of
-from nir_render.scene.load import Scene
-from nir_render.simulate import render
-from nir_render.transport.light import Light
+from nir_render.regress.scenes_of import scenes_of
+from nir_render.regress.stages.camera import compare_electrons, compare_frame
+from nir_render.regress.stages.light import compare_indirect
+from nir_render.regress.statistics import PartTests, judge
+from nir_render.regress.store import read_reference
+from nir_render.scene.scene import Scene
+from nir_render.simulation.clock import render
+from tests.paths import ROOT
 from tests.unit.regress import cases
 
 pytestmark = pytest.mark.mitsuba
 
-ROOT = Path(__file__).parents[2]
 SUITE = ROOT / "scenes" / "regression"
 RUNNER = CliRunner()
 
@@ -82,7 +82,7 @@ def test_bits_defects_and_non_linearity_are_guarded(name: str, change: dict[str,
     scenes, references = _suite()
     scene, reference = scenes[name].with_(change), references[name]
     shot = reference.shots[0]
-    setting = settings_of(scene)[0]
+    setting = frame_settings(scene)[0]
     light = reference.lights[shot.light]
     findings = {
         "electrons": compare_electrons(scene, setting, shot, light, "", exact=False)[0],
@@ -189,7 +189,7 @@ def _clean(name: str, seed: int) -> Light:
 
 def _tests(
     name: str, seed: int, scene: Scene | None = None, fault: Light1 = lambda light: light
-) -> list[Parts]:
+) -> list[PartTests]:
     """Render a scene's light with a seed, and return its tests against the reference."""
     reference = _suite()[1][name].lights[0]
     light = reference.light
@@ -202,7 +202,7 @@ def _tests(
 
 
 @cache
-def _others(name: str) -> list[Parts]:
+def _others(name: str) -> list[PartTests]:
     """Return the tests of all other scenes, once: they are in the family that a scene's are judged in."""
     return [parts for other in _suite()[0] if other != name for parts in _tests(other, 10**6)]
 

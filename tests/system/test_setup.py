@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 
-from nir_render.transport import llvm
-from nir_render.transport.llvm import Choice, install, probe
-from nir_render.transport.llvm.install import NO_APT, Apt
-from nir_render.transport.llvm.probe import Answer
+from nir_render.transport.backend import llvm
+from nir_render.transport.backend.llvm import Choice, install, probe
+from nir_render.transport.backend.llvm.install import NO_APT, Apt
+from nir_render.transport.backend.llvm.probe import Answer
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 BOOTSTRAP = ROOT / "tools" / "bootstrap.py"
 
 posix_only = pytest.mark.skipif(os.name == "nt", reason="the stand-ins are shell scripts")

@@ -14,11 +14,11 @@ import psutil
 import pytest
 import yaml
 
-from nir_render.run_folder import locked
+from nir_render.run.folder import locked
+from tests.paths import ROOT
 
 pytestmark = pytest.mark.mitsuba
 
-ROOT = Path(__file__).parents[2]
 
 # A source before a wall, seen by a camera of 64 × 48 pixels.
 SCENE: dict[str, Any] = {
@@ -69,7 +69,7 @@ def campaign(folder: Path, ranges: int, exposures: int) -> Path:
 
 
 def start(file: Path, output: Path, *more: str, env: dict[str, str] | None = None) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "nir_render.cli", "stress", str(file), "-o", str(output)]
+    command = [sys.executable, "-m", "nir_render.command.main", "stress", str(file), "-o", str(output)]
     command += ["--workers", "2"]
     return subprocess.Popen(
         [*command, *more], cwd=ROOT, text=True, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE

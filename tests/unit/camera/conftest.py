@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
-from nir_render.scene.base import merge
-from nir_render.scene.devices import Camera, Source
+from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.emitters import Source
+from nir_render.scene.documents.files import merge
 
 CameraMaker = Callable[..., Camera]
 

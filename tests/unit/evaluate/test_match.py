@@ -8,7 +8,8 @@ import pytest
 
 from nir_render.evaluate.match import countable, match
 from nir_render.evaluate.metrics import evaluate
-from nir_render.evaluate.truth import SourceTruth, parse_truth
+from nir_render.truth.lamps import LampTruth
+from nir_render.truth.sources import SourceTruth, parse_truth
 from perception.types import Calibration, Detection
 
 CALIBRATION = Calibration(
@@ -170,14 +171,14 @@ def test_truth_without_gain_and_dark_current_reads_as_of_a_cold_camera_at_gain_1
 
 def test_what_is_found_on_a_lamp_is_counted_apart() -> None:
     """A lamp's outline from 390 to 410 px: the detection at 400 is on it, one 7 px beside it is not."""
-    lamp = np.array([[390, 90], [410, 90], [410, 110], [390, 110]], dtype=np.float32)
+    lamp = LampTruth("r1.front", 0, "lamps.one", ((390, 90), (410, 90), (410, 110), (390, 110)))
     found = [_detection(100.0), _detection(400.0), _detection(417.0)]
     result = evaluate(
         [("r1.front", 0)],
         [_truth(100.0)],
         {"r1.front": CALIBRATION},
         {"robust": found},
-        {("r1.front", 0): [lamp]},
+        [lamp],
     )
     robust = result.summary["estimators"]["robust"]
     assert (robust["lamps_reported"], robust["false_alarms_per_frame"], robust["recall"]) == (1, 1.0, 1.0)

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from nir_render.evaluate.metrics import evaluate, source_limits
-from perception.limits import flare_limit
+from perception.model.fisher import flare_limit
 from tests.unit.report.cases import calibration, truth
 
 CAMERA = calibration()

@@ -65,7 +65,7 @@ def expected_e(
     background_e: float = 0.0,
     gain_fault: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Mean electrons of sources at (u, v, range): brute force, independent of perception.flare_model.
+    """Mean electrons of sources at (u, v, range): brute force, independent of perception.model.flare.
 
     The image is sampled on a fine grid *in the image* (1/16 px or finer): a sample is lit if its direction
     lies within the sphere's cap; it weighs cos θ times its solid angle, cos³ θ, and is spread by a Gaussian

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+import nir_render as nr
+from nir_render.light.light import DirectTable, Indirect, Light
 from nir_render.regress.reference import Reference, ReferenceLight, ReferenceShot, document_of
-from nir_render.scene.load import Scene, load_scene
-from nir_render.transport.light import DirectTable, Indirect, Light
+from nir_render.scene.load import load_scene
+from nir_render.scene.scene import Scene
 from perception import Detection, RawFrame
 
 SCENE = """
@@ -89,7 +91,7 @@ def reference(of: Scene) -> Reference:
     many = replace(mean, indirect=replace(mean.indirect, samples=256))
     electrons = np.full((24, 32), 1000.0, dtype=np.float32)
     frame = RawFrame("r1.front", 0, 0.0, 1e-4, np.full((24, 32), 754, dtype=np.uint16), 64.0)
-    calibrations = {"r1.front": of.calibration("r1.front")}
+    calibrations = {"r1.front": nr.calibration(of, "r1.front")}
     return Reference(
         document=document_of(of),
         seed=3,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from nir_render.errors import InputError
+from nir_render.light.npz import light_hash
 from nir_render.regress import create, update
-from nir_render.regress.reference_files import names_in, read_reference, write_references
-from nir_render.regress.suite import scenes_of
-from nir_render.transport.light_file import light_hash
+from nir_render.regress.scenes_of import scenes_of
+from nir_render.regress.store import names_in, read_reference, write_references
 from perception import read_calibrations, read_frames
 from tests.unit.regress import cases
 
@@ -88,7 +88,7 @@ def test_what_is_left_out_of_a_file_says_so(stored: Path, tmp_path: Path) -> Non
     document = json.loads(reference.read_text())
     del document["renders"]
     reference.write_text(json.dumps(document))
-    from nir_render.run_folder import write_manifest
+    from nir_render.run.folder import write_manifest
 
     write_manifest(stored / "references", {"scenes": ["small"]})
     with pytest.raises(InputError, match=r"small: cannot be read \('renders'\); restore it"):

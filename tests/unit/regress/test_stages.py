@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nir_render.compare import judge
-from nir_render.regress.camera_stage import compare_calibration, compare_electrons, compare_frame
-from nir_render.regress.direct_stage import allowed_flips, compare_tables
+import nir_render as nr
+from nir_render.light.light import DirectTable, Indirect
 from nir_render.regress.findings import percent
-from nir_render.regress.light_stage import compare_indirect, settled
-from nir_render.regress.making import detections_of, electrons_of, frame_of, settings_of
-from nir_render.regress.perception_stage import compare_detections
+from nir_render.regress.make import detections_of, electrons_of, frame_of, frame_settings
 from nir_render.regress.reference import ReferenceLight, changes_of, document_of
-from nir_render.regress.twice import compare_twice
-from nir_render.transport.light import DirectTable, Indirect
+from nir_render.regress.repeatable import check_repeatable
+from nir_render.regress.stages.camera import compare_calibration, compare_electrons, compare_frame
+from nir_render.regress.stages.direct import allowed_flips, compare_tables
+from nir_render.regress.stages.light import compare_indirect, finding_of
+from nir_render.regress.stages.perception import compare_detections
+from nir_render.regress.statistics import judge
 from tests.unit.regress import cases
 
 
@@ -85,7 +86,7 @@ def _light_finding(
     findings, pending = compare_indirect(ReferenceLight(reference, None, None, ""), light, "", alike=True)
     assert not findings
     (verdict,) = judge([one.parts for one in pending], 1e-3)
-    finding = settled(pending[0], verdict, same_bits=same_bits, must_be_same=must_be_same)
+    finding = finding_of(pending[0], verdict, same_bits=same_bits, must_be_same=must_be_same)
     return f"{finding.verdict}: {finding.seen}"
 
 
@@ -122,7 +123,7 @@ def test_electrons_frames_and_calibration_of_the_camera(tmp_path: Path) -> None:
     """Equal as they are; 1 % of gain is seen in frame and calibration, 1 nm of filter in electrons and calibration."""
     scene = cases.scene(tmp_path)
     reference = cases.reference(scene)
-    (setting,) = settings_of(scene)
+    (setting,) = frame_settings(scene)
     light = reference.lights[0]
     electrons = electrons_of(scene, setting, light.light)
     frame = frame_of(scene.camera("r1.front")[1], setting, electrons, 3)
@@ -147,7 +148,7 @@ def test_electrons_frames_and_calibration_of_the_camera(tmp_path: Path) -> None:
 def test_a_spread_that_is_rounding_is_none(tmp_path: Path) -> None:
     """Equal sources have no spread, or one of 1e-16; a spread of 1 % is one."""
     scene = cases.scene(tmp_path)
-    known = scene.calibration("r1.front")
+    known = nr.calibration(scene, "r1.front")
     constant = known.range_constant_dn_m2_per_s
     for share, verdict in ((1e-15, "pass"), (0.01, "fail")):
         before = replace(known, sigma={"range_constant_dn_m2_per_s": share * constant})
@@ -158,7 +159,7 @@ def test_a_spread_that_is_rounding_is_none(tmp_path: Path) -> None:
 
 def test_a_few_counts_may_round_the_other_way(tmp_path: Path) -> None:
     scene = cases.scene(tmp_path)
-    (setting,) = settings_of(scene)
+    (setting,) = frame_settings(scene)
     shot = cases.reference(scene).shots[0]
     frame = frame_of(scene.camera("r1.front")[1], setting, shot.electrons, 3)
     for flips, by_dn, exact, verdict in ((2, 1, False, "pass"), (2, 1, True, "fail"), (1, 3, False, "fail"), (40, 1, False, "fail")):  # fmt: skip
@@ -185,7 +186,7 @@ def test_what_goes_with_the_counts_is_compared(
     tmp_path: Path, field: str, share: float, verdict: str
 ) -> None:
     scene = cases.scene(tmp_path)
-    (setting,) = settings_of(scene)
+    (setting,) = frame_settings(scene)
     setting = replace(setting, time_s=0.5)
     shot = cases.reference(scene).shots[0]
     frame = frame_of(scene.camera("r1.front")[1], setting, shot.electrons, 3)
@@ -200,10 +201,10 @@ def test_what_goes_with_the_counts_is_compared(
 def test_the_second_time_gives_the_same_bits(tmp_path: Path) -> None:
     scene = cases.scene(tmp_path)
     reference = cases.reference(scene)
-    taken = list(zip(settings_of(scene), reference.shots, strict=True))
+    taken = list(zip(frame_settings(scene), reference.shots, strict=True))
     found = detections_of([reference.shots[0].frame], reference.calibrations)
-    assert compare_twice(scene, reference, taken, found).verdict == "pass"
-    other = compare_twice(scene, reference, taken, found | {"robust": (cases.detection(),)})
+    assert check_repeatable(scene, reference, taken, found).verdict == "pass"
+    other = check_repeatable(scene, reference, taken, found | {"robust": (cases.detection(),)})
     assert (other.verdict, other.seen) == ("fail", "other bits the second time: detections of robust")
 
 
@@ -211,7 +212,7 @@ def test_electrons_of_light_that_the_scene_has_no_emitter_for(tmp_path: Path) ->
     scene = cases.scene(tmp_path)
     reference = cases.reference(scene)
     stranger = replace(reference.lights[0], light=replace(reference.lights[0].light, groups=("r9.top",)))
-    (setting,) = settings_of(scene)
+    (setting,) = frame_settings(scene)
     finding, pair = compare_electrons(scene, setting, reference.shots[0], stranger, "", exact=False)
     assert (finding.verdict, finding.seen, pair) == ("fail", "the scene has no r9.top any more", None)
 

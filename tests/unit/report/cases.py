@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nir_render.evaluate.metrics import Score
-from nir_render.evaluate.truth import SourceTruth
+from nir_render.truth.sources import SourceTruth
 from perception.types import Calibration, Detection, RawFrame
 
 TRUTH = SourceTruth(

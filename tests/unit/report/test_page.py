@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nir_render.evaluate.metrics import FrameKey, evaluate
-from nir_render.evaluate.truth import SourceTruth
+from nir_render.evaluate.metrics import evaluate
 from nir_render.report.page import report_html
-from perception.types import Detection
+from nir_render.truth.sources import SourceTruth
+from perception.types import Detection, FrameKey
 from tests.unit.report.cases import Page, calibration, detection, frame, truth
 
 HOSTILE = "<script>alert('$x$ & y')</script>"

@@ -2,7 +2,7 @@ from typing import Any
 
 import pytest
 
-from nir_render.report.samples import samples_of
+from nir_render.evaluate.estimator_errors import errors_of
 from nir_render.report.verdicts import Verdict, verdicts_of
 from tests.unit.report.cases import detection, score
 
@@ -20,7 +20,7 @@ def _verdicts(
         )
         for i, error in enumerate(errors_m)
     ]
-    judged = verdicts_of({"false_alarms_per_frame": false_alarms}, samples_of(scores, "mine"))
+    judged = verdicts_of({"false_alarms_per_frame": false_alarms}, errors_of(scores, "mine"))
     return {verdict.about: verdict for verdict in judged}
 
 

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from nir_render import InputError, Scene, load_scene
-from nir_render.scene.drive import FULL_DRIVE, Drive
-from nir_render.scene.shutter import GlobalShutter, RollingShutter
+from nir_render.scene.documents.camera import GlobalShutter, RollingShutter
+from nir_render.scene.documents.emitters import FULL_DRIVE, Drive
+from tests.paths import SCENES
 
-SCENES = Path(__file__).parents[3] / "scenes"
 CAMERA = "robots.r1.rig.cameras.front"
 DRIVE = "robots.r2.rig.sources.top.drive"
 

@@ -8,10 +8,10 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from nir_render import InputError, Scene, load_scene
-from nir_render.scene.lens import Lens
+from nir_render.scene.documents.lens import Lens
 from nir_render.scene.schema import scene_schema
+from tests.paths import SCENES
 
-SCENES = Path(__file__).parents[3] / "scenes"
 AT = "robots.r1.rig.cameras.front.lens."
 FULL = {
     "model": "fisheye", "distortion": [0.01, -0.02, 0.003, -1 / 3000], "principal_point": "[640.2, 478.9] px",

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from nir_render import InputError, Scene, load_scene
+from tests.paths import SCENES
 
-SCENES = Path(__file__).parents[3] / "scenes"
 FRONT = "robots.r1.rig.cameras.front"
 
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from nir_render.scene.document import Robot, Waypoint
-from nir_render.scene.fields import Orientation
-from nir_render.scene.motion import Pose, robot_pose, rotation_of
+from nir_render.scene.documents.base import Orientation
+from nir_render.scene.documents.document import Robot, Waypoint
+from nir_render.scene.motion import robot_pose
+from nir_render.scene.pose import Pose, rotation_of
 
 QUARTER = {"yaw": "90 deg"}
 

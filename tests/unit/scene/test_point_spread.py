@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from nir_render.scene.point_spread import PointSpread
+from nir_render.scene.documents.point_spread import PointSpread
 
 _AT = np.arange(-6, 7)
 _BELL = np.exp(-0.5 * (_AT[:, None] ** 2 + _AT**2) / 1.5**2)

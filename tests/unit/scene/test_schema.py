@@ -9,8 +9,7 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from nir_render.scene.schema import scene_schema
-
-SCENES = Path(__file__).parents[3] / "scenes"
+from tests.paths import SCENES
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from nir_render import InputError, Scene, load_scene
-from nir_render.scene.fog import Fog, HenyeyGreenstein, TabulatedPhase
+from nir_render.scene.documents.fog import Fog, HenyeyGreenstein, TabulatedPhase
+from tests.paths import SCENES
 
-SCENES = Path(__file__).parents[3] / "scenes"
 PATTERN = "robots.r2.rig.sources.top.pattern"
 SUN = {"azimuth": "30 deg", "elevation": "40 deg", "irradiance": "0.305 W/m^2/nm"}
 
@@ -41,7 +41,7 @@ def test_extinction_is_per_metre(scene: Scene, text: str, per_m: float) -> None:
 
 
 def test_visibility_becomes_extinction(scene: Scene) -> None:
-    """PHYSICS section 3: 3.912/σ; the heavy advection fog of 136 m has 28.8 per km."""
+    """docs/physics.md, Fog: 3.912/σ; the heavy advection fog of 136 m has 28.8 per km."""
     assert _fog(scene, visibility="136 m").extinction_per_m == pytest.approx(0.028765, rel=1e-4)
 
 

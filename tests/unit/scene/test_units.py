@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from nir_render.scene import units
-from nir_render.scene.units import format_quantity, format_vector, parse_quantity, parse_vector
+from nir_render.scene.text import units
+from nir_render.scene.text.units import format_quantity, format_vector, parse_quantity, parse_vector
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ import pytest
 
 from nir_render import InputError
 from nir_render.spectra.curve import Curve, constant_curve
-from nir_render.spectra.led import gaussian_spectrum
+from nir_render.spectra.illuminants import gaussian_spectrum
 
 
 @pytest.fixture

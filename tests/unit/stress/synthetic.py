@@ -8,10 +8,10 @@ from typing import Any, cast
 import pyarrow as pa
 
 from nir_render.randomness import generator
-from nir_render.scene.load import Scene
+from nir_render.scene.scene import Scene
 from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
-from nir_render.stress.figures import FIGURES, parse_bound
+from nir_render.stress.metrics import METRICS, parse_bound
 
 RANGE = Axis(
     "robots.r2.x", "range", ("robots.r2.x",), ("1 m", "1.7 m", "2.8 m", "4.8 m", "8 m"),
@@ -33,13 +33,13 @@ def campaign(
     bounds: Mapping[str, str],
     seeds: int = 2,
     *,
-    figures: Sequence[str] = (),
+    metrics: Sequence[str] = (),
     **named: str,
 ) -> Campaign:
-    asked = tuple(name for name in FIGURES if name in {*bounds, *figures})
+    asked = tuple(name for name in METRICS if name in {*bounds, *metrics})
     return Campaign(
         name=named.get("name", "clutter"), description=named.get("description", ""), scene=cast(Scene, None), settings={},
-        axes=tuple(axes), seeds=tuple(range(1, seeds + 1)), estimators=("paper", "robust"), figures=asked,
+        axes=tuple(axes), seeds=tuple(range(1, seeds + 1)), estimators=("paper", "robust"), metrics=asked,
         bounds=tuple(parse_bound(name, text) for name, text in bounds.items()), path="clutter.yaml",
     )  # fmt: skip
 

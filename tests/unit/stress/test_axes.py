@@ -1,8 +1,11 @@
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from pydantic import ValidationError
 
+from nir_render.scene.explain import explain
 from nir_render.stress.axes import Axis, AxisDocument
 
 
@@ -85,6 +88,9 @@ def test_an_axis_without_sense_says_so(written: Any, said: str) -> None:
         ("1 m", "stands where keys with values are wanted"),
     ],
 )  # fmt: skip
-def test_an_axis_badly_written_says_so(written: Any, said: str) -> None:
-    with pytest.raises(ValidationError, match=said):
+def test_an_axis_badly_written_says_so(written: Any, said: str, tmp_path: Path) -> None:
+    (tmp_path / "axis.yaml").write_text(yaml.safe_dump(written))
+    with pytest.raises(ValidationError) as refused:
         AxisDocument.model_validate(written)
+    (problem,) = explain(refused.value, written, str(tmp_path / "axis.yaml"))
+    assert said in problem

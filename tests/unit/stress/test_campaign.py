@@ -9,13 +9,12 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from nir_render import InputError
-from nir_render.stress.campaign import Campaign, load_campaign
+from nir_render.stress.campaign import Campaign, campaign_schema, load_campaign
 from nir_render.stress.jobs import Job, plan
-from nir_render.stress.schema import campaign_schema
+from tests.paths import ROOT
 
 pytestmark = pytest.mark.mitsuba
 
-ROOT = Path(__file__).parents[3]
 SHIPPED = sorted((ROOT / "scenes" / "campaigns").glob("*.yaml"))
 AXES = {"range": {"path": "robots.r2.position.x", "values": ["1 m", "2 m", "4 m"]},
         "robots.r1.rig.cameras.front.exposure": ["50 us", "1 ms"]}  # fmt: skip
@@ -46,7 +45,7 @@ def planned(folder: Path, **changes: Any) -> tuple[Campaign, list[Job]]:
 def test_the_shipped_campaigns_can_be_read(file: Path) -> None:
     campaign = load_campaign(file)
     assert campaign.name == file.stem
-    assert {bound.figure for bound in campaign.bounds} <= set(campaign.figures)
+    assert {bound.metric for bound in campaign.bounds} <= set(campaign.metrics)
 
 
 def test_editors_know_campaigns() -> None:
@@ -184,8 +183,6 @@ def test_a_scene_is_no_campaign() -> None:
 def test_too_many_jobs_are_refused(tmp_path: Path) -> None:
     axes = {"a": {"path": "robots.r2.position.x", "from": "1 m", "to": "2 m", "count": 1000},
             "b": {"path": "robots.r2.position.z", "from": "0 m", "to": "1 m", "count": 3}}  # fmt: skip
-    campaign = load_campaign(
-        written(tmp_path, axes={"a": axes["a"] | {"count": 3}, "b": axes["b"]}, seeds=20_000)
-    )
+    file = written(tmp_path, axes={"a": axes["a"] | {"count": 3}, "b": axes["b"]}, seeds=20_000)
     with pytest.raises(InputError, match="are 180000 jobs; at most 100000"):
-        plan(campaign)
+        load_campaign(file)

@@ -1,7 +1,6 @@
 """A job's rows against what `evaluate` says of the same frames."""
 
 import math
-from pathlib import Path
 
 import pytest
 
@@ -9,10 +8,11 @@ import nir_render as nr
 from nir_render.evaluate.metrics import evaluate
 from nir_render.stress.execute import execute
 from perception import ESTIMATORS, detect
+from tests.paths import SCENES
 
 pytestmark = pytest.mark.mitsuba
 
-SCENE = Path(__file__).parents[3] / "scenes" / "one_source.yaml"
+SCENE = SCENES / "one_source.yaml"
 
 
 def test_rows_say_what_evaluate_says() -> None:
@@ -23,7 +23,7 @@ def test_rows_say_what_evaluate_says() -> None:
     assert frames_sha256 != execute(scene.with_({"seed": 2}), {})[1]
 
     shots = list(nr.simulate(scene))
-    calibration = scene.calibration("r1.front")
+    calibration = nr.calibration(scene, "r1.front")
     found = {
         name: [hit for shot in shots for hit in detect(shot.frame, calibration, name)] for name in ESTIMATORS
     }

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from nir_render import DirectTable, Indirect, InputError, Light, LightCache
-from nir_render.camera.enlarge import Enlargement
-from nir_render.transport.light import Edges
-from nir_render.transport.light_file import bytes_of
+from nir_render.light.enlarge import Enlargement
+from nir_render.light.light import Edges
+from nir_render.light.npz import bytes_of
+from tests.paths import ROOT
 
 KEY, OTHER, THIRD = "a" * 64, "b" * 64, "c" * 64
 
@@ -114,7 +115,7 @@ cache.LightCache(sys.argv[1]).put(KEY, _light())
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_killed_writer_leaves_no_half_light_and_its_rest_goes(tmp_path: Path) -> None:
-    root = Path(__file__).parents[3]
+    root = ROOT
     done = subprocess.run([sys.executable, "-c", _KILLED, str(tmp_path)], cwd=root, check=False)
     assert done.returncode == -signal.SIGKILL
     (rest,) = tmp_path.iterdir()

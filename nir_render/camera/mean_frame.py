@@ -1,0 +1,333 @@
+"""The camera's conductor: all of a `Light` to the noise-free frame, and whose electrons are whose.
+
+All that takes long is done once for a light: `rates` are the electrons per second that it brings, everything
+that shines fully lit. A frame is their weighted sum: drives and the shutter act on what falls on a row of
+pixels, behind lens and point spread, so emitters of one drive share an image.
+"""
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.beams import Beam, beam_window, blur, diffuse_electrons
+from nir_render.camera.by_spectrum import by_spectrum, group_emitters, group_fluxes, row_response
+from nir_render.camera.optics.apertures import Aperture, flare_aperture
+from nir_render.camera.optics.lens import intrinsics_of
+from nir_render.camera.optics.psf import Window
+from nir_render.camera.optics.veil import veil
+from nir_render.camera.timing.drive import drive_of
+from nir_render.camera.timing.shutter import mid_exposure_s, row_profile
+from nir_render.errors import InputError
+from nir_render.geometry import sunflower
+from nir_render.light.enlarge import enlarge
+from nir_render.light.light import Indirect, Light
+from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.emitters import FULL_DRIVE, Drive
+from nir_render.scene.emission import Emitter
+from nir_render.scene.snapshot import Snapshot
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """What a light brings in a second, whatever the exposure: everything that is not constant fully lit.
+
+    Attributes
+    ----------
+    snapshot
+        The world whose light it is: the camera, and what shines.
+    drives
+        The unlike drives of all that shines; what is constant is one, its level is in the rates.
+    drive
+        Index into `drives` of each group, shape (groups,).
+    images
+        Electrons per second of all but the windows, by drive: float32, which keeps 1e-7 of a sum of eight,
+        shape (drives, rows, columns). None where nothing reaches the frame but the windows.
+    windows
+        Electrons per second that each row of the light's direct table brings.
+    centre_row
+        The row of pixels of each window's centre, the nearest one where it is outside, shape (n,).
+    kept
+        For what follows from the rates and takes long: it goes when they go.
+    """
+
+    light: Light
+    snapshot: Snapshot
+    drives: tuple[Drive, ...]
+    drive: NDArray[np.int64]
+    images: NDArray[np.float32] | None
+    windows: tuple[Window, ...]
+    centre_row: NDArray[np.int64]
+    kept: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera that the light reaches."""
+        return self.snapshot.camera(self.light.camera).camera
+
+    @cached_property
+    def scattered(self) -> tuple[NDArray[np.float64], ...]:
+        """Electrons per second that each window's own group brings there indirectly, the windows' shapes."""
+        found = [np.zeros_like(window.values) for window in self.windows]
+        for group in np.unique(self.light.direct.group) if self.light.indirect is not None else ():
+            of_group = np.flatnonzero(self.light.direct.group == group)
+            rows = [row for row in of_group if self.windows[row].values.any()]
+            image = self.group_image(int(group)) if rows else None
+            for row in rows:
+                assert image is not None
+                found[row] = image[place_of(self.windows[row])].copy()
+        return tuple(found)
+
+    def group_image(self, group: int) -> NDArray[np.float64]:
+        """Return the electrons per second that one group's indirect light brings, shape (rows, columns)."""
+        only = np.zeros(len(self.light.groups))
+        only[group] = group_fluxes(self.light, self.snapshot)[group]
+        return _blurred(self.light, self.snapshot, only)
+
+
+@dataclass(frozen=True, eq=False)
+class MeanFrame:
+    """A noise-free frame.
+
+    Attributes
+    ----------
+    time_s
+        When row 0 begins its exposure.
+    electrons
+        Mean photoelectrons per pixel, shape (rows, columns).
+    windows
+        The part of it that each row of the light's direct table brings.
+    profiles
+        What each row of pixels collects of each of the rates' drives, relative to the exposure at full drive,
+        shape (drives, rows).
+    """
+
+    rates: Rates
+    exposure_s: float
+    time_s: float
+    electrons: NDArray[np.float64]
+    windows: tuple[Window, ...]
+    profiles: NDArray[np.float64]
+
+    @property
+    def light(self) -> Light:
+        """The light that was exposed."""
+        return self.rates.light
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that exposed it."""
+        return self.rates.camera
+
+    @property
+    def levels(self) -> NDArray[np.float64]:
+        """What the frame collects of each group, relative to the exposure at full drive, shape (groups,)."""
+        return np.asarray(self.profiles.mean(axis=1)[self.rates.drive])
+
+    def scattered(self, row: int) -> NDArray[np.float64]:
+        """Return the electrons in a window that its own group brings indirectly, the window's shape."""
+        weights = _window_weights(self.rates, row, self.profiles * self.exposure_s)
+        return np.asarray(self.rates.scattered[row] * weights[:, None])
+
+
+def mean_frame(light: Light, snapshot: Snapshot, exposure_s: float, time_s: float | None = None) -> MeanFrame:
+    """Return the noise-free frame of an exposure, and what it is made of.
+
+    `time_s` is when row 0 begins; without it the light's time is mid-exposure.
+    """
+    return exposed_frame(electron_rates(light, snapshot), exposure_s, time_s)
+
+
+def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
+    """Return what a light brings in a second: all that takes long, once for many exposures.
+
+    Raises
+    ------
+    InputError
+        The light is not finite.
+    """
+    camera = snapshot.camera(light.camera).camera
+    of_groups = [_drive_of_rates(emitter) for emitter in group_emitters(light, snapshot)]
+    drives = tuple(dict.fromkeys(of_groups))
+    drive = np.array([drives.index(of_group) for of_group in of_groups], dtype=np.int64)
+    windows = tuple(_windows(light, snapshot, camera))
+    images = _images(light, snapshot, drive, len(drives), windows)
+    parts = [window.values for window in windows] + ([] if images is None else [images])
+    if not all(np.isfinite(part).all() for part in parts):
+        raise InputError(
+            f"{snapshot.origin}: the light of {light.camera} is not finite; a body or source is degenerate"
+        )
+    v_px = intrinsics_of(camera).project(light.direct.direction)[:, 1]
+    nearest = np.clip(np.nan_to_num(v_px), 0, camera.sensor.rows - 1)
+    return Rates(light, snapshot, drives, drive, images, windows, np.rint(nearest).astype(np.int64))
+
+
+def kept_rates(light: Light, snapshot: Snapshot) -> Rates:
+    """Return the rates of a light, and keep them with it for its next exposure.
+
+    Kept are those of the last camera and emitters: another flux, spectrum, drive or device is reckoned anew.
+    What is kept does not hold the light, so that both go when the light is dropped.
+    """
+    camera, emitters = snapshot.camera(light.camera).camera, dict(snapshot.emitters)
+    known = light.kept.get("rates")
+    if known is not None and known[0] == camera and known[1] == emitters:
+        return Rates(light, snapshot, **known[2])
+    rates = electron_rates(light, snapshot)
+    tables = {one.name: getattr(rates, one.name) for one in fields(rates)}
+    del tables["light"], tables["snapshot"]
+    light.kept["rates"] = (camera, emitters, tables)
+    return rates
+
+
+def exposed_frame(rates: Rates, exposure_s: float, time_s: float | None = None) -> MeanFrame:
+    """Return the noise-free frame of one exposure; arguments as of `mean_frame`."""
+    camera = rates.camera
+    _check_exposure(exposure_s)
+    if time_s is None:
+        time_s = rates.light.time_s - mid_exposure_s(camera, exposure_s)
+    if not np.isfinite(time_s):
+        raise InputError(f"time_s is {time_s!r}; wanted seconds")
+    profiles = [row_profile(camera, drive, time_s, exposure_s) for drive in rates.drives]
+    return _weighted_sum(rates, exposure_s, time_s, profiles)
+
+
+def fully_lit_frame(rates: Rates, exposure_s: float) -> MeanFrame:
+    """Return the noise-free frame of an exposure in which everything that is not constant is fully lit."""
+    _check_exposure(exposure_s)
+    return _weighted_sum(rates, exposure_s, 0.0, [np.ones(rates.camera.sensor.rows) for _ in rates.drives])
+
+
+def _check_exposure(exposure_s: float) -> None:
+    if not (np.isfinite(exposure_s) and exposure_s > 0):
+        raise InputError(f"exposure_s is {exposure_s!r}; wanted seconds greater than 0")
+
+
+def _weighted_sum(
+    rates: Rates, exposure_s: float, time_s: float, drive_profiles: list[NDArray[np.float64]]
+) -> MeanFrame:
+    sensor = rates.camera.sensor
+    profiles = np.reshape(drive_profiles, (len(drive_profiles), sensor.rows))
+    weights = exposure_s * profiles
+    if rates.images is None:
+        electrons = np.zeros((sensor.rows, sensor.columns))
+    else:
+        electrons = np.einsum("dr,drc->rc", weights.astype(np.float32), rates.images).astype(np.float64)
+    windows = tuple(_weighted_window(rates, row, weights) for row in range(len(rates.windows)))
+    for window in windows:
+        window.add_into(electrons)
+    return MeanFrame(rates, exposure_s, time_s, electrons, windows, profiles)
+
+
+def _weighted_window(rates: Rates, row: int, weights: NDArray[np.float64]) -> Window:
+    """Return a window of rates, weighted; what of its total lies elsewhere counts as its centre's row."""
+    window = rates.windows[row]
+    values = window.values * _window_weights(rates, row, weights)[:, None]
+    beyond = window.total - float(window.values.sum())
+    of_centre = float(weights[_drive_of_window(rates, row), rates.centre_row[row]])
+    return replace(window, values=values, total=float(values.sum()) + beyond * of_centre)
+
+
+def _window_weights(rates: Rates, row: int, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights, shape (drives, rows), that hold for the rows of a window."""
+    return weights[_drive_of_window(rates, row), place_of(rates.windows[row])[0]]
+
+
+def place_of(window: Window) -> tuple[slice, slice]:
+    """Return the rows and the columns of pixels that a window lies on."""
+    rows, columns = window.values.shape
+    return slice(window.row, window.row + rows), slice(window.column, window.column + columns)
+
+
+def _drive_of_window(rates: Rates, row: int) -> int:
+    return int(rates.drive[rates.light.direct.group[row]])
+
+
+def _drive_of_rates(emitter: Emitter) -> Drive:
+    drive = drive_of(emitter)
+    return drive if drive.constant is None else FULL_DRIVE
+
+
+def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
+    """Return the apertures of what the direct table shows in the frame: sources, the sun, their ghosts."""
+    table = light.direct
+    shown = (
+        flare_aperture(camera, table.direction[row], float(table.angular_radius_rad[row]))
+        for row in table.shining
+    )
+    return [aperture for aperture in shown if aperture is not None]
+
+
+def _images(
+    light: Light, snapshot: Snapshot, drive: NDArray[np.int64], drives: int, windows: tuple[Window, ...]
+) -> NDArray[np.float32] | None:
+    """Return the electrons per second on the sensor, all but the windows, by drive; None where none are.
+
+    They are the indirect light, and what glare and ghosts bring of it and of the windows.
+    """
+    camera = snapshot.camera(light.camera).camera
+    veiled = camera.point_spread.core_share < 1.0
+    if light.indirect is None and not veiled:
+        return None
+    flux = group_fluxes(light, snapshot)
+    images = np.empty((drives, camera.sensor.rows, camera.sensor.columns), dtype=np.float32)
+    for number in range(drives):
+        image = _blurred(light, snapshot, np.where(drive == number, flux, 0.0))
+        if veiled:
+            core = image.copy()
+            for row in np.flatnonzero(drive[light.direct.group] == number):
+                windows[row].add_into(core)
+            image += veil(camera, core)
+        images[number] = image
+    return images
+
+
+def _blurred(light: Light, snapshot: Snapshot, flux: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the electrons per second of indirect light of groups of given fluxes, never below 0."""
+    camera = snapshot.camera(light.camera).camera
+    if light.indirect is None:
+        return np.zeros((camera.sensor.rows, camera.sensor.columns))
+    image = blur(camera, diffuse_image(light, light.indirect, snapshot, flux))
+    return np.asarray(np.maximum(image, 0.0))  # what is enlarged along edges can dip below
+
+
+def diffuse_image(
+    light: Light, indirect: Indirect, snapshot: Snapshot, fluxes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the electrons per second of indirect light before the blur, groups of given fluxes summed."""
+    camera = snapshot.camera(light.camera).camera
+    rows, columns = camera.sensor.rows, camera.sensor.columns
+    image = np.zeros((rows, columns))
+    edges = indirect.edges
+    enlargement = None if edges is None else edges.enlargement
+    parts = by_spectrum(light, snapshot, indirect.radiance_per_w, fluxes)
+    patches = [] if edges is None else by_spectrum(light, snapshot, edges.radiance_per_w, fluxes)
+    for part, patch in zip_longest(parts, patches):
+        whole = enlarge(part.values, rows, columns, enlargement, None if patch is None else patch.values)
+        image += diffuse_electrons(camera, whole, part.emitter, 1.0, part.node)
+    return image
+
+
+def _windows(light: Light, snapshot: Snapshot, camera: Camera) -> list[Window]:
+    """Return the electrons per second of each row of the direct table."""
+    emitters, fluxes = group_emitters(light, snapshot), group_fluxes(light, snapshot)
+    table = light.direct
+    windows = []
+    for row, group in enumerate(table.group):
+        direction, angular_radius_rad = table.direction[row], float(table.angular_radius_rad[row])
+        seen = None
+        if 0.0 < table.visible_fraction[row] < 1.0:
+            seen = sunflower(direction, angular_radius_rad, table.visibility_rays)[table.seen[row]]
+        irradiance_per_unit, response = row_response(camera, light, row, emitters[group])
+        beam = Beam(
+            direction=direction,
+            angular_radius_rad=angular_radius_rad,
+            irradiance_w_per_m2=irradiance_per_unit * float(fluxes[group]),
+            response=response,
+            seen=seen,
+            distance_m=float(table.distance_m[row]),
+        )
+        windows.append(beam_window(camera, beam, 1.0))
+    return windows

@@ -1,0 +1,1 @@
+"""Light through the lens: projection, point spread, glare, spectral response."""

@@ -1,0 +1,1 @@
+"""Electrons to raw counts: noise, fixed pattern, full well, ADC."""

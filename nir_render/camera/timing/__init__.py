@@ -1,0 +1,1 @@
+"""What a row of pixels collects over time: shutter, drives, exposure control."""

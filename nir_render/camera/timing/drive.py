@@ -1,0 +1,81 @@
+"""How much an emitter sends within a stretch of time, exactly: means of its drive, in closed form."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nir_render.scene.documents.emitters import FULL_DRIVE, BitString, Drive, SquareWave, Sun
+from nir_render.scene.emission import Emitter
+
+Array = NDArray[np.float64]
+
+
+def drive_of(emitter: Emitter) -> Drive:
+    """Return the drive of an emitter; the sun shines evenly."""
+    return FULL_DRIVE if isinstance(emitter, Sun) else emitter.drive
+
+
+def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array:
+    """Return the mean level of a drive, from 0 to 1, over stretches of time.
+
+    Edges lie where the floats say, to their rounding; a stretch without edges has its level to the bit.
+
+    Parameters
+    ----------
+    start_s
+        When the stretches begin, any shape; times before 0 are times too.
+    duration_s
+        How long they are, not negative; the mean over none at all is the level there.
+    """
+    start, duration = np.broadcast_arrays(np.asarray(start_s, float), np.asarray(duration_s, float))
+    if drive.square is not None:
+        return _of_square(drive.square, start, duration)
+    if drive.bits is not None:
+        return _of_bits(drive.bits, start, duration)
+    assert drive.constant is not None  # the model admits no fourth form
+    return np.full(start.shape, drive.constant)
+
+
+def _of_square(square: SquareWave, start_s: Array, duration_s: Array) -> Array:
+    """Return the mean over whole periods, and over the rest, which may meet two times of light."""
+    _, begin = _whole_and_part((start_s - square.phase_s) * square.frequency_hz)
+    length = duration_s * square.frequency_hz
+    whole, rest = _whole_and_part(length)
+    lit = np.clip(square.duty - begin, 0.0, rest) + np.clip(1.0 + square.duty - begin, 0.0, rest)
+    lit -= np.clip(1.0 - begin, 0.0, rest)
+    level = np.where(begin < square.duty, 1.0, 0.0)
+    return np.divide(whole * square.duty + lit, length, out=level, where=length > 0.0)
+
+
+def _of_bits(bits: BitString, start_s: Array, duration_s: Array) -> Array:
+    """Return the mean: a part of the first bit, whole bits, a part of the last."""
+    levels = np.array([float(bit) for bit in bits.pattern])
+    sums = np.concatenate([[0.0], np.cumsum(levels)])
+    count = len(levels)
+    end = np.inf if bits.repeat == "forever" else float(count * bits.repeat)
+
+    def level(number: Array) -> Array:
+        sent = levels[np.mod(number, count).astype(np.int64)]
+        return np.where((number >= 0.0) & (number < end), sent, bits.idle)
+
+    def total(number: Array) -> Array:
+        """Return the sum of the levels from bit 0 on up to, and without, the bit of a number."""
+        within = np.clip(number, 0.0, end)
+        repeats, number_in = np.divmod(within, count)
+        return np.asarray(
+            repeats * sums[-1] + sums[number_in.astype(np.int64)] + bits.idle * (number - within)
+        )
+
+    first, begin = _whole_and_part((start_s - bits.start_s) * bits.rate_hz)
+    length = duration_s * bits.rate_hz
+    further, rest = _whole_and_part(begin + length)
+    summed = level(first) * (1.0 - begin) + total(first + further) - total(first + 1.0)
+    summed += level(first + further) * rest
+    return np.divide(summed, length, out=level(first), where=further > 0.0)
+
+
+def _whole_and_part(number: Array) -> tuple[Array, Array]:
+    """Return whole numbers, rounded down, and what is left, from 0 to below 1."""
+    whole = np.floor(number)
+    part = number - whole
+    carry = part >= 1.0  # a number just below 0 rounds up to 1
+    return whole + carry, np.where(carry, 0.0, part)

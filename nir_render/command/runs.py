@@ -1,0 +1,240 @@
+"""The commands of a run folder: run, render, perceive, evaluate, calibrate, report."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nir_render.command.options import (
+    Estimators,
+    FolderArgument,
+    Json,
+    KeepLight,
+    LightFolder,
+    LightLimit,
+    Output,
+    Overwrite,
+    SceneArgument,
+    Seed,
+    Settings,
+    Threads,
+    chosen_estimators,
+    light_cache,
+    read_scene,
+    use_threads,
+)
+
+if TYPE_CHECKING:
+    from nir_render.evaluate.metrics import Evaluation
+    from nir_render.scene.scene import Scene
+    from nir_render.transport.cache import LightCache
+
+
+def run(
+    scene: SceneArgument,
+    output: Output = None,
+    settings: Settings = None,
+    estimators: Estimators = None,
+    overwrite: Overwrite = False,
+    seed: Seed = None,
+    threads: Threads = None,
+    keep_light: KeepLight = False,
+    light_folder: LightFolder = None,
+    light_gib: LightLimit = 4.0,
+    as_json: Json = False,
+) -> None:
+    """Render, perceive, evaluate and report a scene in one go."""
+    from nir_render.command.progress import progress_bar
+    from nir_render.run.evaluate import evaluate_run
+    from nir_render.run.perceive import perceive_run
+    from nir_render.run.report import report_run
+
+    chosen = chosen_estimators(estimators)
+    cache = light_cache(light_folder, light_gib)
+    folder = _render(read_scene(scene, settings, seed), output, overwrite, threads, keep_light, cache)
+    with progress_bar("perceive") as progress:
+        perceive_run(folder, estimators=chosen, progress=progress)
+    result = evaluate_run(folder)
+    page = report_run(folder, result)
+    _show_evaluation(result, folder, as_json)
+    if not as_json:
+        typer.echo(f"open {page}")
+
+
+def render(
+    scene: SceneArgument,
+    output: Output = None,
+    settings: Settings = None,
+    overwrite: Overwrite = False,
+    seed: Seed = None,
+    threads: Threads = None,
+    keep_light: KeepLight = False,
+    light_folder: LightFolder = None,
+    light_gib: LightLimit = 4.0,
+    only_estimate: Annotated[
+        bool,
+        typer.Option("--estimate", help="Only say how long it takes without a cache, from small trials."),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Render the frames of a scene, with truth and calibration."""
+    from nir_render.command.console import print_json
+
+    cache = light_cache(light_folder, light_gib)
+    loaded = read_scene(scene, settings, seed)
+    if only_estimate:
+        _show_estimate(loaded, output, overwrite, threads, as_json)
+        return
+    folder = _render(loaded, output, overwrite, threads, keep_light, cache)
+    frames = len((folder / "frames.jsonl").read_text(encoding="utf-8").splitlines())
+    if as_json:
+        print_json({"folder": str(folder), "frames": frames})
+    else:
+        typer.echo(f"{frames} frames in {folder}; next: nir-render perceive {folder}")
+
+
+def perceive(folder: FolderArgument, estimators: Estimators = None, as_json: Json = False) -> None:
+    """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
+    from nir_render.command.console import print_json
+    from nir_render.command.progress import progress_bar
+    from nir_render.run.perceive import perceive_run
+
+    with progress_bar("perceive") as progress:
+        counts = perceive_run(folder, estimators=chosen_estimators(estimators), progress=progress)
+    if as_json:
+        print_json({"folder": str(folder), "detections": counts})
+    else:
+        for name, count in counts.items():
+            typer.echo(f"{name}: {count} detections in {folder / f'detections.{name}.jsonl'}")
+
+
+def evaluate(folder: FolderArgument, as_json: Json = False) -> None:
+    """Score the detections of a run against its truth and the physical limit."""
+    from nir_render.run.evaluate import evaluate_run
+
+    _show_evaluation(evaluate_run(folder), folder, as_json)
+
+
+def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
+    """Fit the range constants to frames at known ranges; judge them on every other range, held out."""
+    from nir_render.command.console import note, print_error, print_json
+    from nir_render.command.progress import progress_bar
+    from nir_render.command.tables import calibration_table, print_table
+    from nir_render.run.calibrate import FITTED_FILE, calibrate_run
+
+    with progress_bar("calibrate") as progress:
+        cameras = calibrate_run(folder, progress)
+    holds = not any(camera.faults for camera in cameras.values())
+    if as_json:
+        records = {name: camera.record() for name, camera in cameras.items()}
+        print_json({"format": 1, "folder": str(folder), "holds": holds, "cameras": records})
+    else:
+        for name, camera in cameras.items():
+            print_table(calibration_table(name, camera))
+        if holds:
+            typer.echo(f"{folder / FITTED_FILE}: written")
+    if not holds:
+        for name, camera in cameras.items():
+            for fault in camera.faults:
+                print_error(f"{name}: {fault}", label="check failed")
+        note(f"{folder / FITTED_FILE}: not written")
+        raise typer.Exit(1)
+
+
+def report(folder: FolderArgument, as_json: Json = False) -> None:
+    """Evaluate a run, and show it on a page that opens from disk: report.html."""
+    from nir_render.command.console import print_json
+    from nir_render.run.evaluate import evaluate_run
+    from nir_render.run.report import report_run
+
+    page = report_run(folder, evaluate_run(folder))
+    if as_json:
+        print_json({"folder": str(folder), "report": str(page)})
+    else:
+        typer.echo(f"open {page}")
+
+
+def _render(
+    scene: "Scene",
+    output: Path | None,
+    overwrite: bool,
+    threads: int | None,
+    keep_light: bool,
+    cache: "LightCache",
+) -> Path:
+    from nir_render.command.console import warn
+    from nir_render.command.progress import progress_bar
+    from nir_render.run.folder import check_free
+    from nir_render.run.render import calibrations_of, render_run
+
+    _say_what_is_lowered(scene)
+    folder = output if output is not None else Path("outputs") / scene.document.name
+    check_free(folder, overwrite)
+    use_threads(threads)
+    with progress_bar("calibrate") as progress:
+        calibrations = calibrations_of(scene, progress)
+    with progress_bar("render") as progress:
+        warnings = render_run(
+            scene,
+            folder,
+            overwrite=overwrite,
+            progress=progress,
+            keep_light=keep_light,
+            cache=cache,
+            calibrations=calibrations,
+        )
+    for text in warnings:
+        warn(text)
+    return folder
+
+
+def _say_what_is_lowered(scene: "Scene") -> None:
+    """Tell, on standard error, where this machine renders with fewer samples than the scene asks for."""
+    if not scene.document.has_indirect_light():
+        return
+    from nir_render.command.console import note
+    from nir_render.transport.backend.variant import backend
+    from nir_render.transport.indirect.stock import samples_of
+
+    settings, used = scene.document.render, samples_of(scene.document.render.indirect)
+    asked = settings.indirect.samples
+    wanted = "what the target for the noise needs" if asked is None else str(asked)
+    if not backend().vectorised and used != asked:
+        note(
+            f"no usable LLVM: indirect light with {used} samples per pixel instead of {wanted}; "
+            "'nir-render doctor' says more"
+        )
+
+
+def _show_estimate(
+    scene: "Scene", output: Path | None, overwrite: bool, threads: int | None, as_json: bool
+) -> None:
+    import dataclasses
+
+    from nir_render.command.console import print_json
+    from nir_render.run.folder import check_free
+    from nir_render.run.time_estimate import time_estimate
+
+    if output is not None:
+        check_free(output, overwrite)
+    use_threads(threads)
+    guess = time_estimate(scene)
+    if as_json:
+        print_json({**dataclasses.asdict(guess), "seconds": guess.seconds})
+        return
+    typer.echo(
+        f"about {guess.seconds:.0f} s: light for {guess.lights} views at {guess.seconds_per_light:.2f} s, "
+        f"{guess.frames} frames at {guess.seconds_per_frame:.2f} s"
+    )
+
+
+def _show_evaluation(result: "Evaluation", folder: Path, as_json: bool) -> None:
+    from nir_render.command.console import print_json
+    from nir_render.command.tables import print_table, range_table, summary_table
+
+    if as_json:
+        print_json(result.summary)
+        return
+    print_table(range_table(result))
+    print_table(summary_table(result.summary))
+    typer.echo(f"{folder}: frames, truth, detections, summary.json, preview.png")

@@ -1,0 +1,100 @@
+"""The command of campaigns: stress."""
+
+import shlex
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nir_render.command.options import Json, LightFolder, LightLimit, Output, light_limit_bytes
+
+if TYPE_CHECKING:
+    from nir_render.stress.campaign import Campaign
+    from nir_render.stress.jobs import Job
+    from nir_render.stress.sweep import Sweep
+
+
+def stress(
+    file: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="A campaign file (YAML).")],
+    output: Output = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers", min=1, help="Processes to work in; by default as many as cores, at most 8."
+        ),
+    ] = None,
+    light_folder: LightFolder = None,
+    light_gib: LightLimit = 4.0,
+    only_plan: Annotated[
+        bool, typer.Option("--plan", help="Only check the campaign, and say how many jobs it has.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Sweep a scene along axes, and show where estimators fail; goes on where it was stopped."""
+    from nir_render.command.console import note
+    from nir_render.command.progress import progress_bar
+    from nir_render.stress.campaign import load_campaign
+    from nir_render.stress.jobs import plan
+    from nir_render.stress.sweep import StoppedError, sweep
+
+    campaign = load_campaign(file)
+    limit_bytes = light_limit_bytes(light_gib)
+    folder = output if output is not None else Path("outputs") / campaign.name
+    with progress_bar("check") as progress:
+        jobs = plan(campaign, progress)
+    if only_plan:
+        _show_plan(campaign, jobs, folder, as_json)
+        return
+    try:
+        with progress_bar("stress") as progress:
+            result = sweep(
+                campaign,
+                jobs,
+                folder,
+                workers=workers,
+                progress=progress,
+                light=light_folder,
+                light_limit_bytes=limit_bytes,
+            )
+    except StoppedError as stopped:
+        note(f"{stopped}; the same command goes on: {shlex.join(['nir-render', *sys.argv[1:]])}")
+        raise typer.Exit(128 + signal.SIGINT) from None
+    _show(result, as_json)
+    if result.failed:
+        raise typer.Exit(1)
+
+
+def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: bool) -> None:
+    from nir_render.command.console import print_json
+    from nir_render.stress.sweep import plan_record
+
+    record = plan_record(campaign, jobs, folder)
+    if as_json:
+        print_json(record)
+    else:
+        typer.echo(
+            f"{campaign.name}: {record['jobs']} jobs in {record['geometries']} geometries; "
+            f"{record['done']} are done in {folder}"
+        )
+
+
+def _show(result: "Sweep", as_json: bool) -> None:
+    from nir_render.command.console import note, print_error, print_json, warn
+    from nir_render.stress.page.words import reach_lines
+    from nir_render.stress.sweep import sweep_record, write_report
+
+    for text in result.warnings:
+        warn(text)
+    page = write_report(result)
+    if as_json:
+        print_json(sweep_record(result))
+    else:
+        for line in reach_lines(result.campaign, result.table):
+            typer.echo(line)
+        typer.echo(f"open {page}")
+    for key, text in result.failed.items():
+        print_error(text, label=f"job {key[:8]} failed")
+    if result.failed:
+        note("the same command tries these again")

@@ -1,0 +1,145 @@
+"""Tables for the terminal: ranges, the numbers of a summary, a calibration, the facts of a machine."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from nir_render.evaluate.metrics import Evaluation, Score
+from nir_render.run.calibrate import CameraCalibration
+from perception.calibration.result import IDEAL_MAE, HeldOut
+
+_MOST_ROWS = 24
+
+
+def print_table(table: Table) -> None:
+    """Print a table on standard output."""
+    Console().print(table)
+
+
+def range_table(result: Evaluation) -> Table:
+    """Return a table of true ranges, what each estimator gives, and the radiometric limit (1 sigma)."""
+    names = list(result.summary["estimators"])
+    table = Table(title="Range of each source, in metres", title_justify="left")
+    for heading in ("frame", "source", "true", *names, "limit σ"):
+        table.add_column(heading, justify="left" if heading == "source" else "right")
+    for score in result.scores[:_MOST_ROWS]:
+        truth = score.truth
+        estimated = [_range_text(score, name) for name in names]
+        frame, source = f"{truth.camera} {truth.index}", f"{truth.robot}.{truth.source}"
+        table.add_row(frame, source, f"{truth.range_m:.3f}", *estimated, _metres(score.range_limit_m))
+    if len(result.scores) > _MOST_ROWS:
+        table.caption = f"the first {_MOST_ROWS} of {len(result.scores)}"
+    return table
+
+
+def summary_table(summary: Mapping[str, Any]) -> Table:
+    """Return a table of the numbers of `summary.json`."""
+    limit = _metres(summary["range_limit_rmse_m"])
+    table = Table(
+        title=(
+            f"{summary['sources_visible']} sources visible in {summary['frames']} frames; "
+            f"range limit {limit} m RMS"
+        ),
+        title_justify="left",
+    )
+    columns = {
+        "recall": ("recall", "{:.1%}"),
+        "false_alarms_per_frame": ("false alarms\nper frame", "{:.3f}"),
+        "range_mae_m": ("range MAE\nm", "{:.4f}"),
+        "range_rmse_m": ("range RMSE\nm", "{:.4f}"),
+        "range_bias_m": ("range bias\nm", "{:+.4f}"),
+        "bearing_rms_deg": ("bearing RMS\ndeg", "{:.4f}"),
+    }
+    table.add_column("estimator")
+    for heading, _ in columns.values():
+        table.add_column(heading, justify="right")
+    for name, numbers in summary["estimators"].items():
+        cells = [
+            form.format(numbers[key]) if numbers[key] is not None else "–"
+            for key, (_, form) in columns.items()
+        ]
+        table.add_row(name, *cells)
+    return table
+
+
+def calibration_table(name: str, camera: CameraCalibration) -> Table:
+    """Return a table of one camera's calibration: the flux, and the paper's mean grey beside it."""
+    result, fit, paper = camera.result, camera.result.fit, camera.result.paper
+    table = Table(
+        title=f"{name}: {result.places_fitted} ranges fitted, {result.places_held_out} held out",
+        title_justify="left",
+    )
+    for heading in ("", "robust: flux", "paper: mean grey"):
+        table.add_column(heading, justify="right" if heading else "left")
+
+    constant = _with_sigma(fit.range_constant_dn_m2_per_s, fit.range_constant_sigma_dn_m2_per_s)
+    slope = _with_sigma(fit.slope_dn_m2_per_s, fit.slope_sigma_dn_m2_per_s)
+    intercept = _with_sigma(fit.intercept_dn_per_s, fit.intercept_sigma_dn_per_s)
+    paper_slope = paper_intercept = "–"
+    if paper is not None:
+        paper_slope = _with_sigma(paper.slope_dn_m2_per_s, paper.slope_sigma_dn_m2_per_s)
+        paper_intercept = _with_sigma(paper.intercept_dn_per_s, paper.intercept_sigma_dn_per_s)
+    table.add_row("K through the origin, DN m²/s", constant, "")
+    if camera.fitted_to_true is not None:
+        table.add_row("  over the true K − 1", f"{camera.fitted_to_true:+.3%}", "")
+    table.add_row("slope with intercept, DN m²/s", slope, paper_slope)
+    table.add_row("intercept, DN/s", intercept, paper_intercept)
+    table.add_row("reduced χ² (probability)", f"{fit.reduced_chi2:.3f} ({fit.chi2_probability:.2g})", "")
+    table.add_section()
+    robust, by_paper = result.robust, result.paper_held_out
+    frames = result.frames_held_out
+    table.add_row("held out: found", f"{robust.found} of {frames}", f"{by_paper.found} of {frames}")
+    for label, field, form in (
+        ("  range MAE, m", "range_mae_m", "{:.4f}"),
+        ("  range RMSE, m", "range_rmse_m", "{:.4f}"),
+        ("  range bias, m", "range_bias_m", "{:+.4f}"),
+        ("  reduced χ² of the errors", "reduced_chi2", "{:.3f}"),
+    ):
+        table.add_row(label, _cell(robust, field, form), _cell(by_paper, field, form))
+    table.caption = (
+        "The intercept is zero within 3 σ: K is that of the line through the origin.\n"
+        if fit.intercept_is_zero
+        else "The intercept is not zero: the flux does not follow 1/d² here.\n"
+    ) + (
+        f"Limit: mean Cramér–Rao σ {result.range_limit_m:.4f} m, "
+        f"so an ideal MAE of {IDEAL_MAE * result.range_limit_m:.4f} m."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def facts_table(facts: Mapping[str, Any]) -> Table:
+    """Return a table of facts and their values, a row each."""
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for key, value in facts.items():
+        table.add_row(key.replace("_", " "), escape(str(value)))
+    return table
+
+
+def _range_text(score: Score, name: str) -> str:
+    if name not in score.detections:
+        return "not found"
+    mark = " sat" if score.detections[name].saturated else ""
+    return _metres(score.detections[name].range_m, digits=3) + mark
+
+
+def _metres(value: float | None, digits: int = 4) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _cell(held_out: HeldOut, field: str, form: str) -> str:
+    value = getattr(held_out, field)
+    return form.format(value) if math.isfinite(value) else "–"
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """Write both to the sigma's second digit, in one power of ten: (1.2345 ± 0.0012)e+08."""
+    if not math.isfinite(sigma) or sigma <= 0.0:
+        return f"{value:.5g}"
+    power = math.floor(math.log10(max(abs(value), sigma)))
+    digits = max(0, power - math.floor(math.log10(sigma)) + 1)
+    return f"({value / 10**power:.{digits}f} ± {sigma / 10**power:.{digits}f})e{power}"

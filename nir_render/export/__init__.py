@@ -1,1 +1,0 @@
-"""Light and frames in other people's formats."""

@@ -1,0 +1,1 @@
+"""What transport hands to camera: what one unit of each group brings to each pixel, and its files."""

@@ -1,0 +1,153 @@
+"""Light that was rendered in blocks of pixels, enlarged to the sensor without smearing it across edges.
+
+Light is interpolated linearly between the centres of blocks, but for the pixels near edges, which an
+`Enlargement` lists: each of these is a weighted sum of blocks that show its own surfaces, or was rendered by
+itself. All of it is linear in the light. The weights are made where the geometry is known, in
+`transport.indirect.enlargement`.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Enlargement:
+    """How an image of blocks becomes one of pixels.
+
+    Attributes
+    ----------
+    rows, columns
+        Of the sensor.
+    pixels
+        Numbers of the pixels, row by row, that are not interpolated from the four blocks around, shape (n,).
+    first
+        Where the weights of each of these begin; one more at the end, shape (n + 1,).
+    block, weight
+        Numbers of blocks, and what they weigh, shape (m,).
+    patch
+        Numbers of the pixels that no block tells of well enough, or that the edge of a lamp cuts, shape (p,):
+        they are rendered one by one.
+    left_out
+        How many more of these there are than may be rendered one by one: they are interpolated.
+    """
+
+    rows: int
+    columns: int
+    pixels: NDArray[np.int32]
+    first: NDArray[np.int32]
+    block: NDArray[np.int32]
+    weight: NDArray[np.float32]
+    patch: NDArray[np.int32]
+    left_out: int = 0
+
+    def matrix(self, blocks: int) -> csr_array:
+        """Return the weights as a sparse matrix, shape (n, blocks)."""
+        return csr_array((self.weight, self.block, self.first), shape=(len(self.pixels), blocks))
+
+
+def enlarge(
+    values: Array, rows: int, columns: int, enlargement: Enlargement | None = None, patch: Array | None = None
+) -> Array:
+    """Return an image at the size of the sensor.
+
+    Parameters
+    ----------
+    values
+        Means over blocks, shape (rows / scale, columns / scale).
+    enlargement
+        Without, values are linear between the centres of blocks everywhere.
+    patch
+        The values of `enlargement.patch`, shape (p,).
+    """
+    if values.shape == (rows, columns):
+        return values
+    image: Array = np.asarray(
+        cv2.resize(values, (columns, rows), interpolation=cv2.INTER_LINEAR), dtype=np.float64
+    )
+    if enlargement is not None:
+        image.ravel()[enlargement.pixels] = enlargement.matrix(values.size) @ values.ravel()
+        if patch is not None:
+            image.ravel()[enlargement.patch] = patch
+    return image
+
+
+def enlarge_variance(
+    variance: Array,
+    rows: int,
+    columns: int,
+    enlargement: Enlargement | None = None,
+    patch: Array | None = None,
+) -> Array:
+    """Return the variance of each pixel of an enlarged image of independent blocks.
+
+    Parameters
+    ----------
+    variance, patch
+        Of the blocks and of the patch's pixels.
+    """
+    if variance.shape == (rows, columns):
+        return variance
+    sides = zip((rows, columns), variance.shape, strict=True)
+    down, across = (_linear(np.arange(count), count, blocks) for count, blocks in sides)
+    taller = down.multiply(down) @ variance
+    image: Array = np.ascontiguousarray((across.multiply(across) @ taller.T).T)
+    if enlargement is not None:
+        weights = enlargement.matrix(variance.size)
+        image.ravel()[enlargement.pixels] = weights.multiply(weights) @ variance.ravel()
+        if patch is not None:
+            image.ravel()[enlargement.patch] = patch
+    return image
+
+
+def without_edges(rows: int, columns: int) -> Enlargement:
+    """Return the enlargement that is linear between the centres of blocks everywhere."""
+    none, whole = np.empty(0, dtype=np.int32), np.zeros(1, dtype=np.int32)
+    return Enlargement(rows, columns, none, whole, none, np.empty(0, dtype=np.float32), none)
+
+
+def part_of(enlargement: Enlargement, pixels: NDArray[np.int64]) -> Enlargement:
+    """Return what an enlargement says of some pixels; all others are as if no edge were near."""
+    kept = np.isin(enlargement.pixels, pixels)
+    count = np.diff(enlargement.first)
+    entries = np.repeat(kept, count)
+    return replace(
+        enlargement,
+        pixels=enlargement.pixels[kept],
+        first=np.append(0, np.cumsum(count[kept])).astype(np.int32),
+        block=enlargement.block[entries],
+        weight=enlargement.weight[entries],
+        patch=enlargement.patch[np.isin(enlargement.patch, pixels)],
+    )
+
+
+def weights_of(pixels: NDArray[np.int64], scale: int, enlargement: Enlargement) -> csr_array:
+    """Return what each block weighs in some pixels that no patch holds, shape (pixels, blocks)."""
+    blocks = (enlargement.rows // scale, enlargement.columns // scale)
+    row, column = np.divmod(pixels, enlargement.columns)
+    down, across = _linear(row, enlargement.rows, blocks[0]), _linear(column, enlargement.columns, blocks[1])
+    block = down.indices.reshape(-1, 2, 1) * blocks[1] + across.indices.reshape(-1, 1, 2)
+    weight = down.data.reshape(-1, 2, 1) * across.data.reshape(-1, 1, 2)
+    first = 4 * np.arange(len(pixels) + 1)
+    found = csr_array((weight.ravel(), block.ravel(), first), shape=(len(pixels), blocks[0] * blocks[1]))
+    if not len(enlargement.pixels):
+        return found
+    listed = enlargement.pixels
+    place = np.minimum(np.searchsorted(listed, pixels), len(listed) - 1)
+    fitted = listed[place] == pixels
+    take = csr_array((fitted * 1.0, place, np.arange(len(pixels) + 1)), shape=(len(pixels), len(listed)))
+    return csr_array(diags_array((~fitted) * 1.0) @ found + take @ enlargement.matrix(found.shape[1]))
+
+
+def _linear(at: NDArray[np.int64], count: int, blocks: int) -> csr_array:
+    """Return what blocks along an axis of so many pixels weigh in some of these, two each, (n, blocks)."""
+    place = np.clip((at + 0.5) * (blocks / count) - 0.5, 0.0, blocks - 1.0)
+    low = np.minimum(place.astype(np.int64), max(blocks - 2, 0))
+    block = np.stack([low, np.minimum(low + 1, blocks - 1)], axis=1)
+    weight = np.stack([1.0 - (place - low), place - low], axis=1)
+    return csr_array((weight.ravel(), block.ravel(), 2 * np.arange(len(at) + 1)), shape=(len(at), blocks))

@@ -1,0 +1,112 @@
+"""The stage `evaluate`: the detections of a folder against the truth that lies there, and the limit.
+
+It reads files alone: a folder that another program wrote is scored like one that was rendered here.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from nir_render.errors import InputError
+from nir_render.evaluate.metrics import Evaluation, evaluate
+from nir_render.run import folder as run_folder
+from nir_render.run.folder import note_seconds, parse_lines
+from nir_render.run.perceive import frame_keys, unknown_camera
+from nir_render.truth.lamps import LampTruth, parse_lamp
+from nir_render.truth.sources import SourceTruth, parse_truth
+from perception import (
+    Calibration,
+    Detection,
+    RecordingError,
+    parse_detection,
+    read_calibrations,
+    read_frame,
+    read_frame_records,
+)
+from perception.types import FrameKey
+
+
+def evaluate_run(folder: Path) -> Evaluation:
+    """Score every `detections.*.jsonl` of a run against its truth; writes `summary.json`, `preview.png`.
+
+    Raises
+    ------
+    InputError
+        The folder has no truth or no detections, or a file is broken.
+    """
+    started = time.perf_counter()
+    paths = sorted(folder.glob("detections.*.jsonl"))
+    truth_path = folder / run_folder.TRUTH
+    if not truth_path.is_file():
+        raise InputError(
+            f"{truth_path}: there is no such file; without truth there is nothing to score against. A "
+            "rendered run has it; docs/run_folder.md says what a line must hold"
+        )
+    if not paths:
+        raise InputError(f"{folder}: there are no detections; run 'nir-render perceive {folder}' first")
+    try:
+        calibrations = read_calibrations(folder)
+        keys = frame_keys(folder)
+        truth = parse_lines(truth_path, parse_truth)
+        detections = {
+            path.name.removeprefix("detections.").removesuffix(".jsonl"): parse_lines(path, parse_detection)
+            for path in paths
+        }
+        lamps_path = folder / run_folder.LAMPS
+        lamps = parse_lines(lamps_path, parse_lamp) if lamps_path.is_file() else []
+        _check_frames_known(keys, truth, lamps, detections, calibrations, folder)
+        result = evaluate(keys, truth, calibrations, detections, lamps)
+        preview = _preview(folder, keys, calibrations, result)
+    except InputError:
+        raise
+    except RecordingError as error:
+        raise InputError(str(error)) from None
+    run_folder.write_json(folder / "summary.json", result.summary)
+    run_folder.write_file(folder / "preview.png", preview)
+    note_seconds(folder, "evaluate", started)
+    return result
+
+
+def _check_frames_known(
+    keys: Sequence[FrameKey],
+    truth: Sequence[SourceTruth],
+    lamps: Sequence[LampTruth],
+    detections: Mapping[str, Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+    folder: Path,
+) -> None:
+    """Raise InputError where a line speaks of a frame or camera that the recording does not have."""
+    for camera in dict.fromkeys(camera for camera, _ in keys):
+        if camera not in calibrations:
+            raise unknown_camera(folder, camera, calibrations)
+    lines: dict[str, Sequence[SourceTruth | LampTruth | Detection]] = {
+        run_folder.TRUTH: truth,
+        run_folder.LAMPS: lamps,
+    }
+    lines |= {f"detections.{name}.jsonl": found for name, found in detections.items()}
+    known = set(keys)
+    for file, items in lines.items():
+        for item in items:
+            if (item.camera, item.index) not in known:
+                raise InputError(
+                    f"{folder / file}: speaks of frame {item.index} of {item.camera}, "
+                    "which frames.jsonl does not name"
+                )
+
+
+def _preview(
+    folder: Path, keys: Sequence[FrameKey], calibrations: Mapping[str, Calibration], result: Evaluation
+) -> bytes:
+    from nir_render.report.preview import preview_png  # Matplotlib loads only where something is drawn
+
+    at = {(record.camera, record.index): record for record in read_frame_records(folder)}
+    estimators = list(result.summary["estimators"])
+    return preview_png(
+        keys=keys,
+        scores=result.scores,
+        ghosts=result.ghosts,
+        estimators=estimators,
+        load=lambda key: read_frame(folder, at[key]),
+        calibrations=calibrations,
+        title=folder.resolve().name,
+    )

@@ -1,0 +1,253 @@
+"""The run folder: everything that a run leaves on disk, written so that nothing is ever half there.
+
+A new folder is written aside, beside its place, and renamed into it when it is whole. A file that is added
+later is written aside, synced and renamed.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from nir_render.errors import InputError
+
+MANIFEST = "manifest.json"
+CALIBRATION = "calibration.json"
+SCENE = "scene.yaml"
+FRAMES = "frames.jsonl"
+TRUTH = "truth.jsonl"
+LAMPS = "lamps.jsonl"
+
+Item = TypeVar("Item")
+
+
+@contextlib.contextmanager
+def new_run_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
+    """Give an empty folder to write a run into; it takes its place when the block ends without an error.
+
+    Raises
+    ------
+    InputError
+        The place holds another run and `overwrite` is not given, or holds something that is no run, or
+        cannot be written.
+    """
+    check_free(folder, overwrite)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+    except OSError as error:
+        raise disk_error(folder, error) from None
+    try:
+        yield aside
+        _sync_folder(aside)
+        aside.chmod(0o777 & ~_umask())
+        _replace(folder, aside)
+    except OSError as error:
+        raise disk_error(folder, error) from None
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def check_free(folder: Path, overwrite: bool) -> None:
+    """Raise InputError where a run may not be written: see `new_run_folder`."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is a file; give a folder for the run")
+    if not any(folder.iterdir()):
+        return
+    if not (folder / MANIFEST).is_file():
+        raise InputError(
+            f"{folder}: holds files that are no run; give a new folder (they are never overwritten)"
+        )
+    if not overwrite:
+        raise InputError(f"{folder}: holds another run; give a new folder, or --overwrite to replace it")
+
+
+@contextlib.contextmanager
+def locked(file: Path, taken: str) -> Iterator[None]:
+    """Hold a lock on a file for the block; the system gives it back whatever becomes of the process.
+
+    Raises
+    ------
+    InputError
+        Another process holds it, with the text `taken`; the file cannot be written.
+    """
+    try:
+        held = file.open("a")
+    except OSError as error:
+        raise disk_error(file, error) from None
+    with held:
+        try:
+            _lock(held.fileno())
+        except OSError:
+            raise InputError(taken) from None
+        yield
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file aside, sync it and rename it into its place.
+
+    Raises
+    ------
+    InputError
+        The disk is full, the folder cannot be written, ….
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, aside = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(aside).chmod(0o666 & ~_umask())
+            Path(aside).replace(path)
+        finally:
+            Path(aside).unlink(missing_ok=True)
+    except OSError as error:
+        raise disk_error(path, error) from None
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document; not-a-number is no JSON and must be None."""
+    write_file(path, (json.dumps(document, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_lines(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
+    """Write one JSON object per line."""
+    text = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records)
+    write_file(path, text.encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON document; raise InputError where it is missing or broken."""
+    return _parse(_read(path), str(path))
+
+
+def read_lines(path: Path) -> list[Any]:
+    """Read one JSON object per line; raise InputError where the file is missing or a line broken."""
+    return [record for _, record in _numbered_lines(path)]
+
+
+def _numbered_lines(path: Path) -> list[tuple[int, Any]]:
+    lines = _read(path).splitlines()
+    return [
+        (number, _parse(line, f"{path}:{number}")) for number, line in enumerate(lines, 1) if line.strip()
+    ]
+
+
+def parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
+    """Parse a file of JSON lines; raise InputError with file and line where one is broken."""
+    items = []
+    for number, record in _numbered_lines(path):
+        try:
+            items.append(parse(record))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"{path}, line {number}: {error}") from None
+    return items
+
+
+def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Write `manifest.json` with the given facts and the SHA-256 of every file of the folder."""
+    write_json(folder / MANIFEST, {"format": 1, **facts, "sha256": _hashes(folder)})
+
+
+def refresh_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Add facts to the manifest, where the folder has one, and the hashes of files that came or changed."""
+    if (folder / MANIFEST).is_file():
+        old = {
+            key: value
+            for key, value in read_json(folder / MANIFEST).items()
+            if key not in ("format", "sha256")
+        }
+        write_manifest(folder, {**old, **facts})
+
+
+def note_seconds(folder: Path, stage: str, started: float) -> None:
+    """Add to the manifest, where there is one, how long a stage took, and the hashes of what it wrote."""
+    if not (folder / MANIFEST).is_file():
+        return
+    seconds = read_json(folder / MANIFEST).get("seconds", {})
+    refresh_manifest(folder, {"seconds": {**seconds, stage: round(time.perf_counter() - started, 3)}})
+
+
+def disk_error(path: Path, error: OSError) -> InputError:
+    """Return the error to show where the disk refuses."""
+    return InputError(
+        f"{path}: cannot be written ({error.strerror or error}); nothing half-written was left there"
+    )
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+
+
+def _parse(text: str, name: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{name}: is not JSON ({error})") from None
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST)
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
+    }
+
+
+def _replace(folder: Path, aside: Path) -> None:
+    """Put `aside` in the place of `folder`; what was there goes only after the new stands."""
+    if not folder.exists():
+        aside.rename(folder)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+    folder.rename(old / folder.name)
+    try:
+        aside.rename(folder)
+    except OSError:
+        (old / folder.name).rename(folder)  # if this fails too, the old run stays where it was put
+        old.rmdir()
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make sure that the files' names are on the disk too, where the system lets folders be synced."""
+    if os.name != "posix":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _lock(descriptor: int) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

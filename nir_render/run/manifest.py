@@ -1,0 +1,105 @@
+"""What the manifest of a run states: versions, seconds, render noise, samples, the error of enlarging."""
+
+import platform
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from nir_render.camera.render_noise import RenderNoise
+from nir_render.light.light import Light
+from nir_render.simulation.clock import Shot
+from nir_render.transport.fingerprint import package_versions
+from nir_render.transport.indirect.sample_plan import MOST_SAMPLES
+
+_DIGITS = 6
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what decides the bits of a run."""
+    packages = ("nir-render", "mitsuba", "drjit", "numpy", "scipy", "opencv-python-headless")
+    installed = package_versions(*packages)
+    return {"python": platform.python_version(), "platform": platform.platform(), **installed}
+
+
+def noise_facts(target_share: float | None, by_frame: Mapping[str, RenderNoise]) -> dict[str, Any]:
+    """Return the shares of render noise over all frames of a run, and whether the target was reached.
+
+    It is where every frame keeps it, by what the render measured of itself; the others are named, as
+    "r1.front 3". Null without a target.
+    """
+    noises = list(by_frame.values())
+    medians = [one.median_share for one in noises]
+    apertures = [one.aperture_share for one in noises]
+    above = None
+    if target_share is not None:
+        above = [name for name, one in by_frame.items() if not one.keeps(target_share)]
+    return {
+        "target_share": target_share,
+        "target_reached": None if above is None else not above,
+        "frames_above_target": above,
+        "share_of_temporal_variance": _rounded(np.median(medians)),
+        "largest_share": _rounded(max(medians)),
+        "mean_share": _rounded(np.mean([one.mean_share for one in noises])),
+        "share_behind_lens": _rounded(np.mean([one.share_behind_lens for one in noises])),
+        "share_in_99_percent_of_pixels": _rounded(max(one.share_of_99_percent for one in noises)),
+        "largest_share_in_a_pixel": _rounded(max(one.largest_share for one in noises)),
+        "share_in_apertures": _rounded(np.median(apertures)),
+        "largest_share_in_apertures": _rounded(max(apertures)),
+    }
+
+
+def noise_warning(facts: dict[str, Any], frames: int) -> str | None:
+    """Return what to tell who asked for a target that some frames of a run do not keep."""
+    if facts["target_reached"] is not False:
+        return None
+    return (
+        f"render.noise: the target of {facts['target_share']:.3g} of temporal variance is not kept in "
+        f"{len(facts['frames_above_target'])} of {frames} frames: render noise reaches "
+        f"{facts['largest_share']:.3g} in a frame's median pixel, "
+        f"{facts['largest_share_in_apertures']:.3g} in a flare; manifest.json says more (render_noise). "
+        "More samples than these, fixed by render.indirect.samples, bring it down"
+    )
+
+
+def sample_facts(light: Light) -> dict[str, Any]:
+    """Return the samples per pixel of a light, and in how many pixels they stay below what the target asks.
+
+    Some of the `pixels_at_cap` may have needed more, too.
+    """
+    indirect = light.indirect
+    assert indirect is not None
+    counts = np.array([indirect.samples]) if indirect.counts is None else indirect.counts
+    at_cap = 0 if indirect.counts is None else int((counts == MOST_SAMPLES).sum())
+    return {
+        "least": int(counts.min()),
+        "median": float(np.median(counts)),
+        "mean": round(float(counts.mean()), 3),
+        "most": int(counts.max()),
+        "pixels_at_cap": at_cap,
+        "pixels_below_need": light.short_pixels,
+    }
+
+
+def enlarging_facts(shot: Shot) -> dict[str, Any]:
+    """Return how far a frame's enlarged light is off the full render; null and why where it is not known."""
+    from nir_render.transport.indirect.enlarging_error import upsampling_error
+
+    error = upsampling_error(shot.mean)
+    if isinstance(error, str):
+        return {"mean": None, "reason": error}
+    assert shot.light.indirect is not None
+    assert shot.light.indirect.edges is not None
+    enlargement = shot.light.indirect.edges.enlargement
+    return {
+        "mean": _rounded(error.share),
+        "standard_error": _rounded(error.standard_error),
+        "largest": _rounded(error.largest),
+        "pixels": error.pixels,
+        "pixels_rendered_one_by_one": len(enlargement.patch),
+        "pixels_left_out": enlargement.left_out,
+    }
+
+
+def _rounded(value: float | np.floating[Any]) -> float:
+    return round(float(value), _DIGITS)

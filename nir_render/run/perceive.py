@@ -1,0 +1,97 @@
+"""The stage `perceive`: the frames of any folder become detections, by one or several estimators."""
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from nir_render.errors import InputError
+from nir_render.run import folder as run_folder
+from nir_render.run.folder import note_seconds
+from nir_render.run.render import Progress
+from perception import (
+    ESTIMATORS,
+    Detection,
+    Estimator,
+    EstimatorError,
+    detect,
+    detection_record,
+    load_estimator,
+    read_calibrations,
+    read_frame_records,
+    read_frames,
+)
+from perception.types import FrameKey
+
+
+def chosen_estimators(names: Sequence[str]) -> dict[str, Estimator]:
+    """Return the estimators of these names, by name; `file.py:function` loads one of the user's own.
+
+    Raises
+    ------
+    InputError
+        An estimator is unknown or cannot be loaded, or two of them have the same name.
+    """
+    chosen: dict[str, Estimator] = {}
+    for name in dict.fromkeys(names):
+        if name in ESTIMATORS:
+            chosen[name] = ESTIMATORS[name]
+            continue
+        if ":" not in name and not name.endswith(".py"):
+            known = ", ".join(ESTIMATORS)
+            raise InputError(f"--estimator {name}: unknown; known: {known}, or one's own as file.py:function")
+        try:
+            own = load_estimator(name)
+        except EstimatorError as error:
+            raise InputError(f"--estimator {error}") from None
+        if own.name in chosen:
+            raise InputError(
+                f"--estimator {name}: another estimator is called {own.name!r} too; rename one of them"
+            )
+        chosen[own.name] = own
+    return chosen
+
+
+def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress: Progress) -> dict[str, int]:
+    """Run estimators over the frames of a folder; returns the number of detections by estimator.
+
+    Raises
+    ------
+    InputError
+        The folder is no recording, or one's own estimator fails on a frame.
+    """
+    started = time.perf_counter()
+    found: dict[str, list[Detection]] = {name: [] for name in estimators}
+    try:
+        calibrations = read_calibrations(folder)
+        total = len(frame_keys(folder))
+        for done, frame in enumerate(read_frames(folder)):
+            if frame.camera not in calibrations:
+                raise unknown_camera(folder, frame.camera, calibrations)
+            for name, estimator in estimators.items():
+                found[name] += detect(frame, calibrations[frame.camera], estimator)
+            progress(done + 1, total)
+    except EstimatorError as error:
+        raise InputError(f"--estimator {error}") from None
+    except ValueError as error:  # a broken recording, or a frame that does not match its calibration
+        raise InputError(str(error)) from None
+    for name, detections in found.items():
+        run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, detections))
+    note_seconds(folder, "perceive", started)
+    return {name: len(detections) for name, detections in found.items()}
+
+
+def frame_keys(folder: Path) -> list[FrameKey]:
+    """Return camera and index of all frames of a recording; raise InputError where it has none."""
+    keys = [(record.camera, record.index) for record in read_frame_records(folder)]
+    if not keys:
+        raise InputError(f"{folder / run_folder.FRAMES}: names no frame")
+    return keys
+
+
+def unknown_camera(folder: Path, camera: str, known: Collection[str]) -> InputError:
+    """Return the error of a frame whose camera has no calibration."""
+    names = ", ".join(known) or "none"
+    return InputError(
+        f"{folder / run_folder.CALIBRATION}: knows no camera {camera!r}, which {run_folder.FRAMES} names; "
+        f"known: {names}; name the camera so, or calibrate it"
+    )

@@ -1,0 +1,44 @@
+"""The stage `report`: a run folder and its evaluation become one page, report.html."""
+
+import time
+from pathlib import Path
+
+from nir_render.errors import InputError
+from nir_render.evaluate.metrics import Evaluation
+from nir_render.run import folder as run_folder
+from nir_render.run.folder import note_seconds
+from perception import RecordingError, read_calibrations, read_frame, read_frame_records
+
+
+def report_run(folder: Path, result: Evaluation) -> Path:
+    """Write `report.html` from what lies in a run folder and its evaluation; returns the page's path.
+
+    Raises
+    ------
+    InputError
+        A frame or the calibration cannot be read.
+    """
+    from nir_render.report.page import report_html
+
+    started = time.perf_counter()
+    has_manifest = (folder / run_folder.MANIFEST).is_file()
+    try:
+        records = {(record.camera, record.index): record for record in read_frame_records(folder)}
+        page = report_html(
+            keys=list(records),
+            result=result,
+            load=lambda key: read_frame(folder, records[key]),
+            calibrations=read_calibrations(folder),
+            manifest=run_folder.read_json(folder / run_folder.MANIFEST) if has_manifest else {},
+            folder_name=folder.resolve().name,
+            files=sorted(
+                path.name
+                for path in folder.iterdir()
+                if path.is_file() and not path.name.startswith(".") and path.name != "report.html"
+            ),
+        )
+    except RecordingError as error:
+        raise InputError(str(error)) from None
+    run_folder.write_file(folder / "report.html", page.encode())
+    note_seconds(folder, "report", started)
+    return folder / "report.html"

@@ -1,0 +1,176 @@
+"""Values against wavelength or angle: [place, value] points, CSV files that become such, and curves."""
+
+import csv
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import ValidationInfo, field_serializer, field_validator, model_validator
+
+from nir_render.errors import shown
+from nir_render.scene.documents.base import Document, Fraction, Length, NotNegative, Positive
+from nir_render.scene.documents.files import resolve_file
+from nir_render.scene.text.units import ANGLE, FRACTION, LENGTH, Quantity, format_quantity, parse_quantity
+from nir_render.spectra.curve import Curve, constant_curve, curve_from_points
+from nir_render.spectra.illuminants import SILICON_M, gaussian_spectrum
+
+Points = tuple[tuple[float, float], ...]
+
+_ANGLE_SLACK_RAD = 1e-9
+_CURVE_FORMS = ("constant", "gaussian", "points", "file")
+
+
+class Gaussian(Document):
+    """A bell curve over wavelength."""
+
+    centroid_m: Annotated[Length, Positive]
+    fwhm_m: Annotated[Length, Positive]
+
+
+class CurveDocument(Document):
+    """A value against wavelength: a number (the same at every wavelength), points, or a CSV file.
+
+    The CSV file has the header `wavelength_nm,value`; it becomes points when the scene is loaded.
+    """
+
+    read_keys: ClassVar[tuple[str, ...]] = ("file",)
+
+    constant: Annotated[Fraction, NotNegative] | None = None
+    gaussian: Gaussian | None = None
+    points: Points | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, data: Any, info: ValidationInfo) -> Any:
+        if isinstance(data, int | float | str) and not isinstance(data, bool):
+            return {"constant": data}
+        if not isinstance(data, Mapping):
+            raise ValueError("wanted a number, or 'points', 'file' or 'gaussian'")
+        forms = sorted(form for form in _CURVE_FORMS if data.get(form) is not None)
+        if len(forms) > 1:
+            raise ValueError(f"wanted one of 'constant', 'gaussian', 'points' and 'file', not {forms}")
+        if "file" in data:
+            points = read_csv(resolve_file(str(data["file"]), info), "wavelength_nm,value")
+            others = {key: value for key, value in data.items() if key != "file"}
+            return {**others, "points": [(f"{nm!r} nm", value) for nm, value in points]}
+        return data
+
+    @field_validator("points", mode="before")
+    @classmethod
+    def _parse_points(cls, points: Any) -> Any:
+        return None if points is None else parse_points(points, LENGTH, "wavelength", "['940 nm', 0.15]")
+
+    @field_serializer("points")
+    def _write_points(self, points: Points | None) -> list[list[Any]] | None:
+        return write_points(points, LENGTH)
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        if self.constant is None and self.gaussian is None and self.points is None:
+            raise ValueError("wanted a number, or 'points', 'file' or 'gaussian'")
+        return self
+
+    def curve(self, name: str) -> Curve:
+        """Return the curve, which errors call by `name`; a constant holds over what silicon sees."""
+        if self.gaussian is not None:
+            return gaussian_spectrum(self.gaussian.centroid_m, self.gaussian.fwhm_m, name)
+        if self.points is not None:
+            return curve_from_points(self.points, name)
+        assert self.constant is not None  # the model admits no fourth form
+        return constant_curve(self.constant, *SILICON_M, name)
+
+
+def one_form(data: Mapping[str, Any], forms: Sequence[str]) -> None:
+    """Raise ValueError where not exactly one of the keys `forms` has a value."""
+    given = [form for form in forms if data.get(form) is not None]
+    if len(given) != 1:
+        known = ", ".join(repr(form) for form in forms[:-1]) + f" and {forms[-1]!r}"
+        raise ValueError(f"wanted one of {known}, not {sorted(given) if given else 'none'}")
+
+
+def parse_points(points: Any, quantity: Quantity, place: str, example: str) -> Points:
+    """Read [["940 nm", 0.15], …] as (place, value) pairs in SI units.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two points, places that do not increase, a value that is negative or not finite.
+    """
+    if isinstance(points, str) or not isinstance(points, Sequence):
+        raise ValueError(f"{shown(points)} is no list; wanted a list of [{place}, value], such as {example}")
+    try:
+        pairs = [(parse_quantity(where, quantity), _value(value)) for where, value in map(_pair, points)]
+    except ValueError as error:
+        raise ValueError(f"wanted a list of [{place}, value], such as {example}: {error}") from None
+    if len(pairs) < 2 or any(b <= a for (a, _), (b, _) in itertools.pairwise(pairs)):
+        raise ValueError(f"wanted at least two points of increasing {place}")
+    not_negative([value for _, value in pairs])
+    return tuple(pairs)
+
+
+def _value(written: Any) -> float:
+    try:
+        return float(written)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{shown(written)} is no number") from None
+
+
+def _pair(point: Any) -> Sequence[Any]:
+    if isinstance(point, str) or not isinstance(point, Sequence) or len(point) != 2:
+        raise ValueError(f"{shown(point)} is no such pair")
+    return point
+
+
+def not_negative(values: Sequence[float]) -> None:
+    """Raise ValueError where a value of a curve is negative, not finite, or beyond 1e12."""
+    if any(not 0 <= value <= FRACTION.most for value in values):
+        raise ValueError(f"values must be finite and not negative, and at most {FRACTION.most:g}")
+
+
+def write_points(points: Points | None, quantity: Quantity) -> list[list[Any]] | None:
+    """Write what `parse_points` reads, to the bit: a resolved document loads again."""
+    if points is None:
+        return None
+    return [[format_quantity(where, quantity), value] for where, value in points]
+
+
+def parse_half_turn(points: Any, place: str) -> Points:
+    """Read points over an angle from exactly 0 to exactly 180 deg; errors as `parse_points`."""
+    pairs = parse_points(points, ANGLE, place, "['0 deg', 1.0]")
+    ends = half_turn([angle for angle, _ in pairs], place)
+    if not any(value for _, value in pairs):
+        raise ValueError("the values are 0 everywhere")
+    return tuple((angle, value) for angle, (_, value) in zip(ends, pairs, strict=True))
+
+
+def half_turn(angles_rad: Sequence[float], place: str) -> list[float]:
+    """Return increasing angles with their ends, rounded by their unit, at exactly 0 and π."""
+    first, last = angles_rad[0], angles_rad[-1]
+    if abs(first) > _ANGLE_SLACK_RAD or abs(last - math.pi) > _ANGLE_SLACK_RAD:
+        given = f"from {math.degrees(first):g} to {math.degrees(last):g} deg"
+        raise ValueError(f"wanted {place} from 0 to 180 deg, not {given}")
+    return [0.0, *angles_rad[1:-1], math.pi]
+
+
+def read_csv(path: Path, header: str) -> list[tuple[float, ...]]:
+    """Read numbers from CSV under a header such as `wavelength_nm,value`; lines with # are comments.
+
+    Raises
+    ------
+    ValueError
+        Another header, a line of another length, a cell that is no number.
+    """
+    columns = header.split(",")
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
+    if not rows or [cell.strip() for cell in rows[0]] != columns:
+        raise ValueError(f"{path}: the first line must be the header {header!r}")
+    try:
+        numbers = [tuple(float(cell) for cell in row) for row in rows[1:]]
+    except ValueError as error:
+        raise ValueError(f"{path}: each line must hold {len(columns)} numbers ({error})") from None
+    if any(len(row) != len(columns) for row in numbers):
+        raise ValueError(f"{path}: each line must hold {len(columns)} numbers")
+    return numbers

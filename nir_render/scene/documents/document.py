@@ -1,0 +1,280 @@
+"""The model of a whole scene file."""
+
+import itertools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import (
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import CoreSchema, core_schema
+
+from nir_render.errors import shown
+from nir_render.scene.documents.base import (
+    Document,
+    Frequency,
+    Name,
+    NotNegative,
+    Orientation,
+    Position,
+    Positive,
+    Time,
+)
+from nir_render.scene.documents.camera import Rig
+from nir_render.scene.documents.emitters import Lamp, Sun
+from nir_render.scene.documents.files import expand_preset, preset_names
+from nir_render.scene.documents.fog import Fog
+from nir_render.scene.documents.materials import Diffuse, MaterialDocument
+from nir_render.scene.documents.shapes import ShapeDocument
+from nir_render.scene.text.units import TIME
+
+DEFAULT_NOISE = 0.05
+_LARGEST_SEED = 2**63 - 1
+_LEAST_PERCENT, _MOST_PERCENT = 0.1, 100.0
+_NOISE_EXAMPLE = "5 % of temporal variance"
+_NOISE_FORM = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*%\s+of\s+temporal\s+variance\s*")
+
+
+class Waypoint(Document):
+    """Where a robot is from one time on, for as long as `hold`; then it moves evenly to the next."""
+
+    time_s: Time
+    hold_s: Annotated[Time, NotNegative] = 0.0
+    position_m: Position
+    orientation: Orientation = Orientation()
+
+
+class Robot(Document):
+    """A robot: its rig, and either a fixed pose or a motion through waypoints."""
+
+    rig: Rig
+    position_m: Position = (0.0, 0.0, 0.0)
+    orientation: Orientation = Orientation()
+    motion: tuple[Waypoint, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_way_to_move(self) -> Self:
+        if self.motion and self.model_fields_set & {"position_m", "orientation"}:
+            raise ValueError("write either 'position' and 'orientation', or 'motion', not both")
+        for way in self.motion:
+            if way.hold_s > 0.0 and way.time_s + way.hold_s <= way.time_s:
+                raise ValueError(
+                    f"motion: the hold of {way.hold_s:g} s is too short to count at {way.time_s:g} s; "
+                    "lengthen it, or leave it out"
+                )
+        for earlier, later in itertools.pairwise(self.motion):
+            if later.time_s <= earlier.time_s + earlier.hold_s:
+                raise ValueError(
+                    f"the times of 'motion' must increase: {later.time_s:g} s is not after "
+                    f"{earlier.time_s:g} s and its hold of {earlier.hold_s:g} s; put the waypoints in order"
+                )
+        return self
+
+
+class Clock(Document):
+    """When frames are taken: `frames` of them, at most a million, at `frame_rate` from `start` on."""
+
+    frames: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    frame_rate_hz: Annotated[Frequency, Positive] = 30.0
+    start_s: Time = 0.0
+
+    @model_validator(mode="after")
+    def _ends(self) -> Self:
+        end_s = self.start_s + (self.frames - 1) / self.frame_rate_hz
+        if abs(end_s) > TIME.most:
+            raise ValueError(
+                f"the last frame is at {end_s:.4g} s, beyond the {TIME.most:g} s that are taken; raise "
+                "frame_rate, or take fewer frames"
+            )
+        return self
+
+
+def parse_noise(text: object) -> float:
+    """Read "5 % of temporal variance" as the share 0.05.
+
+    Raises
+    ------
+    ValueError
+        It is written otherwise, or lies outside 0.1 to 100 %.
+    """
+    match = _NOISE_FORM.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise ValueError(f"{shown(text)} is no target for the noise; write it such as {_NOISE_EXAMPLE!r}")
+    percent = float(match[1])
+    if not _LEAST_PERCENT <= percent <= _MOST_PERCENT:
+        raise ValueError(
+            f"{shown(text)} lies outside {_LEAST_PERCENT:g} to {_MOST_PERCENT:g} %; take one within"
+        )
+    return percent / 100.0
+
+
+def format_noise(share: float) -> str:
+    """Write a share so that `parse_noise` reads it."""
+    return f"{100.0 * share:.12g} % of temporal variance"
+
+
+@dataclass(frozen=True)
+class _Share:
+    """Annotation of a model's field: the target as text in the document, its share in the model."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(
+            parse_noise,
+            handler(source),
+            serialization=core_schema.plain_serializer_function_ser_schema(format_noise),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {"type": "string", "pattern": f"^{_NOISE_FORM.pattern}$", "examples": [_NOISE_EXAMPLE]}
+
+
+NoiseTarget = Annotated[float, _Share()]
+
+
+class IndirectSettings(Document):
+    """How finely light by way of walls and lamps is sampled: pixels of scale × scale, samples in each.
+
+    Without `samples` the render settings' `noise` says how many each pixel gets.
+    """
+
+    example: ClassVar[str] = "{samples: 64}"
+
+    scale: Annotated[int, Field(ge=1, le=16)] = 2
+    samples: Annotated[int, Field(ge=4, le=65536)] | None = None
+    max_depth: Annotated[int, Field(ge=2, le=64)] = 8
+
+    @field_validator("samples")
+    @classmethod
+    def _power_of_two(cls, samples: int | None) -> int | None:
+        if samples is not None and samples & (samples - 1):
+            lower = 1 << (samples.bit_length() - 1)
+            raise ValueError(
+                f"{samples} is no power of two: only these render to the same bits on any machine; "
+                f"take {lower} or {2 * lower}"
+            )
+        return samples
+
+
+class RenderSettings(Document):
+    """How finely the transport of light is sampled.
+
+    `noise` is the target: the variance that rendering may add, as a share of shot and read noise; 5 % unless
+    `indirect.samples` fixes a count, then None.
+    """
+
+    example: ClassVar[str] = '{noise: "5 % of temporal variance"}'
+
+    noise: NoiseTarget | None = None
+    indirect: IndirectSettings = IndirectSettings()
+    visibility_rays: Annotated[int, Field(ge=16, le=65536)] = 1024
+
+    @model_validator(mode="before")
+    @classmethod
+    def _noise_is_no_switch(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and isinstance(data.get("noise"), bool):  # YAML's off and on
+            raise ValueError(
+                "'noise' is a target, no switch: write it such as '5 % of temporal variance', or leave it "
+                "out and fix the samples in its place, such as indirect: {samples: 64}"
+            )
+        return data
+
+    @model_validator(mode="after")
+    def _target_or_count(self) -> Self:
+        if self.noise is not None and self.indirect.samples is not None:
+            raise ValueError(
+                "'noise' is a target, 'indirect.samples' a fixed count: write one of them, "
+                "or set the other to null"
+            )
+        if self.noise is None and self.indirect.samples is None:
+            object.__setattr__(self, "noise", DEFAULT_NOISE)
+        return self
+
+
+class SceneDocument(Document):
+    """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom."""
+
+    format: Literal[1]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}$")] = "scene"
+    seed: Annotated[int, Field(ge=0, le=_LARGEST_SEED)] = 0
+    clock: Clock = Clock()
+    render: RenderSettings = RenderSettings()
+    observe: Annotated[tuple[str, ...], Field(min_length=1)]
+    robots: Annotated[dict[Name, Robot], Field(min_length=1)]
+    materials: dict[Name, MaterialDocument] = {}
+    shapes: dict[Name, ShapeDocument] = {}
+    lamps: dict[Name, Lamp] = {}
+    sun: Sun | None = None
+    fog: Fog | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_materials(cls, data: Any, info: ValidationInfo) -> Any:
+        """Let shapes name a preset of `data/materials` that the scene itself does not define."""
+        if not isinstance(data, dict) or not isinstance(data.get("shapes"), dict):
+            return data
+        if not isinstance(data.get("materials") or {}, dict):
+            return data
+        materials = dict(data.get("materials") or {})
+        named = {str(shape.get("material")) for shape in data["shapes"].values() if isinstance(shape, dict)}
+        for name in sorted(named & set(preset_names("materials")) - set(materials)):
+            folder = info.context["folder"] if info.context else Path()
+            materials[name] = expand_preset(name, "materials", folder)
+        return {**data, "materials": materials}
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> Self:
+        for name, shape in self.shapes.items():
+            if shape.material not in self.materials:
+                known = ", ".join([*self.materials, *preset_names("materials")]) or "none"
+                raise ValueError(
+                    f"shapes.{name}.material: there is no material {shown(shape.material)}; known: {known}"
+                )
+        for name in self.observe:
+            if not self.cameras_of(name):
+                known = ", ".join(
+                    f"{robot}.{camera}" for robot in self.robots for camera in self.robots[robot].rig.cameras
+                )
+                raise ValueError(
+                    f"observe: there is no robot or camera {shown(name)}; known cameras: {known or 'none'}"
+                )
+        return self
+
+    def cameras_of(self, selector: str) -> list[str]:
+        """Return the cameras, `robot.camera`, that `r1` or `r1.front` selects; empty where there are none."""
+        robot, _, camera = selector.partition(".")
+        if robot not in self.robots:
+            return []
+        cameras = self.robots[robot].rig.cameras
+        if camera:
+            return [selector] if camera in cameras else []
+        return [f"{robot}.{name}" for name in cameras]
+
+    def has_indirect_light(self) -> bool:
+        """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""
+        sources = any(robot.rig.sources for robot in self.robots.values())
+        if not (sources or self.lamps or self.sun is not None):
+            return False
+        return bool(self.lamps) or reflects_or_scatters(self.shapes, self.materials, self.fog)
+
+    def frame_times_s(self) -> list[float]:
+        """Return the start of each frame's exposure."""
+        return [self.clock.start_s + index / self.clock.frame_rate_hz for index in range(self.clock.frames)]
+
+
+def reflects_or_scatters(
+    shapes: Mapping[str, ShapeDocument], materials: Mapping[str, MaterialDocument], fog: Fog | None
+) -> bool:
+    """Tell whether any body reflects or passes light, or fog scatters it."""
+    used = [materials[name] for name in {shape.material for shape in shapes.values()}]
+    absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in used)
+    return not absorbing or (fog is not None and fog.albedo * fog.extinction_per_m > 0.0)

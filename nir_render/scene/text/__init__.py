@@ -1,0 +1,1 @@
+"""What the text of a scene file means: YAML, and quantities with units."""

@@ -1,0 +1,221 @@
+"""Jobs over worker processes of this machine, by Dask: what runs where, and what becomes of what is killed.
+
+A job that is done has left its file; so what comes back from a worker is only that it is done. A worker that
+is killed is started again, and its job goes to another; one that dies with several workers is given up.
+"""
+
+import contextlib
+import logging
+import multiprocessing
+import shutil
+import signal
+from collections.abc import Collection, Generator, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import cv2
+import dask
+from distributed import Client, Future, LocalCluster, as_completed, get_worker
+from distributed.diagnostics.plugin import WorkerPlugin
+from distributed.scheduler import KilledWorker
+
+from nir_render.errors import InputError
+from nir_render.run.perceive import chosen_estimators
+from nir_render.scene.scene import Scene
+from nir_render.stress.execute import execute
+from nir_render.stress.jobs import Job
+from nir_render.stress.table import read_part, write_part
+from nir_render.transport.backend.variant import set_threads
+from nir_render.transport.cache import LightCache
+from perception import Estimator
+
+_DEATHS = 3
+_STARTS = 4
+_MEMORY_LIMIT_BYTES = 256 * 2**20
+_ENDS_WITHIN_S = 5
+_PLUGIN = "nir_render"
+
+
+@dataclass(frozen=True)
+class Work:
+    """What all jobs of a campaign share.
+
+    `scene` is what the jobs' settings change; `threads` how many each worker computes with.
+    """
+
+    scene: Scene
+    estimators: tuple[str, ...]
+    parts: Path
+    light: Path
+    light_limit_bytes: int
+    threads: int
+
+
+@dataclass(frozen=True)
+class Done:
+    """A job that has ended: with its file written, or with what went wrong."""
+
+    job: Job
+    error: str | None = None
+
+
+def part_file(parts: Path, job: Job) -> Path:
+    """Return where a job leaves its rows."""
+    return parts / f"{job.key}.parquet"
+
+
+def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Generator[Done]:
+    """Do jobs in `workers` processes; yield each as it ends.
+
+    The first job of those that share light renders it; the others begin when it has ended, and find it in the
+    cache. When the generator is closed, or an exception goes through it, the workers end.
+    """
+    # `scratch` may hold what a killed run has left.
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    settings = {
+        "distributed.scheduler.allowed-failures": _DEATHS,
+        "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
+        "distributed.nanny.pre-spawn-environ": _pools(work.threads),
+        "temporary-directory": str(scratch),
+    }
+    try:
+        with dask.config.set(settings), _client(workers) as client:
+            client.register_plugin(_Context(work), name=_PLUGIN)
+            order = {job.key: number for number, job in enumerate(jobs)}
+            followers: dict[str, list[Job]] = {}
+            first: list[Job] = []
+            for job in jobs:
+                if job.light in followers:
+                    followers[job.light].append(job)
+                else:
+                    followers[job.light] = []
+                    first.append(job)
+            job_of: dict[Future, Job] = {}
+
+            def submitted(job: Job) -> Future:
+                future = client.submit(_do, job, key=job.key, priority=-order[job.key], retries=0, pure=False)
+                job_of[future] = job
+                return future
+
+            ending = as_completed([submitted(job) for job in first])
+            for future in ending:
+                job = job_of.pop(future)
+                # However it has ended: one that takes its workers along must not take the others along.
+                for follower in followers.pop(job.light, ()):
+                    ending.add(submitted(follower))
+                yield Done(job, _fault(future))
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _client(workers: int) -> Iterator[Client]:
+    """Start worker processes; they end with the block."""
+    others = set(multiprocessing.active_children())
+    with contextlib.ExitStack() as stack:
+        with _interrupts_held():
+            cluster = _started(workers)
+            stack.callback(_end, cluster, others)
+            client = stack.enter_context(Client(cluster))
+        yield client
+
+
+def _started(workers: int) -> LocalCluster:
+    """Start worker processes; again where one is killed before it is ready: later Dask sees to it."""
+    for attempt in range(_STARTS):
+        try:
+            return LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address="127.0.0.1:0",  # none, but for a port that is free
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError:
+            if attempt == _STARTS - 1:
+                raise
+    raise AssertionError
+
+
+def _end(cluster: LocalCluster, others: Collection[BaseProcess]) -> None:
+    """End the workers: what has been done is on the disk, so those that do not end in time are killed."""
+    try:
+        cluster.close(timeout=_ENDS_WITHIN_S)
+    except TimeoutError:  # one was just being started in the place of another that was killed
+        for child in multiprocessing.active_children():
+            if child not in others:
+                child.kill()
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back until the end of the block.
+
+    Threads and processes that begin in it never see one, those that replace a killed worker neither: it is
+    the driver's, and ends them in order.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # to start it later would let Ctrl-C through in the thread that does
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Context(WorkerPlugin):  # type: ignore[misc]
+    """What a worker keeps from job to job: estimators, light, and how many threads it has."""
+
+    def __init__(self, work: Work) -> None:
+        self.work = work
+        self._estimators: dict[str, Estimator] | None = None
+        self._cache: LightCache | None = None
+
+    def do(self, job: Job) -> None:
+        """Do a job, and leave its file."""
+        if self._estimators is None:  # here, not at the start: Mitsuba's variant belongs to this thread
+            set_threads(self.work.threads)
+            cv2.setNumThreads(self.work.threads)
+            self._estimators = chosen_estimators(self.work.estimators)
+            self._cache = LightCache(
+                self.work.light,
+                limit_bytes=self.work.light_limit_bytes,
+                memory_limit_bytes=_MEMORY_LIMIT_BYTES,
+            )
+        if read_part(part_file(self.work.parts, job)) is not None:
+            return  # by a worker that was killed before it could say so
+        scene = self.work.scene.with_(job.settings)
+        rows, frames_sha256 = execute(scene, self._estimators, self._cache)
+        write_part(part_file(self.work.parts, job), rows, frames_sha256)
+
+
+def _do(job: Job) -> str | None:
+    """Do one job in a worker; return what went wrong, in words."""
+    context = get_worker().plugins[_PLUGIN]
+    try:
+        context.do(job)
+    except Exception as error:  # one job that fails must not take the others along
+        return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return None
+
+
+def _fault(future: Future) -> str | None:
+    error = future.exception()
+    if error is None:
+        problem: str | None = future.result()
+        return problem
+    if isinstance(error, KilledWorker):
+        return f"{_DEATHS + 1} workers died with it, perhaps for want of memory: fewer --workers need less"
+    return f"{type(error).__name__}: {error}"
+
+
+def _pools(threads: int) -> dict[str, int]:
+    """Return what tells libraries that bring threads of their own how many to use."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+    return dict.fromkeys(names, threads)

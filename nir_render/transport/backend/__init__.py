@@ -1,0 +1,1 @@
+"""Which Mitsuba variant renders, and which LLVM it compiles with."""

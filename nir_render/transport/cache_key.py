@@ -1,0 +1,230 @@
+"""What determines light, as a hash: two lights of one key are the same bits.
+
+In it: bodies and their materials, where and how large what shines is and how it spreads its light, fog, the
+camera's rays, how finely is sampled, the seed, and what computes: versions, compiler and processor. Not in
+it: what is arithmetic afterwards, such as flux, spectra, filter, exposure, gain and noise.
+
+Two things follow from that arithmetic all the same, and are in it: `power`, in coarse steps, by which lights
+are chosen (`render.group_power`), and with a target for the noise the samples of each pixel. So a change of
+flux, spectrum or filter leaves the key as it is where the samples are fixed and no group's step changes; one
+of exposure, gain or noise, where the samples are fixed.
+
+Everything goes into SHA-256 in one way: each value behind a tag of its type and its length, floats by their
+bytes.
+"""
+
+import hashlib
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from nir_render.camera.optics.lens import corner_directions
+from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.emitters import FULL_DRIVE, Sun
+from nir_render.scene.documents.shapes import Mesh, ShapeDocument
+from nir_render.scene.emission import Emitter
+from nir_render.scene.pose import Pose
+from nir_render.scene.snapshot import PlacedCamera, Snapshot
+from nir_render.transport.backend.llvm.choice import cpu_name
+from nir_render.transport.fingerprint import code_hash, matching, package_versions
+
+_PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
+# Files of this package that decide the bits of light: a change of one is another version.
+_CODE = (
+    "transport/**/*.py",
+    "scene/**/*.py",
+    "light/enlarge.py",
+    "camera/optics/lens.py",
+    "geometry.py",
+)
+
+Sampled = NDArray[np.int64] | int | str | tuple[str, NDArray[np.int64]] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A camera, `robot.camera`, in the world at one time."""
+
+    snapshot: Snapshot
+    name: str
+
+    @cached_property
+    def _placed(self) -> PlacedCamera:
+        return self.snapshot.camera(self.name)
+
+    @property
+    def camera(self) -> Camera:
+        """The device."""
+        return self._placed.camera
+
+    @property
+    def pose(self) -> Pose:
+        """The pose of its axes in the world."""
+        return self._placed.pose
+
+
+def geometry_key(site: Site) -> str:
+    """Return the hash of what is where, and of the rays that look at it: 64 hexadecimal digits."""
+    snapshot = site.snapshot
+    return digest(
+        {
+            "shapes": [
+                (name, _shape(shape), snapshot.materials[shape.material])
+                for name, shape in snapshot.shapes.items()
+            ],
+            "lamps": [
+                (name, lamp.center_m, lamp.size_m, lamp.normal) for name, lamp in snapshot.lamps.items()
+            ],
+            "sun": None if snapshot.sun is None else snapshot.sun.direction,
+            "sources": [
+                (name, placed.pose.position_m, placed.source.radius_m)
+                # A source that shines the same in all directions may turn as it likes.
+                + (() if placed.source.pattern is None else (placed.source.pattern, placed.pose.rotation))
+                for name, placed in snapshot.sources.items()
+            ],
+            "fog": snapshot.fog,
+            "camera": (site.name, site.pose.position_m, site.pose.rotation, _corners(site.camera)),
+        }
+    )
+
+
+def light_key(
+    site: Site,
+    geometry: str,
+    seed: int,
+    power: NDArray[np.float64],
+    samples: Sampled,
+    made_by: Sequence[str],
+) -> str:
+    """Return the hash of everything that determines a light: 64 hexadecimal digits.
+
+    Parameters
+    ----------
+    geometry
+        The site's `geometry_key`.
+    power
+        What each group counts when lights are chosen, shape (groups,).
+    samples
+        Samples per pixel: one number, one for each pixel, or None where there is no indirect light; of a
+        pilot its name, and the pixels where they are chosen.
+    made_by
+        What computes it: `versions`.
+    """
+    settings = site.snapshot.render
+    return digest(
+        {
+            "geometry": geometry,
+            "seed": seed,
+            "power": power,
+            "samples": samples,
+            "settings": (settings.indirect.scale, settings.indirect.max_depth, settings.visibility_rays),
+            "made_by": list(made_by),
+        }
+    )
+
+
+def plan_key(site: Site, geometry: str, seed: int, made_by: Sequence[str]) -> str:
+    """Return the hash of what the samples of a target for the noise follow from: 64 hexadecimal digits.
+
+    That is the pilot, and all that turns its light into electrons. The arguments are those of `light_key`.
+    """
+    settings = site.snapshot.render
+    return digest(
+        {
+            "geometry": geometry,
+            "seed": seed,
+            "settings": settings,
+            "camera": site.camera,
+            "emitters": {name: _fully_lit(emitter) for name, emitter in site.snapshot.emitters.items()},
+            "made_by": list(made_by),
+        }
+    )
+
+
+def _fully_lit(emitter: Emitter) -> Emitter:
+    """Return an emitter as it is planned for: what blinks is fully lit."""
+    if isinstance(emitter, Sun) or emitter.drive.constant is not None:
+        return emitter
+    return emitter.model_copy(update={"drive": FULL_DRIVE})
+
+
+def versions(variant: str, compiler: str) -> tuple[str, ...]:
+    """Return what the bits of light follow from, besides the scene.
+
+    That is Mitsuba's variant, what compiles its code (`Backend.compiler`), the versions of what computes
+    light, the processor with its instruction sets, the hash of this package's part.
+    """
+    return (variant, compiler, *_versions())
+
+
+def _shape(shape: ShapeDocument) -> tuple[str, dict[str, Any]]:
+    """Return a shape without the name of its material, and a mesh by what its file holds."""
+    fields = {name: getattr(shape, name) for name in type(shape).model_fields if name != "material"}
+    if isinstance(shape, Mesh):
+        file = Path(shape.file)
+        state = file.stat()
+        fields["file"] = (file.suffix.lower(), _content(str(file), state.st_mtime_ns, state.st_size))
+    return type(shape).__name__, fields
+
+
+@lru_cache(maxsize=64)
+def _content(file: str, _changed_ns: int, _size: int) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+@lru_cache(maxsize=64)
+def _corners(camera: Camera) -> str:
+    return digest(corner_directions(camera))
+
+
+@cache
+def _versions() -> tuple[str, ...]:
+    code = code_hash(matching(Path(__file__).parents[1], _CODE))
+    packages = package_versions(*_PACKAGES)
+    return (*(f"{name} {version}" for name, version in packages.items()), cpu_name(), code)
+
+
+def digest(value: Any) -> str:
+    """Return the hash of plain data, arrays and models: 64 hexadecimal digits."""
+    hashed = hashlib.sha256()
+    for part in _parts(value):
+        hashed.update(part)
+    return hashed.hexdigest()
+
+
+def _parts(value: Any) -> Iterable[bytes]:
+    """Yield the canonical bytes of plain data, arrays and models."""
+    match value:
+        case None:
+            yield b"n"
+        case bool() | int() | np.integer():
+            yield f"i{int(value)};".encode()
+        case float():
+            yield b"d" + struct.pack("<d", value)
+        case str():
+            yield f"s{len(value.encode())};{value}".encode()
+        case np.ndarray():
+            array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
+            yield f"a{array.dtype.str}{array.shape};".encode()
+            yield array.tobytes()
+        case tuple() | list():
+            yield f"l{len(value)};".encode()
+            for item in value:
+                yield from _parts(item)
+        case BaseModel():
+            fields = {name: getattr(value, name) for name in type(value).model_fields}
+            yield from _parts((type(value).__name__, fields))
+        case Mapping():
+            yield f"m{len(value)};".encode()
+            for key, item in value.items():
+                yield from _parts(key)
+                yield from _parts(item)
+        case _:
+            raise TypeError(f"{type(value).__name__} has no canonical bytes")

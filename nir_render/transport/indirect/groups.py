@@ -1,0 +1,306 @@
+"""Indirect light of all light groups in one pass: the light-group integrator.
+
+The conductor: it gathers a scene's numbers, brings them to the device, has `kernel.paths` walk the samples of
+each pixel in batches, and makes mean and variance of what comes back. The film is cut into parts whose arrays
+fit into a bounded memory; as every random number is keyed by pixel, batch and sample, the cuts change
+nothing.
+"""
+
+import hashlib
+import tempfile
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.optics.lens import corner_directions
+from nir_render.light.light import Indirect
+from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.materials import Dielectric, Pane
+from nir_render.scene.documents.shapes import Box
+from nir_render.scene.pose import Pose
+from nir_render.scene.snapshot import Snapshot
+from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.guide import guide
+from nir_render.transport.indirect.kernel.draws import lane_draws
+from nir_render.transport.indirect.kernel.paths import Film, walk
+from nir_render.transport.indirect.kernel.tables import (
+    DeviceScene,
+    upload_fog,
+    upload_guide,
+    upload_lights,
+    upload_surfaces,
+)
+from nir_render.transport.world import mitsuba_scene
+from nir_render.transport.world.emitters import emitters
+from nir_render.transport.world.facets import PANE, Facets, facets
+from nir_render.transport.world.medium import medium
+from nir_render.transport.world.pattern import pattern_of
+
+BATCHES = 8
+_DEFAULT_SAMPLES = 16
+PILOT_SAMPLES = 16
+_PILOT_STEP = 4
+_PILOT_PIXELS = 1200
+_VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
+_NOTHING = 1e-28  # 1/(m² sr)²
+_MAPPED_FROM_BYTES = 2**30  # larger arrays lie in a file that the system may page out
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """The rays of a camera.
+
+    Attributes
+    ----------
+    origin_m
+        The lens, shape (3,).
+    corners
+        Directions in the world at the corners of the pixels, of any length, shape (rows + 1, columns + 1, 3);
+        between them directions are interpolated.
+    """
+
+    origin_m: NDArray[np.float64]
+    corners: NDArray[np.float64]
+
+
+def rays_of(camera: Camera, pose: Pose) -> Rays:
+    """Return the rays of a camera whose axes have a pose in the world."""
+    return Rays(pose.position_m, corner_directions(camera) @ pose.rotation.T)
+
+
+def indirect(
+    snapshot: Snapshot,
+    rays: Rays,
+    seed: int,
+    power: NDArray[np.float64],
+    samples: NDArray[np.int64] | int | None = None,
+    values_at_once: int = _VALUES_AT_ONCE,
+) -> Indirect | None:
+    """Return the indirect light of all groups, or None where nothing reflects or scatters and no lamp shines.
+
+    Parameters
+    ----------
+    rays
+        The camera's rays; the render settings' scale must divide rows and columns.
+    seed
+        64 bits.
+    power
+        What a unit of each group's emission counts when a light is chosen, shape (groups,). It moves only
+        noise from one group to another.
+    samples
+        Samples in each pixel of the film, powers of two, shape (rows, columns) / scale, or one for all;
+        without, the scene's, 16 where it has a target.
+    values_at_once
+        Float32 numbers that one launch may fill.
+    """
+    if not snapshot.has_indirect_light():
+        return None
+    settings = snapshot.render.indirect
+    shape = film_shape(rays, settings.scale)
+    if samples is None:
+        samples = settings.samples or _DEFAULT_SAMPLES
+    counts = np.broadcast_to(samples, shape)
+    pixels = np.arange(counts.size)
+    built = world_on_device(snapshot, power)
+    radiance, variance = render_pixels(
+        snapshot, built, rays, seed, pixels, counts.ravel(), settings.scale, values_at_once
+    )
+    return Indirect(
+        radiance_per_w=radiance.reshape(-1, 1, *shape),
+        variance=variance.reshape(-1, 1, *shape),
+        scale=settings.scale,
+        samples=int(np.median(counts)),
+        counts=None if (counts == counts.flat[0]).all() else counts.astype(np.int32),
+    )
+
+
+def pilot(snapshot: Snapshot, rays: Rays, seed: int, power: NDArray[np.float64]) -> Indirect | None:
+    """Return a few samples in some pixels of the film, every fourth along each axis: what noise there is.
+
+    A small film's are closer, so that there are a thousand. The arguments are those of `indirect`.
+    """
+    if not snapshot.has_indirect_light():
+        return None
+    scale = snapshot.render.indirect.scale
+    rows, columns = film_shape(rays, scale)
+    step = int(np.clip((rows * columns / _PILOT_PIXELS) ** 0.5, 1, _PILOT_STEP))
+    row, column = (_middles(count, step) for count in (rows, columns))
+    pixels = (row[:, None] * columns + column).ravel()
+    built = world_on_device(snapshot, power)
+    counts = np.full(pixels.size, PILOT_SAMPLES)
+    radiance, variance = render_pixels(snapshot, built, rays, seed, pixels, counts, scale)
+    shape = (len(radiance), 1, row.size, column.size)
+    return Indirect(radiance.reshape(shape), variance.reshape(shape), scale * step, PILOT_SAMPLES)
+
+
+def film_shape(rays: Rays, scale: int) -> tuple[int, int]:
+    """Return rows and columns of a film of scale × scale sensor pixels each."""
+    return (rays.corners.shape[0] - 1) // scale, (rays.corners.shape[1] - 1) // scale
+
+
+def _middles(count: int, step: int) -> NDArray[np.int64]:
+    """Return the middles of equal parts of an axis of so many pixels, each part at most a step long."""
+    parts = -(-count // step)
+    return ((2 * np.arange(parts) + 1) * count) // (2 * parts)
+
+
+def render_pixels(
+    snapshot: Snapshot,
+    built: DeviceScene,
+    rays: Rays,
+    seed: int,
+    pixels: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    scale: int,
+    values_at_once: int = _VALUES_AT_ONCE,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return radiance per unit of each group in some pixels of a film, and its variance.
+
+    Parameters
+    ----------
+    built
+        The scene on the device.
+    seed
+        64 bits.
+    pixels
+        Numbers of the pixels, row by row, shape (pixels,).
+    counts
+        Samples in each, powers of two, shape (pixels,).
+    scale
+        A pixel of the film is scale × scale of the sensor's.
+    values_at_once
+        Float32 numbers that one launch may fill.
+
+    Returns
+    -------
+    Shape (groups, pixels) each.
+    """
+    groups, max_depth = len(snapshot.groups), snapshot.render.indirect.max_depth
+    radiance, variance = (_array((groups, pixels.size)) for _ in range(2))
+    for count in np.unique(counts):
+        places = np.flatnonzero(counts == count)
+        batches = min(BATCHES, int(count))
+        part = int(np.clip(values_at_once // (groups * batches), 1, places.size))
+        for first in range(0, places.size, part):
+            some = places[first : first + part]
+            film = film_on_device(rays, scale, pixels[some])
+            radiance[:, some], variance[:, some] = sample_means(
+                built, film, seed, groups, int(count), max_depth
+            )
+    return radiance, variance
+
+
+def light_seed(*key: object) -> int:
+    """Return a seed of 64 bits for a key."""
+    text = "|".join(repr(part) for part in key)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
+
+
+def sample_means(
+    built: DeviceScene, film: Film, seed: int, groups: int, samples: int, max_depth: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return radiance per unit of each group in some pixels, and the variance of it, shape (groups, pixels).
+
+    The samples make up to 8 batches, independent of each other; the variance is that of their mean.
+    """
+    batches = min(BATCHES, samples)
+    pixels, lanes = film.pixel_count, film.pixel_count * batches
+    lane = dr.arange(mi.UInt32, lanes)
+    pixel = dr.gather(mi.UInt32, film.index, lane % film.pixels)
+    draw = lane_draws(pixel, lane // film.pixels, seed, dr.opaque(mi.UInt32, samples // batches))
+    sums = walk(built, film, pixel, draw, lanes, groups, dr.opaque(mi.UInt32, max_depth))
+    place = dr.arange(mi.UInt32, groups * pixels)
+    group = place // film.pixels
+    first = group * dr.opaque(mi.UInt32, lanes) + (place - group * film.pixels)
+    means = [
+        dr.gather(mi.Float, sums, first + batch * film.pixels) / mi.Float(draw.samples)
+        for batch in range(batches)
+    ]
+    mean = sum(means[1:], means[0]) / batches
+    square = sum((dr.square(batch_mean - mean) for batch_mean in means), mi.Float(0))
+    # Squares of rounding errors are nothing either (see `paths`).
+    variance = dr.select(square > _NOTHING, square, 0.0) / max(batches * (batches - 1), 1)
+    dr.eval(mean, variance)
+    return np.array(mean).reshape(groups, pixels), np.array(variance).reshape(groups, pixels)
+
+
+def film_on_device(rays: Rays, scale: int, pixels: NDArray[np.int64]) -> Film:
+    """Bring some pixels, numbered row by row, of a film of scale × scale sensor pixels each to the device."""
+    return Film(
+        origin=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in rays.origin_m)),
+        corners=mi.Float(rays.corners.astype(np.float32).ravel()),
+        rows=dr.opaque(mi.UInt32, rays.corners.shape[0] - 1),
+        columns=dr.opaque(mi.UInt32, rays.corners.shape[1] - 1),
+        scale=dr.opaque(mi.UInt32, scale),
+        index=mi.UInt32(pixels.astype(np.uint32)),
+        pixels=dr.opaque(mi.UInt32, pixels.size),
+        pixel_count=pixels.size,
+    )
+
+
+def world_on_device(snapshot: Snapshot, power: NDArray[np.float64]) -> DeviceScene:
+    """Bring a scene at a time to the device; `power` as for `indirect`."""
+    bodies = mitsuba_scene.build(snapshot)
+    flat = facets(snapshot)
+    shining = emitters(snapshot, flat)
+    panes = bool((flat.kind == PANE).any())
+    box = bodies.bbox()
+    low_m, high_m = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    patterns, axes = [], []
+    for name in snapshot.groups:
+        placed = snapshot.sources.get(name)
+        patterns.append(None if placed is None else pattern_of(placed.source))
+        axes.append(np.eye(3) if placed is None else placed.pose.rotation)
+    fog = medium(snapshot)
+    opaque = mitsuba_scene.build(snapshot, panes=False) if panes else bodies
+    return DeviceScene(
+        bodies=bodies,
+        opaque=opaque,
+        lights=upload_lights(shining, power, patterns, np.array(axes)),
+        surfaces=upload_surfaces(flat, _shape_columns(snapshot, (bodies, opaque), flat)),
+        choice=upload_guide(
+            guide(shining, flat, power, low_m, high_m, 0.0 if fog is None else fog.extinction_per_m)
+        ),
+        fog=None if fog is None else upload_fog(fog),
+    )
+
+
+def _shape_columns(
+    snapshot: Snapshot, worlds: tuple[object, ...], flat: Facets
+) -> dict[str, NDArray[np.int64]]:
+    """Return what each of Mitsuba's shapes is, by its number in Mitsuba."""
+    numbers = [
+        (shape.id(), int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]))
+        for bodies in worlds
+        for shape in bodies.shapes()  # type: ignore[attr-defined]
+    ]
+    size = max((number for _, number in numbers), default=0) + 1
+    columns = {name: np.full(size, -1, dtype=np.int64) for name in ("light", "facet")}
+    columns |= {name: np.zeros(size, dtype=np.int64) for name in ("box", "glass", "pane")}
+    light_of_body = {
+        f"lamp_{name.removeprefix('lamps.')}" if name.startswith("lamps.") else f"source_{group}": group
+        for group, name in enumerate(snapshot.groups)
+    }
+    first_facet = {name: index for index, name in reversed(list(enumerate(flat.name)))}
+    for body, number in numbers:
+        columns["light"][number] = light_of_body.get(body, -1)
+        name = body.removeprefix("shape_").rpartition("_")[0]
+        if not body.startswith("shape_") or name not in snapshot.shapes:
+            continue
+        shape = snapshot.shapes[name]
+        material = snapshot.materials[shape.material]
+        box = isinstance(shape, Box)
+        columns["facet"][number] = first_facet.get(f"shapes.{name}.0" if box else f"shapes.{name}", -1)
+        columns["box"][number] = box
+        columns["glass"][number] = isinstance(material, Dielectric)
+        columns["pane"][number] = isinstance(material, Pane)
+    return columns
+
+
+def _array(shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return an array of zeros; a large one is mapped from a file that vanishes with it."""
+    if 4 * shape[0] * shape[1] < _MAPPED_FROM_BYTES:
+        return np.zeros(shape, dtype=np.float32)
+    with tempfile.TemporaryFile(prefix="nir_render-light-") as file:
+        return np.memmap(file, dtype=np.float32, mode="w+", shape=shape)

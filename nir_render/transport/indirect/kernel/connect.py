@@ -1,0 +1,254 @@
+"""From a place to a light on the device: choosing one, aiming at it, and what arrives on the way.
+
+A light's image in a flat smooth facet is a light of its own that stands behind the facet: a ray towards it
+that crosses the facet goes on, mirrored, to the light itself. Panes weaken what passes and do not bend it.
+"""
+
+from dataclasses import dataclass
+
+from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.kernel.rectangle import RectangleInView
+from nir_render.transport.indirect.kernel.tables import Choice, Lights, Surfaces
+from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, UInt, Vector
+from nir_render.transport.world.emitters import RECTANGLE, SUN
+from nir_render.transport.world.facets import MIRROR, PANE
+
+# Shadow rays to facets and lamps end this share of their way before it: what float32 rounds, with room.
+SHORTER = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """A ray towards a light: unit direction, length, density per sr of being drawn, and the radiance."""
+
+    direction: Vector
+    reach: Float
+    density: Float
+    radiance: Float
+
+
+def guide_cell(choice: Choice, place: Point) -> UInt:
+    """Return the guide's cell of a place; outside the grid the nearest."""
+    at = mi.Point3u(dr.clip((place - choice.low) * choice.cells_per_m, 0.0, choice.top))
+    return at.x + choice.stride_y * at.y + choice.stride_z * at.z
+
+
+def choose_light(choice: Choice, lights: Lights, cell: UInt, u: Float) -> tuple[UInt, Float]:
+    """Return a light drawn by the guide, and the chance of it."""
+    first = cell * lights.count
+    row = dr.binary_search(
+        0, lights.rows - 1, lambda k: dr.gather(mi.Float, choice.cumulative, first + k) <= u
+    )
+    return row, dr.gather(mi.Float, choice.chance, first + row)
+
+
+def light_chance(choice: Choice, lights: Lights, cell: UInt, row: UInt, active: Mask) -> Float:
+    """Return the chance that the guide draws a light in a cell."""
+    return dr.gather(mi.Float, choice.chance, cell * lights.count + row, active)
+
+
+def versine_of(radius: Float, distance2: Float) -> Float:
+    """Return 1 − cos of half the angle that a sphere fills; the difference itself would lose its digits."""
+    sine2 = dr.minimum(radius * radius / distance2, 1.0)
+    return sine2 / (1.0 + dr.sqrt(1.0 - sine2))
+
+
+def aim_at_light(lights: Lights, row: UInt, place: Point, u: Float, v: Float, active: Mask) -> Aim:
+    """Return a ray from a place towards a point of a light, drawn evenly over the solid angle it fills."""
+    radiance = dr.gather(mi.Float, lights.radiance, row, active)
+    direction, reach, density = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(1)
+    kind = dr.gather(mi.UInt32, lights.kind, row, active)
+    if lights.has_spheres:
+        direction, reach, density = _aim_at_sphere(lights, row, place, u, v, active)
+    if lights.has_rectangles:
+        sampled = _aim_at_rectangle(lights, row, place, u, v, active & (kind == RECTANGLE))
+        direction, reach, density = (
+            dr.select(kind == RECTANGLE, new, old)
+            for new, old in zip(sampled, (direction, reach, density), strict=True)
+        )
+    if lights.sun >= 0:
+        sampled = _aim_at_sun(lights, row, u, v, active & (kind == SUN))
+        direction, reach, density = (
+            dr.select(kind == SUN, new, old)
+            for new, old in zip(sampled, (direction, reach, density), strict=True)
+        )
+    return Aim(direction, reach, density, radiance)
+
+
+def aim_density(lights: Lights, row: UInt, place: Point, direction: Vector, active: Mask) -> Float:
+    """Return the density per sr with which `aim_at_light` draws a direction that does meet a light."""
+    kind = dr.gather(mi.UInt32, lights.kind, row, active)
+    density = mi.Float(0)
+    if lights.has_spheres:
+        center = dr.gather(mi.Point3f, lights.center, row, active)
+        radius = dr.gather(mi.Float, lights.radius, row, active)
+        density = dr.rcp(2.0 * dr.pi * versine_of(radius, dr.squared_norm(center - place)))
+    if lights.has_rectangles:
+        flat = RectangleInView(lights, row, place, active & (kind == RECTANGLE))
+        density = dr.select(kind == RECTANGLE, flat.density(direction), density)
+    if lights.sun >= 0:
+        versine = dr.gather(mi.Float, lights.versine, row, active)
+        density = dr.select(kind == SUN, dr.rcp(2.0 * dr.pi * versine), density)
+    return density
+
+
+def meets_sun(lights: Lights, direction: Vector) -> Mask:
+    """Tell whether a direction meets the sun's disc."""
+    row = mi.UInt32(lights.sun)
+    to_sun = dr.gather(mi.Vector3f, lights.normal, row)
+    return 0.5 * dr.squared_norm(direction - to_sun) < dr.gather(mi.Float, lights.versine, row)
+
+
+def pattern_factor(lights: Lights, light: UInt, leaving: Vector, active: Mask) -> Float:
+    """Return the radiance of a light, not an image, in a direction that leaves it, over its mean."""
+    if not lights.pattern_polars:
+        return mi.Float(1)
+    first = dr.gather(mi.Int32, lights.pattern_first, light, active)
+    patterned = active & (first >= 0)
+    azimuths = dr.gather(mi.UInt32, lights.pattern_azimuths, light, patterned)
+    axes = dr.gather(mi.Matrix3f, lights.pattern_axes, light, patterned)
+    on_source = axes.T @ leaving
+    polar = dr.acos(dr.clip(on_source.z, -1.0, 1.0)) * ((lights.pattern_polars - 1) / dr.pi)
+    azimuth = dr.atan2(on_source.y, on_source.x)
+    azimuth = dr.select(azimuth < 0.0, azimuth + 2.0 * dr.pi, azimuth) * mi.Float(azimuths) / (2.0 * dr.pi)
+    row = mi.UInt32(dr.clip(polar, 0.0, lights.pattern_polars - 1.5))
+    column = dr.minimum(mi.UInt32(azimuth), azimuths - 1)
+    next_column = dr.select(column + 1 == azimuths, 0, column + 1)
+    down, along = dr.clip(polar - mi.Float(row), 0.0, 1.0), dr.clip(azimuth - mi.Float(column), 0.0, 1.0)
+
+    def value(at_row: UInt, at_column: UInt) -> Float:
+        return dr.gather(
+            mi.Float, lights.pattern, mi.UInt32(first) + at_row * azimuths + at_column, patterned
+        )
+
+    above = dr.lerp(value(row, column), value(row, next_column), along)
+    below = dr.lerp(value(row + 1, column), value(row + 1, next_column), along)
+    return dr.select(patterned, dr.lerp(above, below, down), 1.0)
+
+
+def reflectance(surfaces: Surfaces, facet: UInt, cosine: Float, active: Mask) -> Float:
+    """Return the reflectance of a facet at an angle of incidence."""
+    kind = dr.gather(mi.UInt32, surfaces.kind, facet, active)
+    single = mi.fresnel(cosine, dr.gather(mi.Float, surfaces.index, facet, active))[0]
+    single = dr.select(kind == PANE, 2.0 * single / (1.0 + single), single)
+    return dr.select(kind == MIRROR, dr.gather(mi.Float, surfaces.factor, facet, active), single)
+
+
+def pane_transmittance(
+    surfaces: Surfaces, origin: Point, direction: Vector, reach: Float, without: Int, active: Mask
+) -> tuple[Float, UInt]:
+    """Return the transmittance of all panes on a straight way but `without`, and their number."""
+
+    def more(k: UInt, _left: Float, _count: UInt) -> Mask:
+        return k < surfaces.pane_count
+
+    def step(k: UInt, left: Float, count: UInt) -> tuple[UInt, Float, UInt]:
+        pane = dr.gather(mi.UInt32, surfaces.panes, k, active)
+        normal = dr.gather(mi.Vector3f, surfaces.normal, pane, active)
+        at = _crossing(surfaces, pane, origin, direction, active)
+        crossed = (
+            active & at.inside & (at.distance > 0.0) & (at.distance < reach) & (mi.Int32(pane) != without)
+        )
+        reflected = reflectance(surfaces, pane, dr.abs(dr.dot(direction, normal)), active)
+        passed = (1.0 - reflected) * dr.gather(mi.Float, surfaces.transmission, pane, active)
+        return k + 1, dr.select(crossed, left * passed, left), dr.select(crossed, count + 1, count)
+
+    width = dr.zeros(mi.UInt32, dr.width(reach))
+    _, left, count = dr.while_loop((width, mi.Float(width) + 1.0, mi.UInt32(width)), more, step)
+    return left, count
+
+
+@dataclass(frozen=True, eq=False)
+class Reflection:
+    """A ray towards an image: where it meets the facet, how it goes on, and the share that is reflected.
+
+    `place` stands a little off the facet; from there `direction` leads to the light over the length `rest`.
+    """
+
+    valid: Mask
+    distance: Float
+    place: Point
+    direction: Vector
+    rest: Float
+    reflectance: Float
+
+
+def mirror_ray(
+    surfaces: Surfaces, facet: UInt, origin: Point, direction: Vector, reach: Float, active: Mask
+) -> Reflection:
+    """Return how a ray towards a light's image is mirrored by the facet that shows it."""
+    normal = dr.gather(mi.Vector3f, surfaces.normal, facet, active)
+    at = _crossing(surfaces, facet, origin, direction, active)
+    slope = dr.dot(direction, normal)
+    facing = dr.gather(mi.Bool, surfaces.two_sided, facet, active) | (slope < 0.0)
+    valid = active & at.inside & facing & (at.distance > 0.0) & (at.distance < reach)
+    place = origin + direction * at.distance
+    # A step off the facet, on the side from which the light comes; as far as Mitsuba's own rays take.
+    step = dr.sign(slope) * 1e-4 * (1.0 + dr.max(dr.abs(place))) * normal
+    # From there to the same point.
+    to = (direction - 2.0 * slope * normal) * (reach - at.distance) + step
+    rest = dr.norm(to)
+    return Reflection(
+        valid=valid,
+        distance=at.distance,
+        place=place - step,
+        direction=to / rest,
+        rest=rest,
+        reflectance=reflectance(surfaces, facet, dr.abs(slope), valid),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Crossing:
+    distance: Float
+    inside: Mask
+
+
+def _crossing(surfaces: Surfaces, facet: UInt, origin: Point, direction: Vector, active: Mask) -> _Crossing:
+    normal = dr.gather(mi.Vector3f, surfaces.normal, facet, active)
+    center = dr.gather(mi.Point3f, surfaces.center, facet, active)
+    distance = dr.dot(center - origin, normal) / dr.dot(direction, normal)
+    off = origin + direction * distance - center
+    along_u = dr.dot(off, dr.gather(mi.Vector3f, surfaces.half_u, facet, active))
+    along_v = dr.dot(off, dr.gather(mi.Vector3f, surfaces.half_v, facet, active))
+    return _Crossing(distance, (dr.abs(along_u) <= 1.0) & (dr.abs(along_v) <= 1.0))
+
+
+def _aim_at_sphere(
+    lights: Lights, row: UInt, place: Point, u: Float, v: Float, active: Mask
+) -> tuple[Vector, Float, Float]:
+    to = dr.gather(mi.Point3f, lights.center, row, active) - place
+    radius = dr.gather(mi.Float, lights.radius, row, active)
+    distance2 = dr.squared_norm(to)
+    distance = dr.sqrt(distance2)
+    whole = versine_of(radius, distance2)
+    versine = whole * u
+    sine2 = versine * (2.0 - versine)
+    direction = _around(to / distance, dr.safe_sqrt(sine2), versine, v)
+    reach = distance * (1.0 - versine) - dr.safe_sqrt(radius * radius - distance2 * sine2)
+    return direction, reach, dr.rcp(2.0 * dr.pi * whole)
+
+
+def _aim_at_sun(lights: Lights, row: UInt, u: Float, v: Float, active: Mask) -> tuple[Vector, Float, Float]:
+    whole = dr.gather(mi.Float, lights.versine, row, active)
+    versine = whole * u
+    axis = dr.gather(mi.Vector3f, lights.normal, row, active)
+    direction = _around(axis, dr.safe_sqrt(versine * (2.0 - versine)), versine, v)
+    return direction, mi.Float(1e15), dr.rcp(2.0 * dr.pi * whole)
+
+
+def _around(axis: Vector, sine: Float, versine: Float, turn: Float) -> Vector:
+    sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * turn)
+    return mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, 1.0 - versine))
+
+
+def _aim_at_rectangle(
+    lights: Lights, row: UInt, place: Point, u: Float, v: Float, active: Mask
+) -> tuple[Vector, Float, Float]:
+    flat = RectangleInView(lights, row, place, active)
+    to = flat.point(u, v)
+    distance = dr.norm(to)
+    direction = to / distance
+    # Zero from behind: a density beyond all bounds.
+    density = dr.select(dr.dot(direction, flat.normal) < 0.0, flat.density(direction), 1e30)
+    return direction, distance, density

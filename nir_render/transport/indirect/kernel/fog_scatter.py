@@ -1,0 +1,181 @@
+"""Light that fog scatters into a stretch of a path, on the device: which light, and where on the way.
+
+One light is drawn for each stretch, and one place, both by what they bring: the phase function and the
+inverse square cancel where the place is drawn evenly in ∫ p dβ, β being the angle at which the light stands
+off the ray (equiangular sampling, Kulla & Fajardo 2012, with the phase function in it).
+"""
+
+from dataclasses import dataclass
+
+from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.kernel import connect, draws
+from nir_render.transport.indirect.kernel.arrive import arriving_share
+from nir_render.transport.indirect.kernel.fog import (
+    absorbed_share,
+    arc_integral,
+    draw_angle,
+    phase_function,
+    table_slope,
+)
+from nir_render.transport.indirect.kernel.tables import DeviceScene
+from nir_render.transport.indirect.kernel.types import AddLight, Float, Mask, PathState, Point, Random, UInt
+from nir_render.transport.world.emitters import SUN
+
+# Up to so many lights fog weighs each of them for each stretch; with more, the guide proposes so many.
+_WEIGHED_LIGHTS = 16
+_CANDIDATES = 4  # for each of which `draws` has two numbers
+
+
+@dataclass(frozen=True, eq=False)
+class FogScattering:
+    """What fog does on a stretch.
+
+    The share of light lost on it; a place where a path may turn, the weight of turning there, the new
+    direction apart, and whether it may.
+    """
+
+    lost: Float
+    place: Point
+    weight: Float
+    turns: Mask
+
+
+def scatter_on_stretch(
+    scene: DeviceScene,
+    state: PathState,
+    begin: Float,
+    end: Float,
+    active: Mask,
+    max_depth: UInt,
+    number: Random,
+    add: AddLight,
+) -> FogScattering:
+    """Add the light of one light that fog on a stretch scatters into the path."""
+    fog = scene.fog
+    assert fog is not None  # only called in fog
+    lost = dr.select(active, absorbed_share(fog.extinction * (end - begin)), 0.0)
+    # The last stretch but one may scatter, and the last may not: all its light has been asked for before.
+    turns = active & (state.depth + 2 < max_depth)
+    active = active & (state.depth + 1 < max_depth)
+    row, chance = _light_for_stretch(scene, state, begin, end, active, number)
+    distance, density = _place_on_stretch(scene, row, state, begin, end, number(draws.FOG_PLACE), active)
+    place = state.origin + state.direction * distance
+    aim = connect.aim_at_light(scene.lights, row, place, number(draws.FOG_U), number(draws.FOG_V), active)
+    turn = 0.5 * dr.squared_norm(aim.direction - state.direction)
+    weight = fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin)) / density
+    brought = state.weight * weight * phase_function(fog, turn) * aim.radiance / (chance * aim.density)
+    seen = active & (brought > 0.0) & dr.isfinite(brought)
+    share = arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
+    add(brought * share, row, seen & (share > 0.0))
+    return FogScattering(lost, place, weight, turns)
+
+
+def _light_for_stretch(
+    scene: DeviceScene, state: PathState, begin: Float, end: Float, active: Mask, number: Random
+) -> tuple[UInt, Float]:
+    """Return a light drawn by what it brings to the fog on a stretch, and the chance of it.
+
+    Without shadows and extinction that is power · ∫ p(β) / d² dt = power · (arc(β₁) − arc(β₀)) / D, with D
+    the ray's distance from the light. Few lights are all weighed by it. Of many, the guide proposes some for
+    places along the stretch, and one of these is taken by its weight (resampling, Talbot et al. 2005); the
+    chance returned is then the one that makes the estimate right on average.
+    """
+    few = weighs_all(scene)
+
+    def weigh(k: UInt) -> tuple[UInt, Float]:
+        row, chance = (k, 1.0) if few else _candidate(scene, state, begin, end, k, number)
+        return row, _brought_to_stretch(scene, row, state, begin, end, active) / chance
+
+    count = scene.lights.count if few else _CANDIDATES
+    row, weight, total = draws.draw_by_weight(count, weigh, number(draws.FOG_LIGHT))
+    if few:
+        return row, weight / total
+    return row, _CANDIDATES * _brought_to_stretch(scene, row, state, begin, end, active) / total
+
+
+def weighs_all(scene: DeviceScene) -> bool:
+    """Tell whether lights are so few that fog weighs each of them for each stretch."""
+    return scene.lights.rows <= _WEIGHED_LIGHTS
+
+
+def _candidate(
+    scene: DeviceScene, state: PathState, begin: Float, end: Float, k: UInt, number: Random
+) -> tuple[UInt, Float]:
+    """Return a light that the guide draws at one of some places on a stretch, and its chance."""
+    along, pick = (number(draws.FOG_CANDIDATES + 2 * k + which) for which in range(2))
+    distance = _flight_within(scene, begin, end, (mi.Float(k) + along) / _CANDIDATES)
+    cell = connect.guide_cell(scene.choice, state.origin + state.direction * distance)
+    return connect.choose_light(scene.choice, scene.lights, cell, pick)
+
+
+def _brought_to_stretch(
+    scene: DeviceScene, row: UInt, state: PathState, begin: Float, end: Float, active: Mask
+) -> Float:
+    """Return what a light brings to the fog on a stretch, towards its begin, if nothing hides it, roughly.
+
+    The way over the fog is at least the straight one; by that, light is weakened.
+    """
+    fog, lights = scene.fog, scene.lights
+    assert fog is not None  # only called in fog
+    _, off, low, high = _arcs(scene, row, state, begin, end, active)
+    weight = dr.maximum(high - low, 1e-6) / (4.0 * dr.pi * off)
+    to = dr.gather(mi.Point3f, lights.center, row, active) - state.origin
+    weight = weight * dr.maximum(dr.exp(-fog.extinction * dr.norm(to)), 1e-6)
+    if lights.sun >= 0:
+        kind = dr.gather(mi.UInt32, lights.kind, row, active)
+        to_sun = dr.gather(mi.Vector3f, lights.normal, row, active)
+        turn = 0.5 * dr.squared_norm(to_sun - state.direction)
+        of_sun = phase_function(fog, turn) * absorbed_share(fog.extinction * (end - begin)) / fog.extinction
+        weight = dr.select(kind == SUN, of_sun, weight)
+    return weight * dr.gather(mi.Float, lights.power, row, active)
+
+
+def _place_on_stretch(
+    scene: DeviceScene, row: UInt, state: PathState, begin: Float, end: Float, u: Float, active: Mask
+) -> tuple[Float, Float]:
+    """Return a distance on a stretch, and the density per metre with which it was drawn.
+
+    Half of the draws are even in the integral of the phase function over the angle β at which the light
+    stands off the ray, which grows by D/d² for each metre; half go by the extinction, which matters where the
+    light is far. Where the integral is too short for float32, and for the sun, all go by the extinction.
+    """
+    fog = scene.fog
+    assert fog is not None  # only called in fog
+    middle, off, low, high = _arcs(scene, row, state, begin, end, active)
+    far = high - low <= 1e-4
+    if scene.lights.sun >= 0:
+        far = far | (dr.gather(mi.UInt32, scene.lights.kind, row, active) == SUN)
+    by_arc = ~far & (u < 0.5)
+    u = dr.select(far, u, dr.select(by_arc, 2.0 * u, 2.0 * u - 1.0))
+    angle = draw_angle(fog, fog.arc, dr.lerp(low, high, u))
+    sine, cosine = dr.sincos(angle)
+    distance = dr.clip(middle - off * cosine / dr.maximum(sine, 1e-9), begin, end)
+    distance = dr.select(by_arc, distance, _flight_within(scene, begin, end, u))
+    beside = distance - middle
+    slope = table_slope(fog, fog.arc, dr.atan2(off, -beside))
+    arc_density = slope / dr.maximum(high - low, 1e-9) * off / (off * off + beside * beside)
+    whole = absorbed_share(fog.extinction * (end - begin))
+    flight_density = fog.extinction * dr.exp(-fog.extinction * (distance - begin)) / whole
+    return distance, dr.select(far, flight_density, 0.5 * (arc_density + flight_density))
+
+
+def _arcs(
+    scene: DeviceScene, row: UInt, state: PathState, begin: Float, end: Float, active: Mask
+) -> tuple[Float, Float, Float, Float]:
+    """Return where a ray is nearest to a light, how near, and `arc` at both ends of a stretch of it."""
+    to = dr.gather(mi.Point3f, scene.lights.center, row, active) - state.origin
+    middle = dr.dot(to, state.direction)
+    off = dr.norm(to - state.direction * middle)
+    off = dr.maximum(off, dr.gather(mi.Float, scene.lights.spread, row, active))
+    fog = scene.fog
+    assert fog is not None  # only called in fog
+    low = arc_integral(fog, dr.atan2(off, middle - begin))
+    high = arc_integral(fog, dr.atan2(off, middle - end))
+    return middle, off, low, high
+
+
+def _flight_within(scene: DeviceScene, begin: Float, end: Float, u: Float) -> Float:
+    """Return a distance on a stretch, drawn by the extinction, never beyond its end."""
+    assert scene.fog is not None  # only called in fog
+    whole = absorbed_share(scene.fog.extinction * (end - begin))
+    return dr.minimum(begin - dr.log(1.0 - u * whole) / scene.fog.extinction, end)

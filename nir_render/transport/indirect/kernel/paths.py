@@ -1,0 +1,389 @@
+"""The walk of light paths on the device: one lane is one pixel of one batch, and walks its samples in turn.
+
+Every lane goes on to its next sample as soon as a path ends, so none waits for its neighbours' longer paths.
+A lane alone adds to its place in the result, in the order of its samples: the sums are the same bits on any
+number of threads.
+
+Each step is a stretch of a path, from a vertex to the next: fog on the way scatters light of one light
+towards the vertex (a place drawn where the phase function and the inverse square put it, Kulla & Fajardo
+2012); at the surface one light is asked for (next-event estimation), and the path goes on by the surface's
+own scattering. Both ways to a light are weighted by the power heuristic (Veach 1995).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.kernel import connect, draws
+from nir_render.transport.indirect.kernel.arrive import arriving_share
+from nir_render.transport.indirect.kernel.draws import Draws
+from nir_render.transport.indirect.kernel.fog import fog_interval
+from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
+from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
+from nir_render.transport.indirect.kernel.tables import DeviceScene, Surfaces
+from nir_render.transport.indirect.kernel.types import (
+    AddLight,
+    Float,
+    Int,
+    Interaction,
+    Mask,
+    PathState,
+    Point,
+    Random,
+    UInt,
+    Vector,
+)
+from nir_render.transport.world.emitters import RECTANGLE
+
+# How a path came here since its last vertex that scatters evenly: straight on (through panes at most), by one
+# facet (its number), or by smooth surfaces that no image stands for.
+_STRAIGHT, _OTHERWISE = -1, -2
+_FAR = 1e15
+# Paths of which surfaces and fog have left less than this go on by chance, as if this were left. How a path
+# was drawn does not count: what goes towards a light weighs little, and brings as much as any.
+_DIM = 0.1
+# Less than this, in 1/(m² sr), is nothing: near 1e-38 some threads round to zero and others do not.
+_NOTHING = 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """The rays of a camera and the part of its film to fill.
+
+    `corners` holds directions at the corners of the sensor's pixels, `rows` + 1 times `columns` + 1; a pixel
+    of the film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels`
+    and `pixel_count` how many.
+    """
+
+    origin: Point
+    corners: Float
+    rows: UInt
+    columns: UInt
+    scale: UInt
+    index: UInt
+    pixels: UInt
+    pixel_count: int
+
+
+def walk(
+    scene: DeviceScene, film: Film, pixel: UInt, draw: Draws, lanes: int, groups: int, max_depth: UInt
+) -> Float:
+    """Return the sum over a batch's samples of each pixel's radiance per unit of each group's emission.
+
+    Parameters
+    ----------
+    pixel
+        Number of each lane's pixel.
+    lanes
+        Batches × pixels; a batch's pixels lie together.
+    max_depth
+        Longest path, in stretches, as Mitsuba counts.
+
+    Returns
+    -------
+    Flat array, (group, batch, pixel).
+    """
+    lane = dr.arange(mi.UInt32, lanes)
+    out = dr.zeros(mi.Float, groups * lanes)
+    stride = dr.opaque(mi.UInt32, lanes)
+
+    def add(value: Float, row: UInt, active: Mask) -> None:
+        group = dr.gather(mi.UInt32, scene.lights.group, row, active)
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, out, value, group * stride + lane, active & (value > _NOTHING),
+            dr.ReduceMode.NoConflicts,
+        )  # fmt: skip
+
+    def camera_direction(sample: UInt) -> Vector:
+        return _camera_direction(film, pixel, draw, sample)
+
+    def step(state: PathState) -> tuple[PathState]:
+        return (_step(scene, state, draw, max_depth, add, camera_direction, film.origin),)
+
+    zero = dr.zeros(mi.UInt32, lanes)
+    state = PathState(
+        sample=mi.UInt32(zero),
+        depth=mi.UInt32(zero),
+        origin=film.origin + dr.zeros(mi.Point3f, lanes),
+        direction=camera_direction(zero),
+        weight=dr.ones(mi.Float, lanes),
+        left=dr.ones(mi.Float, lanes),
+        place=dr.zeros(mi.Point3f, lanes),
+        cell=mi.UInt32(zero),
+        density=dr.zeros(mi.Float, lanes),
+        scattered=dr.zeros(mi.Bool, lanes),
+        way=dr.full(mi.Int32, _STRAIGHT, lanes),
+        inside=dr.zeros(mi.Bool, lanes),
+        active=dr.full(mi.Bool, True, lanes),
+    )
+    dr.while_loop((state,), lambda state: state.active, step)
+    return out
+
+
+def _camera_direction(film: Film, pixel: UInt, draw: Draws, sample: UInt) -> Vector:
+    """Return a unit direction in a pixel, evenly drawn between those at the sensor pixel's corners."""
+    width = film.columns // film.scale
+    row = pixel // width
+    u = (mi.Float(pixel - row * width) + draw.pixel(sample, draws.PIXEL_U)) * mi.Float(film.scale)
+    v = (mi.Float(row) + draw.pixel(sample, draws.PIXEL_V)) * mi.Float(film.scale)
+    # In float32 the sum can round up to the next whole number.
+    column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
+    corner = line * (film.columns + 1) + column
+    above, above_right, below, below_right = (
+        dr.gather(mi.Vector3f, film.corners, corner + offset)
+        for offset in (0, 1, film.columns + 1, film.columns + 2)
+    )
+    along, down = u - mi.Float(column), v - mi.Float(line)
+    return dr.normalize(dr.lerp(dr.lerp(above, above_right, along), dr.lerp(below, below_right, along), down))
+
+
+def _step(
+    scene: DeviceScene,
+    state: PathState,
+    draw: Draws,
+    max_depth: UInt,
+    add: AddLight,
+    camera_direction: Callable[[UInt], Vector],
+    camera: Point,
+) -> PathState:
+    """Return a lane's state after one more stretch of its path, its light added on the way."""
+
+    def number(purpose: UInt) -> Float:
+        return draw.vertex(state.sample, state.depth, purpose)
+
+    si = _meet(scene, state)
+    met = state.active & si.is_valid()
+    passing, scattering = _pass_fog(scene, state, si, met, max_depth, number, add)
+    light = _add_met_light(scene, state, si, met, passing, add)
+    surface = met & (light < 0) & (state.depth + 1 < max_depth)
+    sampled = _ask_light(scene, state, si, passing, surface, max_depth, number, add)
+    onward_path = _scatter(scene, state, si, sampled, surface, scattering, number)
+    return _survive(state, onward_path, draw, number(draws.SURVIVAL), camera_direction, camera)
+
+
+def _meet(scene: DeviceScene, state: PathState) -> Interaction:
+    """Return where a path's next stretch meets a surface, Mitsuba's surface interaction."""
+    return scene.bodies.ray_intersect(
+        mi.Ray3f(state.origin, state.direction),
+        ray_flags=mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame,
+        coherent=state.depth == 0,
+        active=state.active,
+    )
+
+
+def _pass_fog(
+    scene: DeviceScene,
+    state: PathState,
+    si: Interaction,
+    met: Mask,
+    max_depth: UInt,
+    number: Random,
+    add: AddLight,
+) -> tuple[Float, FogScattering | None]:
+    """Return a path's weight behind the fog on its stretch, and what the fog scatters; add that light.
+
+    What lies at the end is asked for whether the path turns in fog or not, so that this choice brings no
+    noise into it.
+    """
+    if scene.fog is None:
+        return state.weight, None
+    begin, end = fog_interval(scene.fog, state.origin, state.direction, dr.select(met, si.t, _FAR))
+    in_it = state.active & ~state.inside & (end > begin)
+    scattering = scatter_on_stretch(scene, state, begin, end, in_it, max_depth, number, add)
+    return state.weight * (1.0 - scattering.lost), scattering
+
+
+def _add_met_light(
+    scene: DeviceScene, state: PathState, si: Interaction, met: Mask, weight: Float, add: AddLight
+) -> Int:
+    """Add the light that a path meets; return its number, below 0 where there is none."""
+    light = dr.gather(mi.Int32, scene.surfaces.light_of_shape, _shape(si), met)
+    shines = met & (light >= 0)
+    if scene.lights.sun >= 0:
+        leaves = state.active & ~si.is_valid() & connect.meets_sun(scene.lights, state.direction)
+        light = dr.select(leaves, scene.lights.sun, light)
+        shines = shines | leaves
+    front = (dr.dot(state.direction, si.n) < 0.0) | ~met  # lamps shine from one side, suns from everywhere
+    _add_unasked_light(scene, state, weight, mi.UInt32(light), shines & front, add)
+    return light
+
+
+def _add_unasked_light(
+    scene: DeviceScene, state: PathState, weight: Float, light: UInt, active: Mask, add: AddLight
+) -> None:
+    """Add a light that the path has met, as far as asking for it has not brought it.
+
+    Small lights that the camera sees straight, or by one facet, are left out: the direct table holds them.
+    """
+    lights = scene.lights
+    row = mi.Int32(light)
+    towards = state.direction
+    if lights.has_images:
+        mirrored = active & (state.way >= 0)
+        image = dr.gather(mi.Int32, lights.image, mi.UInt32(state.way) * lights.lights + light, mirrored)
+        row = dr.select(mirrored, image, row)
+        normal = dr.gather(mi.Vector3f, scene.surfaces.normal, mi.UInt32(state.way), mirrored)
+        towards = dr.select(mirrored, towards - 2.0 * dr.dot(towards, normal) * normal, towards)
+    asked = active & state.scattered & (state.way != _OTHERWISE) & (row >= 0)
+    known = mi.UInt32(dr.maximum(row, 0))
+    density = connect.aim_density(lights, known, state.place, towards, asked)
+    density = density * connect.light_chance(scene.choice, lights, state.cell, known, asked)
+    share = dr.select(asked, _power_heuristic(state.density, density), 1.0)
+    small = dr.gather(mi.UInt32, lights.kind, light, active) != RECTANGLE
+    in_table = small & ~state.scattered & (state.way != _OTHERWISE)
+    share = dr.select(in_table, 0.0, share)
+    radiance = dr.gather(mi.Float, lights.radiance, light, active)
+    radiance = radiance * connect.pattern_factor(lights, light, -state.direction, active)
+    add(weight * radiance * share, light, active & (share > 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _SurfaceSample:
+    """A surface's own scattering: Mitsuba's sample and its weight, and the guide's cell of the place."""
+
+    bsdf: Any
+    sample: Any
+    weight: Float
+    cell: UInt
+
+
+def _ask_light(
+    scene: DeviceScene,
+    state: PathState,
+    si: Interaction,
+    weight: Float,
+    surface: Mask,
+    max_depth: UInt,
+    number: Random,
+    add: AddLight,
+) -> _SurfaceSample:
+    """Add what a surface scatters of one light into the path, and return its sample of a way onwards.
+
+    Both come from one call of Mitsuba's, which costs less than two.
+    """
+    bsdf = si.bsdf()
+    cell = connect.guide_cell(scene.choice, si.p)
+    row, chance = connect.choose_light(scene.choice, scene.lights, cell, number(draws.LIGHT))
+    aim = connect.aim_at_light(scene.lights, row, si.p, number(draws.LIGHT_U), number(draws.LIGHT_V), surface)
+    value, density, sample, sampled_weight = bsdf.eval_pdf_sample(
+        mi.BSDFContext(), si, si.to_local(aim.direction), number(draws.LOBE),
+        mi.Point2f(number(draws.LOBE_U), number(draws.LOBE_V)), surface,
+    )  # fmt: skip
+    asked = aim.density * chance
+    brought = weight * value[0] * aim.radiance / asked * _power_heuristic(asked, density)
+    seen = surface & (brought > 0.0) & dr.isfinite(brought)
+    shadow = si.spawn_ray(aim.direction)
+    # Mitsuba lifts a ray's origin off the surface, up to 1e-4 of the coordinates; it aims at the same point.
+    to = aim.direction * aim.reach - (shadow.o - si.p)
+    reach = dr.norm(to)
+    lifted = replace(aim, direction=to / reach, reach=reach)
+    share = arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
+    add(brought * share, row, seen & (share > 0.0))
+    return _SurfaceSample(bsdf, sample, sampled_weight[0], cell)
+
+
+@dataclass(frozen=True, eq=False)
+class _NextStretch:
+    """How a path leaves the vertex at the end of a stretch, if it does.
+
+    `origin` is that of its next stretch, `leaves` whether there is one, `evenly` whether the vertex scatters
+    evenly; `cell`, `way` and `inside` are those of `PathState`.
+    """
+
+    leaving: NextDirection
+    origin: Point
+    cell: UInt
+    leaves: Mask
+    evenly: Mask
+    way: Int
+    inside: Mask
+
+
+def _scatter(
+    scene: DeviceScene,
+    state: PathState,
+    si: Interaction,
+    sampled: _SurfaceSample,
+    surface: Mask,
+    scattering: FogScattering | None,
+    number: Random,
+) -> _NextStretch:
+    """Return how a path goes on: scattered by the surface that it meets, or turned in the fog before it."""
+    leaving = leave_surface(si, sampled.sample, sampled.weight)
+    surface = surface & (leaving.weight > 0.0)
+    if scattering is not None:
+        leaving = leave_in_fog(scene, state, si, sampled.bsdf, leaving, surface, scattering, number)
+    turned, smooth = leaving.turned, leaving.smooth
+    sampled_type, shape = sampled.sample.sampled_type, _shape(si)
+    passes = dr.gather(mi.Bool, scene.surfaces.pane_of_shape, shape, surface) & mi.has_flag(
+        sampled_type, mi.BSDFFlags.Null
+    )
+    facet = _facet(scene.surfaces, si, shape, surface)
+    mirrored = (
+        smooth & (facet >= 0) & mi.has_flag(sampled_type, mi.BSDFFlags.DeltaReflection)
+        & (state.way == _STRAIGHT)
+    )  # fmt: skip
+    way = dr.select(passes, state.way, dr.select(mirrored, facet, _OTHERWISE))
+    glass = dr.gather(mi.Bool, scene.surfaces.glass_of_shape, shape, surface)
+    onward = si.spawn_ray(leaving.direction)
+    surface = surface & ~turned & (leaving.weight > 0.0)
+    return _NextStretch(
+        leaving=leaving,
+        origin=dr.select(turned, leaving.place, onward.o),
+        cell=sampled.cell,
+        leaves=surface | turned,
+        evenly=(surface & ~smooth) | turned,
+        way=way,
+        inside=dr.select(surface & glass, dr.dot(leaving.direction, si.n) < 0.0, state.inside),
+    )
+
+
+def _survive(
+    state: PathState,
+    onward_path: _NextStretch,
+    draw: Draws,
+    u: Float,
+    camera_direction: Callable[[UInt], Vector],
+    camera: Point,
+) -> PathState:
+    """Return the state of a path that goes on, by chance `u` where it is dim, or of the next sample's."""
+    leaving, evenly = onward_path.leaving, onward_path.evenly
+    left = state.left * leaving.left
+    survival = dr.minimum(left / _DIM, 1.0)
+    goes_on = onward_path.leaves & (u < survival)
+    sample_next = state.sample + dr.select(goes_on, mi.UInt32(0), mi.UInt32(1))
+    return PathState(
+        sample=sample_next,
+        depth=dr.select(goes_on, state.depth + 1, 0),
+        origin=dr.select(goes_on, onward_path.origin, camera),
+        direction=dr.select(goes_on, leaving.direction, camera_direction(sample_next)),
+        weight=dr.select(goes_on, state.weight * leaving.weight / survival, 1.0),
+        left=dr.select(goes_on, left / survival, 1.0),
+        place=dr.select(evenly, leaving.place, state.place),
+        cell=dr.select(evenly, onward_path.cell, state.cell),
+        # Smooth surfaces on the way leave it: asking for light weighs with the same density.
+        density=dr.select(leaving.smooth, state.density, leaving.density),
+        scattered=goes_on & (state.scattered | evenly),
+        way=dr.select(goes_on & ~evenly, onward_path.way, _STRAIGHT),
+        inside=goes_on & onward_path.inside,
+        active=state.active & (sample_next < draw.samples),
+    )
+
+
+def _shape(si: Interaction) -> UInt:
+    """Return the number of the shape that a path meets."""
+    return dr.reinterpret_array(mi.UInt32, si.shape)
+
+
+def _facet(surfaces: Surfaces, si: Interaction, shape: UInt, active: Mask) -> Int:
+    """Return the facet that a path has met, −1 where the surface is none."""
+    first = dr.gather(mi.Int32, surfaces.facet_of_shape, shape, active)
+    box = dr.gather(mi.Bool, surfaces.box_of_shape, shape, active)
+    return dr.select(active, dr.select(box, first + mi.Int32(si.prim_index >> 1), first), -1)
+
+
+def _power_heuristic(density: Float, other_density: Float) -> Float:
+    """Return the power heuristic's weight of the way whose density is `density`."""
+    ratio = other_density / dr.maximum(density, 1e-30)
+    return dr.select(density > 0.0, 1.0 / (1.0 + ratio * ratio), 0.0)

@@ -1,0 +1,233 @@
+"""A scene's numbers on the device: rays, lights, facets, the guide, fog."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.guide import Guide
+from nir_render.transport.indirect.kernel.types import Float, Int, Mask, MitsubaScene, Point, UInt, Vector
+from nir_render.transport.world.emitters import RECTANGLE, SPHERE, SUN, Emitters
+from nir_render.transport.world.facets import PANE, Facets
+from nir_render.transport.world.medium import Medium
+from nir_render.transport.world.pattern import Pattern
+from nir_render.transport.world.phase import CELLS
+
+_EDGELESS_M = 1e30  # stands for infinity, whose products with 0 are not numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Lights:
+    """Emitters on the device; see `transport.world.emitters.Emitters`. `has_*`: what a program must hold."""
+
+    count: UInt
+    rows: int
+    lights: UInt
+    group: UInt
+    kind: UInt
+    center: Float
+    radius: Float
+    spread: Float  # half the extent of a light: nearer than this fog does not aim at its middle
+    half_u: Float
+    half_v: Float
+    normal: Float
+    versine: Float
+    radiance: Float
+    facet: Int
+    image: Int
+    power: Float
+    pattern: Float  # values of all patterns, one after the other
+    pattern_first: Int  # where each light's begins, −1 for none
+    pattern_azimuths: UInt
+    pattern_axes: Float  # world from the source's own axes, 9 numbers for each light
+    pattern_polars: int
+    sun: int  # row of the sun, −1 for none
+    has_spheres: bool
+    has_rectangles: bool
+    has_images: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Facets on the device, and what each of Mitsuba's shapes is, by its number."""
+
+    center: Float
+    half_u: Float  # half extents over their squared length: their product with an offset is in [−1, 1] inside
+    half_v: Float
+    normal: Float
+    kind: UInt
+    index: Float
+    factor: Float
+    transmission: Float
+    two_sided: Mask
+    panes: UInt  # facets that are panes
+    pane_count: int
+    light_of_shape: Int  # the light whose body a shape is, −1 for none
+    facet_of_shape: Int  # first facet of a shape, −1 for none
+    box_of_shape: Mask  # whether its facets are the faces of a box
+    glass_of_shape: Mask  # whether it is a transparent solid
+    pane_of_shape: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The guide on the device."""
+
+    low: Point
+    cells_per_m: Vector
+    top: Point
+    stride_y: UInt
+    stride_z: UInt
+    cumulative: Float
+    chance: Float
+
+
+@dataclass(frozen=True, eq=False)
+class FogTable:
+    """Fog on the device."""
+
+    extinction: Float
+    albedo: Float
+    low: Point
+    high: Point
+    versine: Float
+    angle: Float
+    density: Float
+    cumulative: Float
+    arc: Float
+    halo: Float
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceScene:
+    """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes."""
+
+    bodies: MitsubaScene
+    opaque: MitsubaScene
+    lights: Lights
+    surfaces: Surfaces
+    choice: Choice
+    fog: FogTable | None
+
+
+def upload_lights(
+    emitters: Emitters, power: NDArray[np.float64], patterns: list[Pattern | None], axes: NDArray[np.float64]
+) -> Lights:
+    """Bring emitters to the device.
+
+    Parameters
+    ----------
+    power
+        What one unit of each group's emission counts in choices, shape (groups,).
+    patterns
+        The emission pattern of each light, None for the same in all directions.
+    axes
+        World from the source's own axes, shape (lights, 3, 3).
+    """
+    values, first, azimuths = [np.ones(1)], [], []
+    for pattern in patterns:
+        first.append(-1 if pattern is None else sum(map(len, values)))
+        azimuths.append(1 if pattern is None else pattern.values.shape[1])
+        if pattern is not None:
+            values.append(pattern.values.ravel())
+    polars = max([2, *(pattern.values.shape[0] for pattern in patterns if pattern is not None)])
+    suns = np.flatnonzero((emitters.kind == SUN) & (emitters.facet < 0))
+    half_m = np.linalg.norm(emitters.half_u_m + emitters.half_v_m, axis=1)
+    return Lights(
+        count=dr.opaque(mi.UInt32, len(emitters.kind)),
+        rows=len(emitters.kind),
+        lights=dr.opaque(mi.UInt32, emitters.lights),
+        group=_whole(emitters.group),
+        kind=_whole(emitters.kind),
+        center=_real(emitters.center_m),
+        radius=_real(emitters.radius_m),
+        spread=_real(np.maximum(emitters.radius_m, half_m)),
+        half_u=_real(emitters.half_u_m),
+        half_v=_real(emitters.half_v_m),
+        normal=_real(emitters.normal),
+        versine=_real(emitters.versine),
+        radiance=_real(emitters.radiance),
+        facet=mi.Int32(emitters.facet.astype(np.int32)),
+        image=mi.Int32(np.append(emitters.image.ravel(), -1).astype(np.int32)),
+        power=_real(power[emitters.group]),
+        pattern=_real(np.concatenate(values)),
+        pattern_first=mi.Int32(np.array(first, dtype=np.int32)),
+        pattern_azimuths=_whole(np.array(azimuths)),
+        pattern_axes=_real(axes),
+        pattern_polars=0 if all(pattern is None for pattern in patterns) else polars,
+        sun=int(suns[0]) if suns.size else -1,
+        has_spheres=bool((emitters.kind == SPHERE).any()),
+        has_rectangles=bool((emitters.kind == RECTANGLE).any()),
+        has_images=bool((emitters.facet >= 0).any()),
+    )
+
+
+def upload_surfaces(facets: Facets, shapes: dict[str, NDArray[np.int64]]) -> Surfaces:
+    """Bring facets to the device; `shapes` holds the columns `*_of_shape` that `groups` has gathered."""
+    panes = np.flatnonzero(facets.kind == PANE)
+
+    def over_square(half_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(half_m / (half_m**2).sum(axis=1, keepdims=True))
+
+    return Surfaces(
+        center=_real(facets.center_m),
+        half_u=_real(over_square(facets.half_u_m)),
+        half_v=_real(over_square(facets.half_v_m)),
+        normal=_real(facets.normal),
+        kind=_whole(facets.kind),
+        index=_real(facets.index),
+        factor=_real(facets.factor),
+        transmission=_real(facets.transmission),
+        two_sided=mi.Bool(np.append(facets.two_sided, False)),
+        panes=_whole(panes),
+        pane_count=len(panes),
+        light_of_shape=mi.Int32(shapes["light"].astype(np.int32)),
+        facet_of_shape=mi.Int32(shapes["facet"].astype(np.int32)),
+        box_of_shape=mi.Bool(shapes["box"].astype(bool)),
+        glass_of_shape=mi.Bool(shapes["glass"].astype(bool)),
+        pane_of_shape=mi.Bool(shapes["pane"].astype(bool)),
+    )
+
+
+def upload_guide(guide: Guide) -> Choice:
+    """Bring the guide to the device."""
+    x, y, _ = (int(count) for count in guide.counts)
+    return Choice(
+        low=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in guide.low_m)),
+        cells_per_m=mi.Vector3f(*(dr.opaque(mi.Float, float(1.0 / value)) for value in guide.step_m)),
+        top=mi.Point3f(*(dr.opaque(mi.Float, float(count) - 0.5) for count in guide.counts)),
+        stride_y=dr.opaque(mi.UInt32, x),
+        stride_z=dr.opaque(mi.UInt32, x * y),
+        cumulative=mi.Float(guide.cumulative.ravel()),
+        chance=mi.Float(guide.chance.ravel()),
+    )
+
+
+def upload_fog(medium: Medium) -> FogTable:
+    """Bring fog to the device."""
+    low, high = (np.clip(bound, -_EDGELESS_M, _EDGELESS_M) for bound in (medium.low_m, medium.high_m))
+    assert len(medium.phase.arc) == CELLS + 1  # the lookups count on it
+    return FogTable(
+        extinction=dr.opaque(mi.Float, medium.extinction_per_m),
+        albedo=dr.opaque(mi.Float, medium.albedo),
+        low=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in low)),
+        high=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in high)),
+        versine=_real(medium.phase.versine),
+        angle=_real(medium.phase.angle_rad),
+        density=_real(medium.phase.density_per_sr),
+        cumulative=_real(medium.phase.cumulative),
+        arc=_real(medium.phase.arc),
+        halo=_real(medium.phase.halo),
+    )
+
+
+def _real(values: NDArray[np.float64]) -> Float:
+    """Return an array on the device, never empty, which could not be read from."""
+    flat = np.asarray(values, dtype=np.float32).ravel()
+    return mi.Float(flat if flat.size else np.zeros(4, dtype=np.float32))
+
+
+def _whole(values: NDArray[np.int64]) -> UInt:
+    flat = np.asarray(values, dtype=np.uint32).ravel()
+    return mi.UInt32(flat if flat.size else np.zeros(4, dtype=np.uint32))

@@ -1,0 +1,42 @@
+"""What a program for Dr.Jit handles: arrays of one value for each lane, and the state of a lane's path.
+
+The types of these arrays depend on Mitsuba's variant, and no checker knows them: all are `Any`. Their names
+say what a function takes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+Float = Any
+UInt = Any
+Int = Any
+Mask = Any
+Vector = Any  # a unit direction, or an offset in metres; tables hold their vectors as flat Float
+Point = Any  # in metres
+Interaction = Any  # where rays meet surfaces: mi.SurfaceInteraction3f
+MitsubaScene = Any
+
+Random = Callable[[Any], Float]  # a number in [0, 1) for a path's vertex, by what it is for (see `draws`)
+AddLight = Callable[[Float, UInt, Mask], None]  # adds radiance per unit of a light's emission to the result
+
+
+@dataclass
+class PathState:
+    """Where a lane stands."""
+
+    sample: UInt
+    depth: UInt
+    origin: Point
+    direction: Vector
+    weight: Float
+    left: Float  # what surfaces and fog have left of a path's light
+    place: Point  # the last vertex that scatters evenly
+    cell: UInt
+    density: (
+        Float  # with which its direction was drawn; 0 after fog, where lights have been asked for already
+    )
+    scattered: Mask  # whether there is such a vertex
+    way: Int
+    inside: Mask  # a transparent solid
+    active: Mask

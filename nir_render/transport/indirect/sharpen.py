@@ -1,0 +1,117 @@
+"""Sharp edges for indirect light that was rendered in blocks of pixels."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.light.enlarge import Enlargement, without_edges
+from nir_render.light.light import Edges, Indirect
+from nir_render.scene.snapshot import Snapshot
+from nir_render.transport.indirect import groups
+from nir_render.transport.indirect.enlargement import fit_enlargement
+from nir_render.transport.indirect.kernel.tables import DeviceScene
+from nir_render.transport.indirect.labels import labels_of
+
+FLARE_PILOT_SAMPLES = 256
+
+
+def enlargement_of(built: DeviceScene, rays: groups.Rays, scale: int) -> Enlargement:
+    """Return how light in blocks of scale × scale pixels is enlarged; of scale 1 nothing is."""
+    if scale == 1:
+        return without_edges(*(count - 1 for count in rays.corners.shape[:2]))
+    return fit_enlargement(labels_of(built, rays.origin_m, rays.corners), scale)
+
+
+def sharpened(
+    snapshot: Snapshot,
+    built: DeviceScene,
+    rays: groups.Rays,
+    seed: int,
+    light: Indirect,
+    enlargement: Enlargement,
+) -> Indirect:
+    """Return a light with what its enlargement needs: weights beside edges, and pixels rendered one by one.
+
+    These have as many samples as the block that they lie in. Of scale 1 nothing is enlarged.
+
+    Parameters
+    ----------
+    built, rays, seed
+        Those with which the light was rendered, as for `groups.render_pixels`.
+    """
+    if light.scale == 1:
+        return light
+    blocks = light.radiance_per_w.shape[2:]
+    pixels = enlargement.patch.astype(np.int64)
+    row, column = (at // light.scale for at in np.divmod(pixels, enlargement.columns))
+    counts = np.broadcast_to(light.samples if light.counts is None else light.counts, blocks)[row, column]
+    key = groups.light_seed(seed, "edges")
+    radiance, variance = groups.render_pixels(snapshot, built, rays, key, pixels, counts, 1)
+    return replace(light, edges=Edges(enlargement, radiance[:, None], variance[:, None]))
+
+
+def flare_pilot(
+    snapshot: Snapshot,
+    built: DeviceScene,
+    rays: groups.Rays,
+    seed: int,
+    blocks: NDArray[np.int64],
+    enlargement: Enlargement,
+) -> Indirect:
+    """Return a pilot in chosen blocks, as an image of one row, and in each pixel of the patch.
+
+    Parameters
+    ----------
+    built, rays, seed
+        As for `groups.render_pixels`.
+    blocks
+        Numbers of the film's pixels, row by row, shape (n,).
+    """
+    scale, samples = snapshot.render.indirect.scale, FLARE_PILOT_SAMPLES
+    patch = enlargement.patch.astype(np.int64)
+    parts = [
+        groups.render_pixels(
+            snapshot, built, rays, groups.light_seed(seed, name), pixels, np.full(pixels.size, samples), size
+        )
+        for name, pixels, size in (("blocks", blocks, scale), ("edges", patch, 1))
+    ]
+    (radiance, variance), (alone, variance_alone) = parts
+    edges = Edges(enlargement, alone[:, None], variance_alone[:, None])
+    return Indirect(radiance[:, None, None], variance[:, None, None], scale, samples, edges=edges)
+
+
+def rendered_again(
+    snapshot: Snapshot,
+    rays: groups.Rays,
+    seed: int,
+    power: NDArray[np.float64],
+    pixels: dict[int, NDArray[np.int64]],
+    samples: int,
+) -> list[dict[int, NDArray[np.float32]]]:
+    """Return the indirect light of some pixels of films, twice, independent of each other and of the light.
+
+    Parameters
+    ----------
+    rays, seed, power
+        As for `groups.indirect`.
+    pixels
+        Their numbers, row by row, by the scale of the film.
+    samples
+        In each pixel, a power of two.
+
+    Returns
+    -------
+    By scale, radiance per unit of each group, shape (groups, nodes, pixels).
+    """
+    built = groups.world_on_device(snapshot, power)
+    renders: list[dict[int, NDArray[np.float32]]] = []
+    for number in range(2):
+        radiance = {}
+        for scale, some in pixels.items():
+            key = groups.light_seed(seed, "again", number, scale)
+            counts = np.full(some.size, samples)
+            mean, _ = groups.render_pixels(snapshot, built, rays, key, some, counts, scale)
+            radiance[scale] = mean[:, None]
+        renders.append(radiance)
+    return renders

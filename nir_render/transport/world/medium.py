@@ -1,0 +1,36 @@
+"""Fog as numbers: one homogeneous medium in a box, whose faces may be infinitely far."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.scene.documents.fog import HenyeyGreenstein
+from nir_render.scene.snapshot import Snapshot
+from nir_render.transport.world.phase import PhaseTable, henyey_greenstein, phase_table, tabulated
+
+
+@dataclass(frozen=True, eq=False)
+class Medium:
+    """A fog: extinction, share of it that is scattering, the box it fills, and its phase function."""
+
+    extinction_per_m: float
+    albedo: float
+    low_m: NDArray[np.float64]
+    high_m: NDArray[np.float64]
+    phase: PhaseTable
+
+
+def medium(snapshot: Snapshot) -> Medium | None:
+    """Return the fog of a scene, None where the air is clear."""
+    fog = snapshot.fog
+    if fog is None or fog.extinction_per_m == 0.0:
+        return None
+    low_m, high_m = fog.region_m()
+    phase = fog.phase
+    if isinstance(phase, HenyeyGreenstein):
+        function = henyey_greenstein(phase.g)
+    else:
+        angle_rad, value = np.array(phase.points).T
+        function = tabulated(angle_rad, value)
+    return Medium(fog.extinction_per_m, fog.albedo, low_m, high_m, phase_table(function))

@@ -1,0 +1,231 @@
+"""A scene's bodies at one time as a Mitsuba scene."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.errors import InputError
+from nir_render.geometry import perpendiculars, rectangle_frame
+from nir_render.scene.documents.emitters import Sun
+from nir_render.scene.documents.materials import (
+    Dielectric,
+    Diffuse,
+    MaterialDocument,
+    Mirror,
+    Pane,
+    Plastic,
+    RoughConductor,
+)
+from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.pose import rotation_of
+from nir_render.scene.snapshot import Snapshot
+from nir_render.scene.text.units import LENGTH, format_vector
+from nir_render.transport.backend.variant import mi
+
+SUN_RADIUS_RAD = Sun.angular_radius_rad
+
+
+def sun_direction(sun: Sun) -> NDArray[np.float64]:
+    """Return the unit vector towards the sun's centre in the world, shape (3,)."""
+    return np.array(sun.direction)
+
+
+def extent_m(snapshot: Snapshot) -> float:
+    """Return the diagonal of the box that holds all bodies."""
+    box = build(snapshot).bbox()
+    return float(np.linalg.norm(np.array(box.max).ravel() - np.array(box.min).ravel()))
+
+
+def has_smooth_surface(snapshot: Snapshot) -> bool:
+    """Tell whether any body shows sharp images: a mirror, glass, a pane, a smooth clear coat."""
+    materials = [snapshot.materials[shape.material] for shape in snapshot.shapes.values()]
+    return any(
+        isinstance(material, Mirror | Dielectric | Pane)
+        or (isinstance(material, Plastic) and material.roughness == 0.0)
+        for material in materials
+    )
+
+
+def build(
+    snapshot: Snapshot,
+    emitting: str | None = None,
+    as_point: bool = False,
+    panes: bool = True,
+) -> Any:
+    """Return the Mitsuba scene of all bodies at one time, lamps and the spheres of the sources included.
+
+    The light group `emitting`, a source or lamp, sends one watt, evenly; nothing else shines. Sources and
+    lamps absorb what falls on them. With `as_point` the emitting source is a point without a body. Without
+    `panes` these are left out: light passes them straight.
+    """
+    bodies = described(snapshot, () if emitting is None else (emitting,), as_point, panes)
+    # optimize=False: merging equal spectra would tie sources together that must be changed apart.
+    try:
+        return mi.load_dict(bodies, optimize=False)
+    except RuntimeError as error:
+        raise InputError(
+            f"{snapshot.origin}: Mitsuba refuses the scene: {' '.join(str(error).split())}"
+        ) from None
+
+
+def described(
+    snapshot: Snapshot, emitting: Collection[str] = (), as_point: bool = False, panes: bool = True
+) -> dict[str, Any]:
+    """Return what `build` loads, as Mitsuba's dictionary; any number of groups may be `emitting`."""
+    bodies: dict[str, Any] = {"type": "scene"}
+    for name, shape in snapshot.shapes.items():
+        material = snapshot.materials[shape.material]
+        if isinstance(material, Pane) and not panes:
+            continue
+        bsdf = _bsdf(material)
+        for part, body in enumerate(_bodies(shape)):
+            bodies[f"shape_{name}_{part}"] = {**body, "bsdf": bsdf}
+    for index, (name, placed) in enumerate(snapshot.sources.items()):
+        centre_m, radius_m = placed.pose.position_m, placed.source.radius_m
+        if name in emitting and as_point:
+            intensity = _uniform(1.0 / (4.0 * np.pi))  # one watt in all directions
+            bodies["point"] = {"type": "point", "position": centre_m.tolist(), "intensity": intensity}
+            continue
+        sphere = {"type": "sphere", "center": centre_m.tolist(), "radius": radius_m, "bsdf": _BLACK}
+        # One watt from the whole sphere: L = 1 / (4π² r²).
+        shine = {"emitter": _area_light(1.0 / (4.0 * np.pi**2 * radius_m**2))} if name in emitting else {}
+        bodies[f"source_{index}"] = {**sphere, **shine}
+    for name, lamp in snapshot.lamps.items():
+        panel = Rectangle(
+            type="rectangle", material="", center=format_vector(lamp.center_m, LENGTH),
+            size=format_vector(lamp.size_m, LENGTH), normal=lamp.normal,
+        )  # fmt: skip
+        # One watt from one side: L = 1 / (π A).
+        area_m2 = lamp.size_m[0] * lamp.size_m[1]
+        shine = {"emitter": _area_light(1.0 / (np.pi * area_m2))} if f"lamps.{name}" in emitting else {}
+        bodies[f"lamp_{name}"] = {**_bodies(panel)[0], "bsdf": _BLACK, **shine}
+    return bodies
+
+
+def source_spheres(bodies: Any) -> list[Any]:
+    """Return the spheres of the sources of a built scene, in the order of the scene's light groups."""
+    spheres = {shape.id(): shape for shape in bodies.shapes() if shape.id().startswith("source_")}
+    return [spheres[f"source_{index}"] for index in range(len(spheres))]
+
+
+def check_meshes(snapshot: Snapshot, point_m: NDArray[np.float64], what: str) -> None:
+    """Raise InputError where a point is inside a closed mesh: a ray leaves it an odd number of times."""
+    for name, shape in snapshot.shapes.items():
+        if isinstance(shape, Mesh) and _crossings(shape, point_m) % 2 == 1:
+            raise InputError(f"{snapshot.origin}: {what} is inside shapes.{name}; move one of them")
+
+
+def _crossings(shape: Mesh, point_m: NDArray[np.float64]) -> int:
+    try:
+        body = mi.load_dict({"type": "scene", "mesh": _bodies(shape)[0]})
+    except RuntimeError as error:
+        raise InputError(f"{shape.file}: cannot be read as a mesh: {' '.join(str(error).split())}") from None
+    direction = mi.Vector3f(
+        0.2672612, 0.5345225, 0.8017837
+    )  # a direction that axis-aligned edges do not share
+    origin = mi.Point3f(*point_m.tolist())
+    for count in range(1000):
+        hit = body.ray_intersect(mi.Ray3f(origin, direction))
+        if not np.all(np.array(hit.is_valid())):
+            return count
+        origin = hit.p + 1e-5 * direction
+    return 0
+
+
+def _bodies(shape: ShapeDocument) -> list[dict[str, Any]]:
+    match shape:
+        case Rectangle():
+            frame = rectangle_frame(shape.normal, shape.size_m, shape.rotation_rad)
+            return [{"type": "rectangle", "to_world": _matrix(frame, shape.center_m)}]
+        case Box():
+            rotation = rotation_of(shape.orientation)
+            return [
+                {
+                    "type": "cube",
+                    "to_world": _matrix(rotation * (0.5 * np.array(shape.size_m)), shape.center_m),
+                }
+            ]
+        case Sphere():
+            return [{"type": "sphere", "center": list(shape.center_m), "radius": shape.radius_m}]
+        case Cylinder():
+            return _closed_cylinder(shape)
+        case Mesh():
+            kind = shape.file.rsplit(".", 1)[1].lower()
+            placed = _matrix(rotation_of(shape.orientation) * shape.scale, shape.position_m)
+            return [{"type": kind, "filename": shape.file, "to_world": placed}]
+
+
+def _uniform(value: float) -> dict[str, Any]:
+    """Return a spectrum of one value; Mitsuba's other spectra are zero or undefined at 940 nm."""
+    return {"type": "uniform", "value": float(value)}
+
+
+_BLACK = {"type": "diffuse", "reflectance": _uniform(0.0)}
+
+
+def _area_light(radiance: float) -> dict[str, Any]:
+    return {"type": "area", "radiance": _uniform(radiance)}
+
+
+def _bsdf(material: MaterialDocument) -> dict[str, Any]:
+    match material:
+        case Diffuse():
+            surface: dict[str, Any] = {"type": "diffuse", "reflectance": _uniform(material.reflectance)}
+        case RoughConductor():
+            surface = {
+                "type": "roughconductor",
+                "distribution": "ggx",
+                "alpha": material.roughness,
+                "eta": _uniform(material.index),
+                "k": _uniform(material.extinction_index),
+            }
+        case Mirror():
+            surface = {
+                "type": "conductor",
+                "material": "none",
+                "specular_reflectance": _uniform(material.reflectance),
+            }
+        case Plastic():
+            rough = {"type": "roughplastic", "distribution": "ggx", "alpha": material.roughness}
+            surface = {
+                **(rough if material.roughness > 0.0 else {"type": "plastic"}),
+                "int_ior": material.index,
+                "ext_ior": 1.0,
+                "diffuse_reflectance": _uniform(material.reflectance),
+            }
+        case Dielectric():
+            return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
+        case Pane():
+            return {
+                "type": "thindielectric",
+                "int_ior": material.index,
+                "ext_ior": 1.0,
+                "specular_transmittance": _uniform(material.transmission),
+            }
+    return {"type": "twosided", "nested": surface}
+
+
+def _closed_cylinder(shape: Cylinder) -> list[dict[str, Any]]:
+    start, end = np.array(shape.start_m), np.array(shape.end_m)
+    axis = (end - start) / np.linalg.norm(end - start)
+    x_axis, y_axis = perpendiculars(axis)
+    radius = shape.radius_m
+    caps = [
+        {
+            "type": "disk",
+            "to_world": _matrix(
+                np.stack([radius * x_axis, sign * radius * y_axis, sign * axis], axis=1), centre
+            ),
+        }
+        for centre, sign in ((start, -1.0), (end, 1.0))
+    ]
+    return [{"type": "cylinder", "p0": start.tolist(), "p1": end.tolist(), "radius": radius}, *caps]
+
+
+def _matrix(linear: NDArray[np.float64], position_m: Any) -> Any:
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    matrix[:3, 3] = position_m
+    return mi.ScalarTransform4f(matrix)

@@ -1,0 +1,1 @@
+"""What is true in a frame, as records: written while rendering, read by whoever scores."""

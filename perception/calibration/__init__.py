@@ -1,0 +1,1 @@
+"""From frames at known ranges to constants."""

@@ -1,0 +1,260 @@
+"""Calibration on a rail: the range constants from frames of one source at known ranges, judged on others.
+
+Every other range is fitted; the ranges between them are held out and judge what was fitted.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.calibration.range_constant import (
+    RangeConstantFit,
+    regress_range_constant,
+)
+from perception.calibration.result import CONVERGED_CHANGE, HeldOut, RailCalibration
+from perception.estimators import detect
+from perception.files.fields import RecordingError
+from perception.model.fisher import flare_limit
+from perception.model.ranging import effective_exposure_s
+from perception.model.sensor import at_gain
+from perception.paper import PaperRegression, regress_paper_range_constant
+from perception.types import Calibration, Detection, RawFrame
+
+LEAST_PLACES = 6
+"""Three ranges to fit (a line, and one to contradict it), three to judge."""
+
+MAX_PASSES = 8
+
+_SAME_PLACE_M = 1e-6
+
+Progress = Callable[[int, int], None]
+"""Called with the number of frames done, and of all; begins anew with each pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighting:
+    """A frame of the rail without its pixels, and what an estimator took for the source."""
+
+    range_m: float
+    exposure_s: float
+    gain: float
+    black_level_dn: float
+    detection: Detection | None
+
+
+@dataclass(frozen=True, eq=False)
+class _ConvergedFit:
+    """The last fit, how far it moved K, the number of passes, and what the last one saw."""
+
+    fit: RangeConstantFit
+    change: float
+    passes: int
+    sightings: tuple[_Sighting, ...]
+
+
+FindIn = Callable[[Sequence[int], Calibration, str], list[_Sighting]]
+"""Lets an estimator look, with a calibration, at the frames of some indices."""
+
+
+def calibrate_rail(
+    ranges_m: Mapping[int, float],
+    load: Callable[[int], RawFrame],
+    calibration: Calibration,
+    progress: Progress = lambda _done, _total: None,
+) -> RailCalibration:
+    """Fit the range constants of one camera, and judge them on ranges held out.
+
+    Places are the different ranges. In order of range, the first, third, … are fitted, the others held out.
+    The brightest detection of a frame is the source.
+
+    The detector needs a K to know how large a source looks: K too large by 1 % makes the flux 0.1 % too
+    small. So the frames are looked at again with the K just found, until that changes by less than 0.03 %;
+    what is left in K is a tenth of that. A claimed σ holds for a given K, so that of the fitted K comes out
+    up to a tenth too large.
+
+    Parameters
+    ----------
+    ranges_m
+        Known range of each frame, by its index.
+    load
+        Gives the frame of an index.
+    calibration
+        Of the camera. Its range constant is only a first guess.
+    progress
+        Told how far each pass is.
+
+    Returns
+    -------
+    RailCalibration
+
+    Raises
+    ------
+    RecordingError
+        If there are fewer than 6 different ranges, or the source is found at fewer than two of them.
+    """
+    fitted, held_out = _split_places(ranges_m, calibration.camera)
+    # One number for each place: the regression pools what stands at the same range.
+    place_m = {index: ranges_m[place[0]] for place in (*fitted, *held_out) for index in place}
+
+    def find(indices: Sequence[int], known: Calibration, estimator: str) -> list[_Sighting]:
+        sightings = []
+        for done, index in enumerate(indices):
+            sightings.append(_brightest_in(load(index), place_m[index], known, estimator))
+            progress(done + 1, len(indices))
+        return sightings
+
+    to_fit = [index for place in fitted for index in place]
+    to_judge = [index for place in held_out for index in place]
+    converged = _iterate_fit(find, to_fit, calibration)
+    paper = _fit_paper(find(to_fit, calibration, "paper"))
+    known = _with_constants(calibration, converged.fit, paper)
+    robust = find(to_judge, known, "robust")
+    # Without a claim (a clipped flare that cannot be recovered) the range is an upper bound, no estimate.
+    claimed = [s for s in robust if s.detection and math.isfinite(s.detection.range_sigma_m)]
+    return RailCalibration(
+        calibration=known,
+        fit=converged.fit,
+        paper=paper,
+        places_fitted=len(fitted),
+        places_held_out=len(held_out),
+        frames_fitted=len(to_fit),
+        frames_held_out=len(to_judge),
+        misfits=sum(s.detection.merged for s in (*converged.sightings, *robust) if s.detection),
+        passes=converged.passes,
+        last_change=converged.change,
+        range_limit_m=_mean([_range_limit_m(s, s.detection, known) for s in robust if s.detection]),
+        robust=_held_out_errors(claimed),
+        paper_held_out=_held_out_errors(find(to_judge, known, "paper")),
+    )
+
+
+def _split_places(ranges_m: Mapping[int, float], camera: str) -> tuple[list[list[int]], list[list[int]]]:
+    """Return the frames of the places to fit, and those of the places to judge on."""
+    places: list[list[int]] = []
+    for index in sorted(ranges_m, key=lambda index: ranges_m[index]):
+        if places and ranges_m[index] - ranges_m[places[-1][0]] < _SAME_PLACE_M:
+            places[-1].append(index)
+        else:
+            places.append([index])
+    if len(places) < LEAST_PLACES:
+        raise RecordingError(
+            f"{camera}: {len(places)} different ranges are known. Record at least {LEAST_PLACES}: "
+            "one half is fitted, the other judges it."
+        )
+    return places[0::2], places[1::2]
+
+
+def _brightest_in(frame: RawFrame, range_m: float, calibration: Calibration, estimator: str) -> _Sighting:
+    found = detect(frame, calibration, estimator)
+    brightest = max(found, key=lambda detection: detection.flux_dn, default=None)
+    return _Sighting(range_m, frame.exposure_s, frame.gain, frame.black_level_dn, brightest)
+
+
+def _iterate_fit(find: FindIn, indices: Sequence[int], calibration: Calibration) -> _ConvergedFit:
+    """Look and fit until the range constant does not change any more, or all passes are used up."""
+    # The constant that is sought has no sigma yet, so a detection claims that of its flux alone.
+    known = replace(calibration, sigma=_without_constants(calibration.sigma))
+    for passes in range(1, MAX_PASSES + 1):
+        sightings = find(indices, known, "robust")
+        fit = _fit_range_constant(sightings, known)
+        change = fit.range_constant_dn_m2_per_s / known.range_constant_dn_m2_per_s - 1.0
+        converged = _ConvergedFit(fit, change, passes, tuple(sightings))
+        if abs(change) < CONVERGED_CHANGE:
+            break
+        known = replace(known, range_constant_dn_m2_per_s=fit.range_constant_dn_m2_per_s)
+    return converged
+
+
+def _fit_range_constant(sightings: Sequence[_Sighting], calibration: Calibration) -> RangeConstantFit:
+    """Regress the flux over its effective exposure.
+
+    Flares that do not look like one source count too, with the wider sigmas that they claim: until K is near,
+    that holds for all of them.
+    """
+    m, sigma, ranges_m = [], [], []
+    for sighting in sightings:
+        found = sighting.detection
+        if found is None or not math.isfinite(found.range_sigma_m):
+            continue
+        effective_s = effective_exposure_s(
+            found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration
+        )
+        m.append(found.flux_dn / effective_s)
+        sigma.append(m[-1] * 2.0 * found.range_sigma_m / found.range_m)  # σ_d / d = ½ σ_F / F
+        ranges_m.append(sighting.range_m)
+    try:
+        return regress_range_constant(m, sigma, ranges_m)
+    except ValueError as error:
+        raise RecordingError(
+            f"{calibration.camera}: the source was measured in {len(m)} of {len(sightings)} frames to "
+            f"fit, and {error}. Look at the frames: is one source in view, alone, not clipped? Is the first "
+            "guess of range_constant_dn_m2_per_s within a factor of 2?"
+        ) from error
+
+
+def _fit_paper(sightings: Sequence[_Sighting]) -> PaperRegression | None:
+    found = [
+        (s.detection.mean_dn, s.detection.background_dn, s.exposure_s, s.range_m)
+        for s in sightings
+        if s.detection is not None and math.isfinite(s.detection.background_dn)
+    ]
+    if len({range_m for *_, range_m in found}) < 2:
+        return None
+    return regress_paper_range_constant(*zip(*found, strict=True))
+
+
+def _without_constants(sigma: Mapping[str, float]) -> dict[str, float]:
+    return {name: value for name, value in sigma.items() if not name.startswith("range_constant")}
+
+
+def _with_constants(
+    calibration: Calibration, fit: RangeConstantFit, paper: PaperRegression | None
+) -> Calibration:
+    sigma = _without_constants(calibration.sigma)
+    sigma["range_constant_dn_m2_per_s"] = fit.range_constant_sigma_dn_m2_per_s
+    fitted = replace(calibration, range_constant_dn_m2_per_s=fit.range_constant_dn_m2_per_s, sigma=sigma)
+    if paper is None:
+        return fitted
+    if math.isfinite(paper.slope_sigma_dn_m2_per_s):
+        sigma["range_constant_paper_dn_m2_per_s"] = paper.slope_sigma_dn_m2_per_s
+    return replace(fitted, range_constant_paper_dn_m2_per_s=paper.slope_dn_m2_per_s)
+
+
+def _held_out_errors(sightings: Sequence[_Sighting]) -> HeldOut:
+    rows = [(s.detection.range_m, s.detection.range_sigma_m, s.range_m) for s in sightings if s.detection]
+    range_m, sigma_m, true_m = np.array([row for row in rows if math.isfinite(row[0])]).reshape(-1, 3).T
+    errors_m = range_m - true_m
+    return HeldOut(
+        found=errors_m.size,
+        range_mae_m=_mean(np.abs(errors_m)),
+        range_rmse_m=math.sqrt(_mean(errors_m**2)),
+        range_bias_m=_mean(errors_m),
+        reduced_chi2=_mean((errors_m / sigma_m) ** 2),
+    )
+
+
+def _range_limit_m(sighting: _Sighting, found: Detection, calibration: Calibration) -> float:
+    """Return the Cramér–Rao σ of the range, from the known range and the background found."""
+    # `flare_limit` knows no gain: a frame at another gain is one of a camera that has it for good.
+    same_camera = at_gain(calibration, sighting.gain)
+    effective_s = effective_exposure_s(
+        found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration
+    )
+    flux_dn = calibration.range_constant_dn_m2_per_s * effective_s / sighting.range_m**2
+    background_dn = max(found.background_dn - sighting.black_level_dn, 0.0)
+    limit = flare_limit(
+        same_camera,
+        found.u_px,
+        found.v_px,
+        sighting.range_m,
+        flux_dn / same_camera.system_gain_dn_per_e,
+        background_dn / same_camera.system_gain_dn_per_e,
+    )
+    return limit.range_sigma_m
+
+
+def _mean(values: Sequence[float] | NDArray[np.float64]) -> float:
+    return float(np.mean(values)) if np.size(values) else math.nan

@@ -1,0 +1,262 @@
+"""The one call from a frame to its flares, by an estimator that the caller names or brings.
+
+One's own is a function in a Python file, `file.py:function`. Whatever goes wrong in code that somebody is
+still writing becomes one line that says where.
+"""
+
+import dataclasses
+import importlib.util
+import math
+import operator
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from perception.paper import detect_paper
+from perception.robust.detect import detect_robust
+from perception.types import Calibration, Detection, RawFrame
+
+Estimator = Callable[[RawFrame, Calibration], Iterable[Detection]]
+"""Anything that turns a frame and its calibration into detections."""
+
+ESTIMATORS: dict[str, Estimator] = {"paper": detect_paper, "robust": detect_robust}
+
+
+def detect(
+    frame: RawFrame, calibration: Calibration, estimator: str | Estimator = "robust"
+) -> list[Detection]:
+    """Find the flares of one frame.
+
+    Parameters
+    ----------
+    frame
+        A raw frame.
+    calibration
+        Its camera's calibration.
+    estimator
+        "paper" (the paper's method to the letter), "robust", or a function of frame and calibration.
+
+    Returns
+    -------
+    The detections, in the order in which the estimator gives them.
+
+    Raises
+    ------
+    ValueError
+        If the estimator's name is not known, or frame and calibration do not belong together.
+
+    Examples
+    --------
+    A camera of 64 × 48 pixels that looks forward, and a frame with a flare of 7000 counts at (41, 23):
+
+    >>> import numpy as np
+    >>> calibration = Calibration(
+    ...     camera="r1.front", width_px=64, height_px=48, fx_px=60.0, fy_px=60.0, cx_px=31.5, cy_px=23.5,
+    ...     rotation_body_camera=np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    ...     position_body_m=np.zeros(3), system_gain_dn_per_e=0.5, read_noise_e=4.0, black_level_dn=64.0,
+    ...     saturation_dn=4095, bit_depth=12, psf_sigma_px=0.8, source_radius_m=0.01, wavelength_m=940e-9,
+    ...     response_angle_rad=np.array([0.0, 1.0]), response_relative=np.array([1.0, 0.9]),
+    ...     range_constant_dn_m2_per_s=1e8, range_constant_paper_dn_m2_per_s=7e6)
+    >>> share = np.array([0.03, 0.236, 0.468, 0.236, 0.03])
+    >>> counts = np.full((48, 64), 66, dtype=np.uint16)
+    >>> counts[21:26, 39:44] += np.rint(7000.0 * np.outer(share, share)).astype(np.uint16)
+    >>> frame = RawFrame("r1.front", 0, time_s=0.0, exposure_s=1e-3, data_dn=counts, black_level_dn=64.0)
+    >>> (hit,) = detect(frame, calibration)
+    >>> f"({hit.u_px:.1f}, {hit.v_px:.1f}) px, {hit.range_m:.2f} ± {hit.range_sigma_m:.2f} m"
+    '(41.0, 23.0) px, 3.72 ± 0.02 m'
+    >>> (hit,) = detect(frame, calibration, "paper")
+    >>> f"({hit.u_px:.1f}, {hit.v_px:.1f}) px, {hit.range_m:.2f} m"
+    '(41.0, 23.0) px, 3.72 m'
+    """
+    if isinstance(estimator, str):
+        if estimator not in ESTIMATORS:
+            raise ValueError(
+                f"unknown estimator {estimator!r}: known are {', '.join(ESTIMATORS)}, or pass a function"
+            )
+        estimator = ESTIMATORS[estimator]
+    return list(estimator(frame, calibration))
+
+
+class EstimatorError(ValueError):
+    """An estimator cannot be loaded, or failed on a frame; the text is one line."""
+
+
+@dataclass(frozen=True)
+class OwnEstimator:
+    """An estimator of the user's own; calling it checks what comes back.
+
+    `name` is the function's, and names the file of its detections; `reference` is what the user wrote,
+    for error texts; `path` is the file that holds it.
+    """
+
+    name: str
+    reference: str
+    path: Path
+    function: Callable[[RawFrame, Calibration], Iterable[Detection]]
+
+    def __call__(self, frame: RawFrame, calibration: Calibration) -> list[Detection]:
+        """Find the flares of one frame.
+
+        The function gets counts of its own, which it may change. NumPy numbers in its detections become
+        plain ones.
+
+        Raises
+        ------
+        EstimatorError
+            If the function raises, or returns anything but detections of this frame.
+        """
+        where = f"{self.reference}: frame {frame.index} of {frame.camera}"
+        copied = dataclasses.replace(frame, data_dn=frame.data_dn.copy())
+        try:
+            # A generator raises only while it is being read.
+            found = self.function(copied, calibration)
+            listed = list(found) if isinstance(found, Iterable) else None
+        except Exception as error:
+            raise EstimatorError(f"{where}: {_error_line(error, self.path)}") from error
+        if listed is None:
+            raise EstimatorError(f"{where}: returned {_kind(found)}; wanted a list of detections")
+        return [_checked_detection(detection, frame, where) for detection in listed]
+
+
+def load_estimator(reference: str) -> OwnEstimator:
+    """Load the function that `file.py:function` names.
+
+    The file may import modules that lie beside it.
+
+    Parameters
+    ----------
+    reference
+        Path of a Python file, a colon, and the name of a function in it that takes a frame and its
+        calibration and returns detections.
+
+    Returns
+    -------
+    OwnEstimator
+
+    Raises
+    ------
+    EstimatorError
+        If there is no such file or function, it cannot be called, the file raises while it is imported,
+        or the function's name cannot name a file of detections.
+    """
+    file, _, name = reference.rpartition(":")
+    if not (file and name.isidentifier()):
+        raise EstimatorError(f"{reference}: wanted file.py:function, such as my_estimator.py:brightest_blob")
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise EstimatorError(f"{reference}: the name may hold letters a to z, digits and _; rename it")
+    if name.lower() in ESTIMATORS:
+        raise EstimatorError(f"{reference}: {name.lower()!r} is an estimator that is built in; rename yours")
+    path = Path(file)
+    if not path.is_file():
+        raise EstimatorError(f"{reference}: there is no file {file!r}")
+    contents = _import_file(path, reference)
+    if name not in contents:
+        raise EstimatorError(f"{reference}: there is no {name!r} in the file{_functions_listed(contents)}")
+    function = contents[name]
+    if not callable(function):
+        raise EstimatorError(f"{reference}: {name!r} is {_kind(function)}, which cannot be called")
+    return OwnEstimator(name, reference, path, function)
+
+
+def _import_file(path: Path, reference: str) -> dict[str, Any]:
+    """Import a file and return what it defines."""
+    # A name that no other module has: a file may be called numpy.py.
+    module_name = f"own_estimator_{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise EstimatorError(f"{reference}: {path.name!r} is no Python file; its name must end in .py")
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses with annotations look their module up while it is being imported.
+    sys.modules[module_name] = module
+    try:
+        with _importing_from(path.parent):
+            spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise EstimatorError(f"{reference}: importing it failed: {_error_line(error, path)}") from error
+    finally:
+        del sys.modules[module_name]
+    return vars(module)
+
+
+@contextmanager
+def _importing_from(folder: Path) -> Iterator[None]:
+    """Let modules that lie in a folder be imported; installed ones come first."""
+    entry = str(folder.resolve())
+    sys.path.append(entry)
+    try:
+        yield
+    finally:
+        sys.path.remove(entry)
+
+
+def _checked_detection(detection: object, frame: RawFrame, where: str) -> Detection:
+    """Return a detection with plain numbers, or say what about it is wrong."""
+    if not isinstance(detection, Detection):
+        raise EstimatorError(f"{where}: returned {_kind(detection)} among its detections; wanted a Detection")
+    if (detection.camera, detection.index) != (frame.camera, frame.index):
+        raise EstimatorError(
+            f"{where}: returned a detection of frame {detection.index} of {detection.camera}; "
+            "give it this frame's camera and index"
+        )
+    fields = {}
+    for field in dataclasses.fields(Detection):
+        value = getattr(detection, field.name)
+        try:
+            fields[field.name] = _KINDS[field.type](value) if field.type in _KINDS else value
+        except (TypeError, ValueError) as error:
+            raise EstimatorError(f"{where}: {field.name} of a detection is {value!r}: {error}") from None
+    return Detection(**fields)
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if math.isinf(number):
+        raise ValueError("wanted a finite number, or NaN where there is none")
+    return number
+
+
+def _vector(values: Any) -> tuple[float, float, float]:
+    numbers = [_number(value) for value in values]
+    if len(numbers) != 3:
+        raise ValueError("wanted three numbers")
+    return numbers[0], numbers[1], numbers[2]
+
+
+_KINDS: dict[Any, Callable[[Any], Any]] = {
+    float: _number,
+    int: operator.index,
+    bool: bool,
+    tuple[float, float, float]: _vector,
+}
+
+
+def _error_line(error: BaseException, path: Path) -> str:
+    """Say in one line what was raised, and in which line of the user's file."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    lines = [
+        entry.lineno
+        for entry in traceback.extract_tb(error.__traceback__)
+        if Path(entry.filename).resolve() == path.resolve()
+    ]
+    return f"{text} ({path.name}, line {lines[-1]})" if lines else text
+
+
+def _functions_listed(contents: dict[str, Any]) -> str:
+    """List the functions that a file itself defines."""
+    there = [
+        name
+        for name, value in contents.items()
+        if callable(value)
+        and not name.startswith("_")
+        and getattr(value, "__module__", None) == contents["__name__"]
+    ]
+    return f"; it has {', '.join(there)}" if there else ""
+
+
+def _kind(value: object) -> str:
+    return "None" if value is None else f"an object of type {type(value).__name__}"

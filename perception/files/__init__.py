@@ -1,0 +1,1 @@
+"""What touches disk: recordings, calibrations, detections, ranges."""

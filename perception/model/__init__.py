@@ -1,0 +1,1 @@
+"""The forward model that fit, bound and evaluation share."""

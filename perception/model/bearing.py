@@ -1,0 +1,59 @@
+"""From a pixel to a direction: through the lens, then from camera axes to body axes."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from perception.model.lens import unproject
+from perception.types import Calibration
+
+
+def direction_camera(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:
+    """Back-project pixels to unit directions in camera axes (x right, y down, z forward).
+
+    The paper's eq. pixel_to_image, with its R_i2c the identity: image and camera axes agree here.
+
+    Parameters
+    ----------
+    points_px
+        Image points (u, v), shape (n, 2).
+    calibration
+        The camera's intrinsics.
+
+    Returns
+    -------
+    Unit vectors, shape (n, 3); NaN beyond a fisheye's image circle.
+
+    Raises
+    ------
+    ValueError
+        If `points_px` is not of shape (n, 2).
+    """
+    points = np.asarray(points_px, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"points_px must have shape (n, 2), not {points.shape}")
+    return unproject(points, calibration)
+
+
+def field_angle_rad(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:
+    """Angle between the optical axis and the direction of each pixel, shape (n,)."""
+    direction = direction_camera(points_px, calibration)
+    return np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
+
+
+def bearing_body(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:
+    """Directions of pixels from the camera's centre, in body axes (x forward, y left, z up).
+
+    A direction is rotated and nothing else: where the camera sits on the robot does not turn it.
+
+    Parameters
+    ----------
+    points_px
+        Image points (u, v), shape (n, 2).
+    calibration
+        Intrinsics, and the rotation from camera to body axes.
+
+    Returns
+    -------
+    Unit vectors, shape (n, 3).
+    """
+    return direction_camera(points_px, calibration) @ calibration.rotation_body_camera.T

@@ -1,0 +1,348 @@
+"""The lens: OpenCV's distortion models in closed form, their inverse, and where they fold.
+
+Light from a direction (X, Y, Z), at the field angle θ from the axis Z, falls on the point (x, y) of the
+image, in units of the focal length about the principal point. With a = X/Z, b = Y/Z, r² = a² + b²:
+
+rectilinear    x = a, y = b
+brown_conrady  x = a g + 2 p1 a b + p2 (r² + 2 a²), y = b g + p1 (r² + 2 b²) + 2 p2 a b,
+               g = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
+fisheye        (x, y) = θ_d (a, b)/r, θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)
+
+(OpenCV, modules calib3d and fisheye; Brown 1966; Kannala and Brandt 2006.) A polynomial may turn back beyond
+the field that it was fitted over: from there, the fold, on it means nothing, and would put what lies far
+outside the field into the middle of the picture. `project` and `unproject` know nothing beyond the fold;
+`Distortion.place`, which whoever renders needs for light from anywhere, lets the image grow in proportion
+from there on, so that it stays outside.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Literal, cast
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.polynomial.polynomial import polyval
+from numpy.typing import NDArray
+
+from perception.types import Calibration
+
+Array = NDArray[np.float64]
+LensModel = Literal["rectilinear", "brown_conrady", "fisheye"]
+
+COEFFICIENTS = {"rectilinear": (0,), "brown_conrady": (4, 5, 8), "fisheye": (4,)}
+"""Lens models, and how many numbers of distortion each may have."""
+
+_RIGHT_ANGLE = 0.5 * math.pi
+# Newton starts from a table over the field angle, up to where a brown_conrady image is 6 km wide.
+_TABLE = 4097
+_WIDEST_RAD = _RIGHT_ANGLE - 1e-6
+_MOST_STEPS, _LAST_STEP = 40, 1e-9  # a step of 1e-9 leaves an error of its square
+_RESIDUAL = 1e-12
+_SCAN_ANGLES, _SCAN_AZIMUTHS = 901, 72
+
+
+def project(direction: Array, calibration: Calibration) -> Array:
+    """Return where directions in camera axes, shape (n, 3), fall on the image, (u, v), shape (n, 2).
+
+    They need not be of unit length. NaN for what is behind the lens, z ≤ 0, or beyond its fold.
+    """
+    lens = distortion_of(calibration)
+    point = lens.place(direction)
+    if lens.fold_rad < _RIGHT_ANGLE:
+        point[~lens.images(direction)] = np.nan
+    return point * (calibration.fx_px, calibration.fy_px) + (calibration.cx_px, calibration.cy_px)
+
+
+def unproject(points_px: Array, calibration: Calibration) -> Array:
+    """Return the unit directions in camera axes, shape (n, 3), of image points (u, v), shape (n, 2).
+
+    NaN where no light within 90° of the axis and before the fold falls: beyond a fisheye's image circle,
+    beyond a fold.
+    """
+    point = (points_px - (calibration.cx_px, calibration.cy_px)) / (calibration.fx_px, calibration.fy_px)
+    direction = distortion_of(calibration).direction(point)
+    return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
+
+
+def stretch(direction: Array, calibration: Calibration) -> float:
+    """Return how many pixels the image moves, at most, per radian of a unit direction, shape (3,).
+
+    NaN where there is no direction.
+    """
+    focal_px = (calibration.fx_px, calibration.fy_px)
+    if calibration.lens_model == "rectilinear":
+        return max(focal_px) / float(direction[2]) ** 2  # along the radius; across it by 1 / cos θ
+    if np.isnan(direction).any():
+        return math.nan
+    slope = np.diag(focal_px) @ distortion_of(calibration).derivative(direction)
+    return float(np.linalg.norm(slope, ord=2))
+
+
+def distortion_of(calibration: Calibration) -> "Distortion":
+    """Return the lens law of a calibration."""
+    return _distortion(cast("LensModel", calibration.lens_model), calibration.distortion)
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """A lens model and its coefficients in OpenCV's order.
+
+    brown_conrady has 4, 5 or 8: k1, k2, p1, p2, k3, k4, k5, k6; fisheye 4: k1, k2, k3, k4.
+
+    Examples
+    --------
+    r - 0.3 r³ turns back at r = 1/√0.9, where the image is 2/3 of that high:
+
+    >>> barrel = Distortion("brown_conrady", (-0.3, 0.0, 0.0, 0.0))
+    >>> round(math.degrees(barrel.fold_rad), 1)
+    46.5
+    >>> barrel.place(np.array([0.5, 0.0, 1.0])).round(4).tolist()
+    [0.4625, 0.0]
+    >>> barrel.direction(np.array([[0.4625, 0.0], [0.8, 0.0]])).round(4).tolist()
+    [[0.5, 0.0, 1.0], [nan, nan, 1.0]]
+    """
+
+    model: LensModel = "rectilinear"
+    coefficients: tuple[float, ...] = ()
+
+    def place(self, direction: Array) -> Array:
+        """Return the points (x, y), shape (..., 2), of directions, shape (..., 3), of any length.
+
+        What is behind the lens (Z ≤ 0) becomes NaN.
+        """
+        z = np.where(direction[..., 2] > 0.0, direction[..., 2], np.nan)
+        across = direction[..., :2]
+        if self.model == "rectilinear":
+            return np.asarray(across / z[..., None])
+        if self.model == "brown_conrady":
+            tangent = across / z[..., None]
+            beyond = np.maximum(np.hypot(tangent[..., 0], tangent[..., 1]) / math.tan(self._end_rad), 1.0)
+            x, y = self._distort(tangent[..., 0] / beyond, tangent[..., 1] / beyond)
+            return np.stack([x * beyond, y * beyond], axis=-1)
+        sine = np.hypot(across[..., 0], across[..., 1])
+        height = self.image_height(np.arctan2(sine, z))
+        # On the axis θ_d / sin θ is 1 / Z for a direction of any length.
+        scale = np.where(sine > 0.0, height / np.where(sine > 0.0, sine, 1.0), 1.0 / z)
+        return np.asarray(across * scale[..., None])
+
+    def images(self, direction: Array) -> NDArray[np.bool_]:
+        """Tell which directions, shape (..., 3), lie before the fold and not behind the lens, shape (...)."""
+        sine = np.hypot(direction[..., 0], direction[..., 1])
+        return np.asarray(np.arctan2(sine, direction[..., 2]) <= self._end_rad)
+
+    def direction(self, point: Array) -> Array:
+        """Return the directions, shape (..., 3), of points, shape (..., 2).
+
+        Those of a fisheye are of unit length, the others of depth 1. NaN where no light within 90° of the
+        axis and before the fold falls.
+        """
+        if self.model == "fisheye":
+            return self._fisheye_direction(point)
+        tangent = point if self.model == "rectilinear" else self._undistort(point)
+        return np.concatenate([tangent, np.ones((*tangent.shape[:-1], 1))], axis=-1)
+
+    def image_height(self, angle_rad: Array) -> Array:
+        """Return the distance from the principal point at field angles, without tangential distortion."""
+        if self.model == "rectilinear":
+            return np.tan(angle_rad)
+        if self.model == "fisheye":
+            gain, _ = self._equidistant
+            return np.asarray(angle_rad * polyval(np.minimum(angle_rad, self._end_rad) ** 2, gain.coef))
+        tangent = np.tan(angle_rad)
+        radial, _ = self._radial(np.minimum(tangent, math.tan(self._end_rad)) ** 2)
+        return np.asarray(tangent * radial)
+
+    def solid_angle_sr(self, direction: Array) -> Array:
+        """Return the solid angle per unit of the image's area at directions before the fold, shape (...)."""
+        cosine, sine, angle = _field_angle(direction)
+        if self.model == "rectilinear":
+            return np.asarray(cosine**3)
+        if self.model == "fisheye":
+            # dΩ = sin θ dθ dφ falls on θ_d dθ_d dφ.
+            height, slope = self.image_height(angle), self._fisheye_slope(angle)
+            small = angle < 1e-9
+            return np.where(small, 1.0, sine / np.where(small, 1.0, height * slope))
+        xx, xy, yy = self._jacobian(
+            direction[..., 0] / direction[..., 2], direction[..., 1] / direction[..., 2]
+        )
+        return np.asarray(cosine**3 / (xx * yy - xy**2))
+
+    def stretch(self, direction: Array) -> float:
+        """Return how far the image moves, at most, per radian of a direction before the fold, shape (3,)."""
+        if self.model == "rectilinear":
+            return 1.0 / float(_field_angle(direction)[0]) ** 2
+        if self.model == "fisheye":
+            return max(self._fisheye_slopes(direction))
+        return float(np.linalg.norm(self.derivative(direction), ord=2))
+
+    def derivative(self, direction: Array) -> Array:
+        """Differentiate (x, y) by the direction, in radians outwards and around the axis, shape (2, 2).
+
+        At one direction before the fold, shape (3,), of a lens with distortion.
+        """
+        cosine, sine, _ = (float(value) for value in _field_angle(direction))
+        outward = direction[:2] / sine if sine > 1e-9 else np.array([1.0, 0.0])
+        around = np.array([-outward[1], outward[0]])
+        if self.model == "fisheye":
+            slope_outward, slope_around = self._fisheye_slopes(direction)
+            return np.stack([outward * slope_outward, around * slope_around], axis=1)
+        xx, xy, yy = (float(value) for value in self._jacobian(*(direction[:2] / direction[2])))
+        frame = np.array([outward / cosine**2, around / cosine])
+        return np.asarray(np.array([[xx, xy], [xy, yy]]) @ frame.T)
+
+    @cached_property
+    def fold_rad(self) -> float:
+        """The field angle at which the image folds, 90° where it does not.
+
+        That is where the image height turns back, or, with tangential distortion, the determinant of the
+        Jacobian first falls to 0 for some azimuth.
+        """
+        if self.model == "rectilinear":
+            return _RIGHT_ANGLE
+        if self.model == "fisheye":
+            return min(math.sqrt(_first_root(self._equidistant[1])), _RIGHT_ANGLE)
+        over, under = self._ratio
+        square = Polynomial([0.0, 1.0])
+        # d(r g)/dr of g = P(r²)/Q(r²) has the numerator P Q + 2 r² (P' Q − P Q').
+        slope = over * under + 2.0 * square * (over.deriv() * under - over * under.deriv())
+        radial_rad = math.atan(math.sqrt(min(_first_root(slope), _first_root(under))))
+        return radial_rad if not any(self.coefficients[2:4]) else self._tangential_fold(radial_rad)
+
+    @cached_property
+    def _end_rad(self) -> float:
+        """The field angle up to which the model is followed: right before a fold or a pole of g."""
+        return min(self.fold_rad - 1e-9, _WIDEST_RAD)
+
+    def _tangential_fold(self, radial_rad: float) -> float:
+        angle_rad = np.linspace(0.0, min(radial_rad, _WIDEST_RAD), _SCAN_ANGLES)[:, None]
+        azimuth_rad = 2.0 * np.pi * np.arange(_SCAN_AZIMUTHS) / _SCAN_AZIMUTHS
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # the scan may end at a pole of g
+            xx, xy, yy = self._jacobian(
+                np.tan(angle_rad) * np.cos(azimuth_rad), np.tan(angle_rad) * np.sin(azimuth_rad)
+            )
+            area = xx * yy - xy**2
+        # Both of its eigenvalues are above 0 as long as the image has not folded; they begin at 1.
+        folded = np.any((area <= 0.0) | (xx + yy <= 0.0), axis=1)
+        folded[-1:] &= radial_rad >= _RIGHT_ANGLE
+        return float(angle_rad[np.argmax(folded) - 1, 0]) if folded.any() else radial_rad
+
+    @cached_property
+    def _equidistant(self) -> tuple[Polynomial, Polynomial]:
+        """θ_d/θ and dθ_d/dθ of a fisheye, as polynomials of θ²."""
+        powers = (1.0, *self.coefficients)
+        return Polynomial(powers), Polynomial([(2 * n + 1) * value for n, value in enumerate(powers)])
+
+    @cached_property
+    def _ratio(self) -> tuple[Polynomial, Polynomial]:
+        """Numerator and denominator of g, as polynomials of r²."""
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.coefficients, *[0.0] * (8 - len(self.coefficients)))
+        return Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+
+    @cached_property
+    def _ratio_slopes(self) -> tuple[Array, Array]:
+        """Coefficients of the derivatives of numerator and denominator of g by r²."""
+        over, under = self._ratio
+        return np.asarray(over.deriv().coef, dtype=np.float64), np.asarray(
+            under.deriv().coef, dtype=np.float64
+        )
+
+    @cached_property
+    def _table(self) -> tuple[Array, Array]:
+        """Field angles up to the end, and image heights there."""
+        angle_rad = np.linspace(0.0, self._end_rad, _TABLE)
+        return angle_rad, self.image_height(angle_rad)
+
+    def _radial(self, square: Array) -> tuple[Array, Array]:
+        """Return g and dg/d(r²) at r²."""
+        (over, under), (over_slope, under_slope) = self._ratio, self._ratio_slopes
+        below = polyval(square, under.coef)
+        gain = polyval(square, over.coef) / below
+        slope = polyval(square, over_slope) - gain * polyval(square, under_slope)
+        return gain, slope / below
+
+    def _distort(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Return the point (x, y) of brown_conrady at (a, b)."""
+        _, _, p1, p2 = self.coefficients[:4]
+        square = a**2 + b**2
+        gain, _ = self._radial(square)
+        x = a * gain + 2.0 * p1 * a * b + p2 * (square + 2.0 * a**2)
+        return x, b * gain + p1 * (square + 2.0 * b**2) + 2.0 * p2 * a * b
+
+    def _jacobian(self, a: Array, b: Array) -> tuple[Array, Array, Array]:
+        """Return ∂x/∂a, ∂x/∂b = ∂y/∂a and ∂y/∂b of brown_conrady."""
+        _, _, p1, p2 = self.coefficients[:4]
+        gain, slope = self._radial(a**2 + b**2)
+        xx = gain + 2.0 * a**2 * slope + 2.0 * p1 * b + 6.0 * p2 * a
+        xy = 2.0 * a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+        return xx, xy, gain + 2.0 * b**2 * slope + 6.0 * p1 * b + 2.0 * p2 * a
+
+    def _undistort(self, point: Array) -> Array:
+        """Return (a, b) of brown_conrady, shape (..., 2), by Newton's method."""
+        angle_rad, heights = self._table
+        height = np.hypot(point[..., 0], point[..., 1])
+        start = np.interp(height, heights, np.tan(angle_rad))
+        scale = start / np.where(height > 0.0, height, 1.0)
+        a, b = point[..., 0] * scale, point[..., 1] * scale
+        for _ in range(_MOST_STEPS):
+            x, y = self._distort(a, b)
+            x, y = x - point[..., 0], y - point[..., 1]
+            xx, xy, yy = self._jacobian(a, b)
+            area = np.where(xx * yy == xy**2, np.nan, xx * yy - xy**2)
+            step_a, step_b = (yy * x - xy * y) / area, (xx * y - xy * x) / area
+            a, b = a - step_a, b - step_b
+            if not (np.hypot(step_a, step_b) > _LAST_STEP * (1.0 + np.hypot(a, b))).any():
+                break
+        x, y = self._distort(a, b)
+        found = np.hypot(x - point[..., 0], y - point[..., 1]) <= _RESIDUAL * (1.0 + height)
+        found &= np.hypot(a, b) <= math.tan(self._end_rad)
+        return np.where(found[..., None], np.stack([a, b], axis=-1), np.nan)
+
+    def _fisheye_direction(self, point: Array) -> Array:
+        angle_rad, heights = self._table
+        height = np.hypot(point[..., 0], point[..., 1])
+        inside = height < heights[-1]
+        angle = np.interp(height, heights, angle_rad)
+        for _ in range(_MOST_STEPS):
+            slope = self._fisheye_slope(angle)
+            step = (self.image_height(angle) - height) / np.where(slope > 0.0, slope, np.nan)
+            angle = np.clip(angle - step, 0.0, self._end_rad)
+            if not (np.abs(step[inside]) > _LAST_STEP).any():
+                break
+        angle = np.where(inside, angle, np.nan)
+        scale = np.sin(angle) / np.where(height > 0.0, height, 1.0)
+        return np.stack([point[..., 0] * scale, point[..., 1] * scale, np.cos(angle)], axis=-1)
+
+    def _fisheye_slopes(self, direction: Array) -> tuple[float, float]:
+        """Return how far the image moves per radian outwards and around the axis."""
+        _, sine, angle = (float(value) for value in _field_angle(direction))
+        around = float(self.image_height(np.array(angle))) / sine if sine > 1e-9 else 1.0
+        return float(self._fisheye_slope(np.array(angle))), around
+
+    def _fisheye_slope(self, angle_rad: Array) -> Array:
+        """Return dθ_d/dθ before the fold."""
+        return np.asarray(polyval(angle_rad**2, self._equidistant[1].coef))
+
+
+RECTILINEAR = Distortion()
+
+
+@lru_cache(maxsize=16)
+def _distortion(model: LensModel, coefficients: tuple[float, ...]) -> Distortion:
+    """Return a lens law that keeps its tables from call to call."""
+    return Distortion(model, coefficients)
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """Return the smallest root above 0, infinity where there is none."""
+    roots = np.asarray(polynomial.trim().roots(), dtype=complex)
+    # A double root, where the curve touches 0, comes out as a pair with small imaginary parts.
+    above = roots.real[(np.abs(roots.imag) < 1e-7 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(above.min(initial=math.inf))
+
+
+def _field_angle(direction: Array) -> tuple[Array, Array, Array]:
+    """Return cosine, sine and value of the angle between directions and the axis."""
+    sine = np.hypot(direction[..., 0], direction[..., 1])
+    length = np.hypot(sine, direction[..., 2])
+    return direction[..., 2] / length, sine / length, np.arctan2(sine, direction[..., 2])

@@ -1,0 +1,1 @@
+"""The detector that an engineer would ship: each step a file."""

@@ -1,0 +1,106 @@
+"""From a mask to blobs: connected components, and where one of them holds several flares."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.flare import PixelBox
+
+_MAX_PEAKS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Blob:
+    """One flare's pixels: a box, and which pixels of it belong, shape (box.height, box.width).
+
+    `touching` says that the component it comes from holds other flares as well.
+    """
+
+    box: PixelBox
+    pixels: NDArray[np.bool_]
+    touching: bool = False
+
+    @property
+    def area_px(self) -> int:
+        """Number of pixels."""
+        return int(self.pixels.sum())
+
+
+def components(mask: NDArray[np.bool_], min_area_px: int = 1) -> list[Blob]:
+    """Find connected components (8 neighbours) of at least a given area, by their first row."""
+    import cv2
+
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
+    blobs = []
+    for label in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= min_area_px):
+        if label == 0:  # what is not in the mask
+            continue
+        left, top, width, height, _ = stats[label].tolist()
+        box = PixelBox(top, left, height, width)
+        blobs.append(Blob(box, np.asarray(labels[box.slices] == label)))
+    return blobs
+
+
+def split_at_peaks(
+    blob: Blob, brightness: NDArray[np.floating], noise: NDArray[np.floating], dip: float = 0.05
+) -> list[Blob]:
+    """Divide a blob among its distinct local maxima.
+
+    Two maxima are distinct if the lowest saddle between them lies below the fainter one by more than 5 σ of
+    noise and a fraction `dip` of its brightness: the plateau of a resolved or clipped disc has many maxima
+    but no such saddle. Each pixel goes to the nearest maximum.
+
+    Parameters
+    ----------
+    blob
+        A connected component.
+    brightness
+        The filtered image within the blob's box, shape (box.height, box.width).
+    noise
+        Standard deviation of `brightness`, same shape.
+    dip
+        Least relative depth of a saddle.
+
+    Returns
+    -------
+    The blob itself, or one touching blob for each maximum, brightest first.
+    """
+    import cv2
+
+    inside = np.where(blob.pixels, brightness, -np.inf)
+    widened = cv2.dilate(inside.astype(np.float32), np.ones((3, 3), dtype=np.uint8))
+    maxima = (inside.astype(np.float32) >= widened) & blob.pixels
+    # A plateau is one maximum: of each connected group, the brightest pixel stands for it.
+    count, groups = cv2.connectedComponents(maxima.view(np.uint8), connectivity=8)
+    if count <= 2:
+        return [blob]
+    places = [_brightest(inside, groups == group) for group in range(1, count)]
+    places = sorted(places, key=lambda at: float(inside[at]), reverse=True)[:_MAX_PEAKS]
+    peaks = places[:1]
+    for place in places[1:]:
+        height = float(inside[place])
+        level = height - max(5.0 * float(noise[place]), dip * height)
+        _, above = cv2.connectedComponents((inside > level).view(np.uint8), connectivity=8)
+        if all(above[place] != above[peak] for peak in peaks):
+            peaks.append(place)
+    if len(peaks) == 1:
+        return [blob]
+    rows, columns = np.indices(blob.pixels.shape)
+    distance2 = np.stack([(rows - row) ** 2 + (columns - column) ** 2 for row, column in peaks])
+    nearest = distance2.argmin(axis=0)
+    return [_trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
+
+
+def _brightest(brightness: NDArray[np.floating], mask: NDArray[np.bool_]) -> tuple[int, int]:
+    row, column = np.unravel_index(int(np.argmax(np.where(mask, brightness, -np.inf))), mask.shape)
+    return int(row), int(column)
+
+
+def _trimmed(blob: Blob, pixels: NDArray[np.bool_]) -> Blob:
+    """Cut out the part of a blob that `pixels` marks, in a box of its own."""
+    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
+    top, left = int(rows[0]), int(columns[0])
+    height, width = int(rows[-1]) - top + 1, int(columns[-1]) - left + 1
+    box = PixelBox(blob.box.top + top, blob.box.left + left, height, width)
+    return Blob(box, pixels[top : top + height, left : left + width], touching=True)

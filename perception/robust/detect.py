@@ -1,0 +1,145 @@
+"""The robust detector: flares found against the noise of one frame, and measured by maximum likelihood."""
+
+import math
+
+import numpy as np
+
+from perception.model.bearing import bearing_body
+from perception.model.sensor import check_frame, gain_dn_per_e
+from perception.robust.blobs import Blob, components, split_at_peaks
+from perception.robust.measure import Candidate, Measurement, candidate, is_extended, measure
+from perception.robust.prepare import PreparedFrame, prepare
+from perception.types import Calibration, Detection, RawFrame
+
+CONTRAST_SIGMAS = 6.03
+"""As for detection against the coarse background: Gaussian noise passes 8e-10 of the time."""
+
+MAX_FLARES = 100
+"""The robust detector measures no more blobs of a frame than this, the brightest: it bounds the time."""
+
+_RING_PX = 4
+_FEWEST_RING_PIXELS = 8
+
+
+def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
+    """Flares found against the local background and measured by maximum likelihood.
+
+    Counts become electrons; a background on a coarse mesh is subtracted; the rest is matched to the image of
+    a point and compared with the level that noise alone passes once in a thousand frames. Each component
+    (divided where it has several maxima) is fitted with the image of a source of known size and strength.
+
+    Parameters
+    ----------
+    frame
+        A raw frame.
+    calibration
+        Its camera's calibration.
+
+    Returns
+    -------
+    Detections
+        From top to bottom. `area_px` and `mean_dn` are those of the pixels above the detection limit.
+        `saturated`: a pixel is clipped; the rest is fitted, and where that does not determine the flux, the
+        clipped flux is given as its lower bound, the range that follows is an upper bound, and
+        `range_sigma_m` is NaN. `merged`: the flare shares its component with another, or does not look like
+        one source; its sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror
+        image from a source. Blobs much larger than a source of their flux would be are left out,
+        and so are those that do not stand out from what lies right beside them, and all but the brightest
+        100.
+
+    Raises
+    ------
+    ValueError
+        If frame and calibration do not belong together (`sensor.check_frame`).
+    """
+    check_frame(frame, calibration)
+    prepared = prepare(frame, calibration)
+    candidates = [
+        candidate(blob, prepared)
+        for component in components(prepared.lit)
+        for blob in _split(component, prepared)
+        if _stands_above_surroundings(blob, prepared)
+    ]
+    flares = _brightest([each for each in candidates if not is_extended(each, prepared)], prepared)
+    measured = [(flare.blob, measure(flare, prepared)) for flare in flares]
+    return [_detection(blob, found, frame, calibration) for blob, found in measured if found.stands_out]
+
+
+def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
+    """Tell whether a blob's peak exceeds the level of a ring around it by more than noise does.
+
+    The sheen of a lamp on metal, or a wall's lit corner, bends within a cell of the background mesh; on the
+    slope that is left, noise alone passes the detection limit. The ring lies just outside the PSF's reach and
+    takes that slope with it. Its median is blind to other flares in less than half of it.
+
+    Parameters
+    ----------
+    blob
+        The blob.
+    prepared
+        The frame it was found in.
+
+    Returns
+    -------
+    True also where the frame's edges leave too little of the ring.
+    """
+    gap_px = math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1
+    inner, outer = blob.box.with_margin(gap_px), blob.box.with_margin(gap_px + _RING_PX)
+    rows, columns = prepared.filtered_e.shape
+    place = np.s_[
+        max(outer.top, 0) : min(outer.top + outer.height, rows),
+        max(outer.left, 0) : min(outer.left + outer.width, columns),
+    ]
+    ring = np.ones(prepared.filtered_e[place].shape, dtype=bool)
+    top, left = inner.top - max(outer.top, 0), inner.left - max(outer.left, 0)
+    ring[max(top, 0) : top + inner.height, max(left, 0) : left + inner.width] = False
+    if int(ring.sum()) < _FEWEST_RING_PIXELS:
+        return True
+    level_e = float(np.median(prepared.filtered_e[place][ring]))
+    around_e = max(level_e + float(np.median(prepared.background_e[place][ring])), 0.0)
+    noise_e = prepared.filtered_noise * math.sqrt(around_e + prepared.floor_e2)
+    peak_e = float(prepared.filtered_e[blob.box.slices][blob.pixels].max())
+    return peak_e - level_e > CONTRAST_SIGMAS * noise_e
+
+
+def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
+    """Divide a component at maxima that differ by more than their noise."""
+    box = component.box.slices
+    brightness_e = prepared.filtered_e[box]
+    expected_e = np.maximum(brightness_e + prepared.background_e[box], 0.0)
+    noise_e = prepared.filtered_noise * np.sqrt(expected_e + prepared.floor_e2)
+    return split_at_peaks(component, brightness_e, noise_e)
+
+
+def _detection(blob: Blob, measured: Measurement, frame: RawFrame, calibration: Calibration) -> Detection:
+    gain = gain_dn_per_e(frame, calibration)
+    x, y, z = bearing_body([[measured.u_px, measured.v_px]], calibration)[0].tolist()
+    return Detection(
+        camera=frame.camera,
+        index=frame.index,
+        time_s=frame.time_s,
+        u_px=measured.u_px,
+        v_px=measured.v_px,
+        u_sigma_px=measured.u_sigma_px,
+        v_sigma_px=measured.v_sigma_px,
+        flux_dn=measured.flux_e * gain,
+        mean_dn=float(frame.data_dn[blob.box.slices][blob.pixels].mean()),
+        background_dn=frame.black_level_dn + measured.background_e * gain,
+        area_px=blob.area_px,
+        saturated=measured.saturated,
+        merged=blob.touching or measured.misfit,
+        ghost=False,
+        range_m=measured.range_m,
+        range_sigma_m=measured.range_sigma_m,
+        bearing_body=(x, y, z),
+    )
+
+
+def _brightest(candidates: list[Candidate], prepared: PreparedFrame) -> list[Candidate]:
+    """Keep the brightest, in the order in which they are."""
+    if len(candidates) <= MAX_FLARES:
+        return candidates
+    blobs = [each.blob for each in candidates]
+    peaks = [float(prepared.filtered_e[blob.box.slices][blob.pixels].max()) for blob in blobs]
+    kept = np.sort(np.argsort(peaks)[-MAX_FLARES:])
+    return [candidates[index] for index in kept]

@@ -1,0 +1,182 @@
+"""Estimators by name and of one's own: what works, and the one line that each mistake gets."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import perception
+from perception import EstimatorError, load_estimator
+from perception.paper import detect_paper
+from perception.robust.detect import detect_robust
+from tests.paths import SCENES
+from tests.unit.perception.simulation import calibration, expected_e, expose, random
+
+CAMERA = calibration(width_px=120, height_px=100, cx_px=59.5, cy_px=49.5)
+FRAME = expose(expected_e(CAMERA, [(60.3, 49.8, 2.0)], 2.4e-4, 1.0), CAMERA, random(71), 2.4e-4)
+
+
+def test_names_choose_the_estimator() -> None:
+    assert perception.detect(FRAME, CAMERA)[0].range_m == detect_robust(FRAME, CAMERA)[0].range_m
+    paper = perception.detect(FRAME, CAMERA, "paper")[0]
+    assert (paper.u_px, paper.range_m) == (
+        detect_paper(FRAME, CAMERA)[0].u_px,
+        detect_paper(FRAME, CAMERA)[0].range_m,
+    )
+
+
+def test_an_estimator_of_ones_own() -> None:
+    hits = perception.detect(FRAME, CAMERA, lambda frame, camera: iter(detect_robust(frame, camera)))
+    assert len(hits) == 1
+
+
+def test_unknown_name() -> None:
+    with pytest.raises(ValueError, match=r"'sound'.*paper, robust"):
+        perception.detect(FRAME, CAMERA, "sound")
+
+
+def test_inputs_are_left_as_they_were() -> None:
+    before = FRAME.data_dn.copy()
+    perception.detect(FRAME, CAMERA)
+    perception.detect(FRAME, CAMERA, "paper")
+    assert np.array_equal(before, FRAME.data_dn)
+
+
+# --- one's own ---
+
+EXAMPLE = SCENES / "my_estimator.py"
+
+HEAD = """
+import dataclasses
+import numpy as np
+from perception.robust.detect import detect_robust
+"""
+
+
+def _load(tmp_path: Path, body: str, name: str = "mine") -> perception.OwnEstimator:
+    (tmp_path / "own.py").write_text(HEAD + body, encoding="utf-8")
+    return load_estimator(f"{tmp_path / 'own.py'}:{name}")
+
+
+def test_the_example_ranges_a_source_within_its_claims() -> None:
+    """A source 2 m away; the claim is about 3 % of the limit's flux, so 4 σ is a few centimetres."""
+    (hit,) = load_estimator(f"{EXAMPLE}:brightest_spot")(FRAME, CAMERA)
+    assert abs(hit.range_m - 2.0) < 4.0 * hit.range_sigma_m < 0.1
+    assert abs(hit.u_px - 60.3) < 0.1
+    assert abs(hit.v_px - 49.8) < 0.1
+
+
+def test_the_example_says_nothing_about_a_dark_frame() -> None:
+    dark = expose(np.full((100, 120), 1.0), CAMERA, random(72), 2.4e-4)
+    flat = perception.RawFrame("r1.front", 0, 0.0, 1e-3, np.full((100, 120), 64, dtype=np.uint16), 64.0)
+    estimator = load_estimator(f"{EXAMPLE}:brightest_spot")
+    assert estimator(dark, CAMERA) == []
+    assert estimator(flat, CAMERA) == []
+
+
+def test_what_it_returns_arrives_with_plain_numbers(tmp_path: Path) -> None:
+    """NumPy's numbers are none of JSON's; a generator is as good as a list; a module beside the file is found."""
+    (tmp_path / "beside.py").write_text("FACTOR = 1.5\n")
+    estimator = _load(
+        tmp_path,
+        """
+from beside import FACTOR
+
+def mine(frame, calibration):
+    for hit in detect_robust(frame, calibration):
+        yield dataclasses.replace(
+            hit, area_px=np.int64(7), merged=np.bool_(True), range_m=np.float32(FACTOR), bearing_body=np.array(hit.bearing_body)
+        )
+""",
+    )
+    (hit,) = estimator(FRAME, CAMERA)
+    assert estimator.name == "mine"
+    assert (hit.area_px, hit.merged, hit.range_m) == (7, True, 1.5)
+    assert [type(value) for value in (hit.area_px, hit.merged, hit.range_m, hit.bearing_body)] == [
+        int, bool, float, tuple,
+    ]  # fmt: skip
+    perception.detection_record(hit)
+
+
+def test_counts_may_be_changed_without_harm_to_others(tmp_path: Path) -> None:
+    before = FRAME.data_dn.copy()
+    estimator = _load(tmp_path, "def mine(frame, calibration):\n    frame.data_dn[:] = 0\n    return ()\n")
+    assert estimator(FRAME, CAMERA) == []
+    assert np.array_equal(FRAME.data_dn, before)
+
+
+@pytest.mark.parametrize(
+    ("body", "name", "said"),
+    [
+        ("", "mine", "there is no 'mine' in the file"),
+        ("def yours(frame, calibration): ...\n", "mine", "it has yours"),
+        ("mine = 3\n", "mine", "'mine' is an object of type int, which cannot be called"),
+        ("def robust(frame, calibration): ...\n", "robust", "'robust' is an estimator that is built in"),
+        ("def Paper(frame, calibration): ...\n", "Paper", "'paper' is an estimator that is built in"),
+        ("def größe(frame, calibration): ...\n", "größe", "letters a to z"),
+        ("x = 1 / 0\n", "mine", "importing it failed: ZeroDivisionError: division by zero (own.py, line 5)"),
+        ("raise SystemExit('no')\n", "mine", "importing it failed: SystemExit: no"),
+        ("def mine(:\n", "mine", "importing it failed: SyntaxError: invalid syntax"),
+        ("import no_such_module_here\n", "mine", "No module named 'no_such_module_here' (own.py, line 5)"),
+    ],
+)
+def test_files_that_cannot_be_used(tmp_path: Path, body: str, name: str, said: str) -> None:
+    with pytest.raises(EstimatorError) as caught:
+        _load(tmp_path, body, name)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("reference", "said"),
+    [
+        ("nowhere.py:mine", "there is no file 'nowhere.py'"),
+        ("own.py", "wanted file.py:function"),
+        ("own.py:", "wanted file.py:function"),
+        (":mine", "wanted file.py:function"),
+        (f"{Path(__file__).parent}:mine", "there is no file"),
+        (f"{EXAMPLE.parent / 'one_source.yaml'}:mine", "its name must end in .py"),
+    ],
+)
+def test_references_that_lead_nowhere(reference: str, said: str) -> None:
+    with pytest.raises(EstimatorError, match="^" + reference.replace("\\", "\\\\")) as caught:
+        load_estimator(reference)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("raise KeyError('x')", "frame 3 of r1.front: KeyError: 'x' (own.py, line 6)"),
+        ("raise ValueError('two\\nlines')", "ValueError: two lines (own.py, line 6)"),
+        ("return None", "returned None; wanted a list of detections"),
+        ("return 3", "returned an object of type int; wanted a list"),
+        ("return [(1.0, 2.0)]", "returned an object of type tuple among its detections; wanted a Detection"),
+        ("yield 1 / 0", "ZeroDivisionError: division by zero (own.py, line 6)"),
+        ("return [dataclasses.replace(hits[0], index=4)]", "returned a detection of frame 4 of r1.front"),
+        ("return [dataclasses.replace(hits[0], camera='x')]", "give it this frame's camera and index"),
+        (
+            "return [dataclasses.replace(hits[0], range_m=np.inf)]",
+            "range_m of a detection is inf: wanted a finite",
+        ),
+        ("return [dataclasses.replace(hits[0], range_m=None)]", "range_m of a detection is None"),
+        ("return [dataclasses.replace(hits[0], area_px=2.5)]", "area_px of a detection is 2.5"),
+        ("return [dataclasses.replace(hits[0], bearing_body=(1, 0))]", "wanted three numbers"),
+    ],
+)
+def test_frames_that_go_wrong(tmp_path: Path, body: str, said: str) -> None:
+    setup = "    hits = detect_robust(frame, calibration)\n" if "hits" in body else ""
+    estimator = _load(tmp_path, f"def mine(frame, calibration):\n{setup}    {body}\n")
+    with pytest.raises(EstimatorError) as caught:
+        estimator(FRAME, CAMERA)
+    assert said in str(caught.value)
+    assert str(caught.value).startswith(f"{tmp_path / 'own.py'}:mine: frame 3 of r1.front: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_range_that_is_unknown_stays_unknown(tmp_path: Path) -> None:
+    body = "return [dataclasses.replace(hit, range_m=np.nan) for hit in detect_robust(frame, calibration)]"
+    (hit,) = _load(tmp_path, f"def mine(frame, calibration):\n    {body}\n")(FRAME, CAMERA)
+    assert math.isnan(hit.range_m)
+    assert hit.u_px == detect_robust(FRAME, CAMERA)[0].u_px
