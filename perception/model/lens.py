@@ -21,9 +21,7 @@ from functools import cached_property, lru_cache
 from typing import Literal, cast
 
 import numpy as np
-from numpy.polynomial import Polynomial
-from numpy.polynomial.polynomial import polyval
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from perception.types import Calibration
 
@@ -148,7 +146,7 @@ class Distortion:
             return np.tan(angle_rad)
         if self.model == "fisheye":
             gain, _ = self._equidistant
-            return np.asarray(angle_rad * polyval(np.minimum(angle_rad, self._end_rad) ** 2, gain.coef))
+            return np.asarray(angle_rad * _polyval(np.minimum(angle_rad, self._end_rad) ** 2, gain.coef))
         tangent = np.tan(angle_rad)
         radial, _ = self._radial(np.minimum(tangent, math.tan(self._end_rad)) ** 2)
         return np.asarray(tangent * radial)
@@ -203,7 +201,7 @@ class Distortion:
         if self.model == "fisheye":
             return min(math.sqrt(_first_root(self._equidistant[1])), _RIGHT_ANGLE)
         over, under = self._ratio
-        square = Polynomial([0.0, 1.0])
+        square = np.polynomial.Polynomial([0.0, 1.0])
         # d(r g)/dr of g = P(r²)/Q(r²) has the numerator P Q + 2 r² (P' Q − P Q').
         slope = over * under + 2.0 * square * (over.deriv() * under - over * under.deriv())
         radial_rad = math.atan(math.sqrt(min(_first_root(slope), _first_root(under))))
@@ -228,16 +226,18 @@ class Distortion:
         return float(angle_rad[np.argmax(folded) - 1, 0]) if folded.any() else radial_rad
 
     @cached_property
-    def _equidistant(self) -> tuple[Polynomial, Polynomial]:
+    def _equidistant(self) -> "tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]":
         """θ_d/θ and dθ_d/dθ of a fisheye, as polynomials of θ²."""
         powers = (1.0, *self.coefficients)
-        return Polynomial(powers), Polynomial([(2 * n + 1) * value for n, value in enumerate(powers)])
+        return np.polynomial.Polynomial(powers), np.polynomial.Polynomial(
+            [(2 * n + 1) * value for n, value in enumerate(powers)]
+        )
 
     @cached_property
-    def _ratio(self) -> tuple[Polynomial, Polynomial]:
+    def _ratio(self) -> "tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]":
         """Numerator and denominator of g, as polynomials of r²."""
         k1, k2, _, _, k3, k4, k5, k6 = (*self.coefficients, *[0.0] * (8 - len(self.coefficients)))
-        return Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+        return np.polynomial.Polynomial([1.0, k1, k2, k3]), np.polynomial.Polynomial([1.0, k4, k5, k6])
 
     @cached_property
     def _ratio_slopes(self) -> tuple[Array, Array]:
@@ -256,9 +256,9 @@ class Distortion:
     def _radial(self, square: Array) -> tuple[Array, Array]:
         """Return g and dg/d(r²) at r²."""
         (over, under), (over_slope, under_slope) = self._ratio, self._ratio_slopes
-        below = polyval(square, under.coef)
-        gain = polyval(square, over.coef) / below
-        slope = polyval(square, over_slope) - gain * polyval(square, under_slope)
+        below = _polyval(square, under.coef)
+        gain = _polyval(square, over.coef) / below
+        slope = _polyval(square, over_slope) - gain * _polyval(square, under_slope)
         return gain, slope / below
 
     def _distort(self, a: Array, b: Array) -> tuple[Array, Array]:
@@ -321,7 +321,7 @@ class Distortion:
 
     def _fisheye_slope(self, angle_rad: Array) -> Array:
         """Return dθ_d/dθ before the fold."""
-        return np.asarray(polyval(angle_rad**2, self._equidistant[1].coef))
+        return np.asarray(_polyval(angle_rad**2, self._equidistant[1].coef))
 
 
 RECTILINEAR = Distortion()
@@ -333,7 +333,12 @@ def _distortion(model: LensModel, coefficients: tuple[float, ...]) -> Distortion
     return Distortion(model, coefficients)
 
 
-def _first_root(polynomial: Polynomial) -> float:
+def _polyval(at: Array, coefficients: ArrayLike) -> Array:
+    """Return the polynomial's value; NumPy loads its polynomials at their first use."""
+    return np.asarray(np.polynomial.polynomial.polyval(at, coefficients))
+
+
+def _first_root(polynomial: "np.polynomial.Polynomial") -> float:
     """Return the smallest root above 0, infinity where there is none."""
     roots = np.asarray(polynomial.trim().roots(), dtype=complex)
     # A double root, where the curve touches 0, comes out as a pair with small imaginary parts.
