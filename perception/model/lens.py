@@ -18,10 +18,10 @@ from there on, so that it stays outside.
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from perception.types import Calibration
 
@@ -333,7 +333,7 @@ def _distortion(model: LensModel, coefficients: tuple[float, ...]) -> Distortion
     return Distortion(model, coefficients)
 
 
-def _polyval(at: Array, coefficients: ArrayLike) -> Array:
+def _polyval(at: Array, coefficients: NDArray[Any]) -> Array:
     """Return the polynomial's value; NumPy loads its polynomials at their first use."""
     return np.asarray(np.polynomial.polynomial.polyval(at, coefficients))
 

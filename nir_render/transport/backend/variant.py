@@ -123,6 +123,8 @@ def blocked(
     """
     reach_m = np.minimum(reach_m, _FARTHEST_M)
     own = np.full(len(reach_m), -1) if own is None else own
+    if not len(reach_m):
+        return np.zeros(0, dtype=bool)  # Dr.Jit ends the process on arrays of no value
     if backend().vectorised:
         ray = mi.Ray3f(
             mi.Point3f(origins_m.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32))

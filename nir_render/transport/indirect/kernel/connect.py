@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel.rectangle import RectangleInView
-from nir_render.transport.indirect.kernel.tables import Choice, Lights, Surfaces
+from nir_render.transport.indirect.kernel.tables import Choice, Lights, Surfaces, along_table
 from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, UInt, Vector
 from nir_render.transport.world.emitters import RECTANGLE, SUN
 from nir_render.transport.world.facets import MIRROR, PANE
@@ -29,7 +29,7 @@ class Aim:
 
 def guide_cell(choice: Choice, place: Point) -> UInt:
     """Return the guide's cell of a place; outside the grid the nearest."""
-    at = mi.Point3u(dr.clip((place - choice.low) * choice.cells_per_m, 0.0, choice.top))
+    at = mi.Point3u(along_table((place - choice.low) * choice.cells_per_m, choice.top))
     return at.x + choice.stride_y * at.y + choice.stride_z * at.z
 
 
@@ -111,7 +111,7 @@ def pattern_factor(lights: Lights, light: UInt, leaving: Vector, active: Mask) -
     polar = dr.acos(dr.clip(on_source.z, -1.0, 1.0)) * ((lights.pattern_polars - 1) / dr.pi)
     azimuth = dr.atan2(on_source.y, on_source.x)
     azimuth = dr.select(azimuth < 0.0, azimuth + 2.0 * dr.pi, azimuth) * mi.Float(azimuths) / (2.0 * dr.pi)
-    row = mi.UInt32(dr.clip(polar, 0.0, lights.pattern_polars - 1.5))
+    row = mi.UInt32(along_table(polar, lights.pattern_polars - 1.5))
     column = dr.minimum(mi.UInt32(azimuth), azimuths - 1)
     next_column = dr.select(column + 1 == azimuths, 0, column + 1)
     down, along = dr.clip(polar - mi.Float(row), 0.0, 1.0), dr.clip(azimuth - mi.Float(column), 0.0, 1.0)

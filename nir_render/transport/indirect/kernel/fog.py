@@ -1,7 +1,7 @@
 """Fog on the device: where a ray is in it, how far it gets, and how it turns."""
 
 from nir_render.transport.backend.variant import dr, mi
-from nir_render.transport.indirect.kernel.tables import FogTable
+from nir_render.transport.indirect.kernel.tables import FogTable, along_table
 from nir_render.transport.indirect.kernel.types import Float, Point, UInt, Vector
 from nir_render.transport.world.phase import CELLS
 
@@ -91,4 +91,4 @@ def _angle(versine: Float) -> Float:
 
 def _cell(angle: Float) -> UInt:
     """Return the cell of the table that holds an angle: angles are π (i / CELLS)²."""
-    return mi.UInt32(dr.clip(CELLS * dr.sqrt(dr.maximum(angle, 0.0) / dr.pi), 0.0, CELLS - 1.0))
+    return mi.UInt32(along_table(CELLS * dr.sqrt(angle / dr.pi), CELLS - 1.0))

@@ -49,7 +49,8 @@ class RectangleInView:
         beside_x, beside_y = dr.maximum(dr.abs(x) - width, 0.0), dr.maximum(dr.abs(y) - height, 0.0)
         nearest2 = beside_x * beside_x + beside_y * beside_y + self.z * self.z
         roughly = self.size * dr.abs(self.z) / dr.power(nearest2, 1.5)
-        self.by_area = roughly < _SMALL_SR
+        # Almost in its plane, beside it, the solid angle can round to nothing, of which no part can be drawn.
+        self.by_area = (roughly < _SMALL_SR) | (self.solid_angle <= 0.0)
 
     def density(self, direction: Vector) -> Float:
         """Return the density per sr with which `point` draws a direction that meets the rectangle."""

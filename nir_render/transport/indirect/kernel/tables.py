@@ -222,6 +222,14 @@ def upload_fog(medium: Medium) -> FogTable:
     )
 
 
+def along_table(place: Float, end: float | Point) -> Float:
+    """Return a place on a table's axis, kept to 0 … `end`; 0 where it is no number, as in lanes that rest.
+
+    As a whole number NaN is 2³¹ on processors without AVX-512: a gather there reads memory that is not ours.
+    """
+    return dr.select(place > 0.0, dr.minimum(place, end), 0.0)
+
+
 def _real(values: NDArray[np.float64]) -> Float:
     """Return an array on the device, never empty, which could not be read from."""
     flat = np.asarray(values, dtype=np.float32).ravel()

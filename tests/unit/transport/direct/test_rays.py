@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from nir_render import load_scene
+from nir_render.transport.backend.variant import blocked
 from nir_render.transport.direct.rays import crossing, length_in_box_m
 from nir_render.transport.world.facets import facets
+from nir_render.transport.world.mitsuba_scene import build
 from tests.paths import SCENES
 
 INF = math.inf
@@ -58,3 +60,11 @@ def test_where_rays_cross_a_facet() -> None:
     along_m, within = crossing(facets(scene.at(0.0)), 0, starts, directions)
     assert along_m.tolist() == [3.0, 3.0, 3.0, 3.0, -3.0, math.inf]
     assert within.tolist() == [True, False, True, False, True, False]
+
+
+@pytest.mark.mitsuba
+def test_no_rays_hit_nothing() -> None:
+    """As of a mirror in which no ray finds its source."""
+    bodies = build(load_scene(SCENES / "one_source.yaml").at(0.0), panes=False)
+    none = np.zeros((0, 3))
+    assert blocked(bodies, none, none, np.zeros(0)).shape == (0,)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nir_render import Scene, load_scene
+from nir_render import Scene, load_scene, render
 from nir_render.transport.backend.variant import backend
 from nir_render.transport.indirect.guide import guide
 from nir_render.transport.indirect.kernel import connect
 from nir_render.transport.indirect.kernel.draws import lane_draws
-from nir_render.transport.indirect.kernel.tables import upload_guide, upload_lights
+from nir_render.transport.indirect.kernel.tables import along_table, upload_guide, upload_lights
 from nir_render.transport.world import mitsuba_scene as world
 from nir_render.transport.world.emitters import emitters
 from nir_render.transport.world.facets import facets
@@ -177,6 +177,34 @@ def test_a_large_lamp_is_aimed_at_evenly_from_right_before_it(
     assert weight_sr.max() < 2.0 * np.pi * (1.0 + 1e-5)
 
 
+def test_a_lamp_seen_from_its_own_plane_has_rays_too(room: Scene) -> None:
+    """From beside a lamp of 2.1 m, 0.1 to 60 µm off its plane, where its solid angle rounds to nothing.
+
+    Such places met one path in 10⁶ in fog; their directions were no numbers, and were lost or read foreign memory.
+    """
+    mi = backend().mi
+    lamp = room.with_({"lamps.one.size": "[2.1, 2.1] m"})
+    lights = upload_lights(
+        emitters(lamp.at(0.0), facets(lamp.at(0.0))), np.ones(4), [None] * 4, np.stack([np.eye(3)] * 4)
+    )
+    random = np.random.default_rng(5)
+    u, v, along, beside, below = random.random((5, 100_000)).astype(np.float32)
+    below_m = 1e-7 * 600.0**below
+    place = mi.Point3f(1.0 + 1.05 + 0.01 + 0.2 * beside, -1.0 + 2.1 * (along - 0.5), 2.5 - below_m)
+    row, whole = mi.UInt32(3), mi.Bool(True)
+    aim = connect.aim_at_light(lights, row, place, mi.Float(u), mi.Float(v), whole)
+    for value in (*aim.direction, aim.reach, aim.density):
+        assert np.isfinite(np.array(value)).all()
+    assert (np.array(aim.density) > 0.0).all()
+    assert (np.array(connect.aim_density(lights, row, place, aim.direction, whole)) > 0.0).all()
+
+
+def test_what_is_no_number_has_the_first_place_in_a_table() -> None:
+    mi = backend().mi
+    places = mi.Float(float("nan"), float("inf"), -float("inf"), -0.5, 0.25, 3.75, 9.0)
+    assert np.array(along_table(places, 3.5)).tolist() == [0.0, 3.5, 0.0, 0.0, 0.25, 3.5, 3.5]
+
+
 @pytest.mark.parametrize("distance_m", [0.02, 0.5, 10.0, 50.0])
 def test_a_sphere_is_aimed_at_evenly_over_its_cone(room: Scene, distance_m: float) -> None:
     """Density 1/(2π(1 − cos α)) to float32, even for 10 mm at 50 m, where 1 − cos α is 2e-8."""
@@ -209,3 +237,38 @@ def test_images_stand_behind_their_mirror_and_shine_as_the_light_itself(room: Sc
     np.testing.assert_allclose(shining.normal[7], shining.normal[3] * [1, -1, 1], atol=1e-12)
     np.testing.assert_array_equal(shining.radiance[4:], shining.radiance[:4])
     np.testing.assert_array_equal(shining.facet, [-1] * 4 + [0] * 4)
+
+
+FOG = """
+format: 1
+observe: [r1.front]
+render: {indirect: {scale: 4, samples: 8, max_depth: 6}}
+fog: {extinction: 0.5 /m, albedo: 0.9, phase: {type: henyey_greenstein, g: 0.85}, center: "[1, 0, 1] m", size: "[4, 4, 2] m"}
+sun: {azimuth: 30 deg, elevation: 40 deg, irradiance: 0.3 W/m^2/nm}
+lamps: {one: {center: "[1, -1, 2.5] m", size: "[0.8, 0.3] m", luminous_flux: 3000 lm, temperature: 2856 K}}
+robots:
+  r1: {rig: infra_swarm}
+  r2: {rig: infra_swarm, position: "[2, 1, 0] m"}
+materials: {paint: {type: diffuse, reflectance: 0.5}, silver: {type: mirror, reflectance: 0.9}}
+shapes:
+  floor: {type: rectangle, center: "[0, 0, 0] m", size: "[8, 6] m", normal: [0, 0, 1], material: paint}
+  mirror: {type: rectangle, center: "[0, 3, 1] m", size: "[2, 2] m", normal: [0, -1, 0], material: silver}
+"""
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("swarm", [0, 20], ids=["few lights", "many lights"])
+def test_no_lane_reads_outside_a_table(swarm: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Also lanes that rest: beside the fog, past the last surface. Dr.Jit's debug mode tells each such read."""
+    mi, dr = backend().mi, backend().dr
+    more = "".join(
+        f'  s{k}: {{rig: infra_swarm, position: "[2, {0.1 * k - 1}, 0] m"}}\n' for k in range(swarm)
+    )
+    path = tmp_path / "fog.yaml"
+    path.write_text(FOG.replace("materials:", f"{more}materials:"))
+    scene = load_scene(path)
+    with dr.scoped_set_flag(dr.JitFlag.Debug, True):
+        render(scene, "r1.front")
+        assert "out-of-bounds" not in capfd.readouterr().err
+        dr.eval(dr.gather(mi.Float, dr.opaque(mi.Float, 1.0, 4), dr.opaque(mi.UInt32, 5)))
+        assert "out-of-bounds read from position 5 in an array of size 4" in capfd.readouterr().err
