@@ -117,9 +117,8 @@ def _images(
     return scene, lights, sharp, plain, [electrons(light, False) for light in full]
 
 
-@pytest.mark.parametrize(
-    ("name", "scale"), [("arena", 4), pytest.param("corridor", 2, marks=pytest.mark.verify)]
-)
+@pytest.mark.parametrize(("name", "scale"), [("arena", 4), ("corridor", 2)])
+@pytest.mark.verify
 def test_the_error_is_below_a_hundredth_of_the_sensors_noise(name: str, scale: int) -> None:
     scene, lights, sharp, plain, full = _images(name, scale)
     assert lights[0].indirect is not None
@@ -165,7 +164,7 @@ shapes:
 """
 
 
-@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("scale", [2, pytest.param(4, marks=pytest.mark.verify)])
 def test_an_error_in_few_pixels_is_found(scale: int, tmp_path: Path) -> None:
     """A robot's source 30 cm above the floor: half of the error is in the 20 pixels below it, of 19 200.
 

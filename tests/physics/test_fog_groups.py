@@ -29,7 +29,8 @@ Array = NDArray[np.float64]
 RADIUS_M = 0.02
 
 
-@pytest.mark.parametrize("number", [24, pytest.param(48, marks=pytest.mark.verify)])
+@pytest.mark.verify
+@pytest.mark.parametrize("number", [24, 48])
 def test_each_of_many_sources_shines_in_fog_as_if_alone(make: Loader, number: int) -> None:
     """With more lights than fog weighs one by one, some are proposed, and one is taken: right for each on average.
 

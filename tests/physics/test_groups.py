@@ -122,7 +122,7 @@ def _stock(room: str, emitting: list[list[str]], batches: int) -> Array:
 
 @pytest.fixture(
     scope="module",
-    params=["diffuse room", *(pytest.param(room, marks=pytest.mark.verify) for room in list(ROOMS)[1:])],
+    params=[pytest.param(room, marks=pytest.mark.verify) for room in ROOMS],
 )
 def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
     if not backend().vectorised:

@@ -86,7 +86,7 @@ def test_a_source_behind_a_pane_stands_in_the_table_alone(make: Loader, index: f
     np.testing.assert_allclose(passed, [[expected]], rtol=1e-4)
 
 
-@pytest.mark.parametrize("index", PANE_INDICES)
+@pytest.mark.parametrize("index", [1.5, pytest.param(4.0, marks=pytest.mark.verify)])
 def test_a_lamp_lights_a_wall_through_a_pane(make: Loader, index: float) -> None:
     """A large near lamp, a pane halfway, a diffuse wall: L = (ρ/π) ∫ L_lamp T cos² / d² dA, by midpoints.
 
@@ -125,12 +125,13 @@ FLOORS: dict[str, dict[str, Any]] = {
     "gloss": {"type": "plastic", "index": 1.5, "reflectance": 0.3, "roughness": 0.0},
     "glass": {"type": "dielectric", "index": 1.5},
 }
+QUICK = ("mirror", "box")  # the others: `make verify`
 
 
 @pytest.mark.parametrize(
     ("floor", "body"),
     [
-        (floor, body)
+        pytest.param(floor, body, marks=() if (floor, body) == QUICK else pytest.mark.verify)
         for floor in FLOORS
         for body in ("rectangle", "box")
         if (floor, body) != ("glass", "rectangle")

@@ -137,6 +137,7 @@ def test_a_campaign_runs_stops_and_goes_on(tmp_path: Path) -> None:
     assert contents(output) == before
 
 
+@pytest.mark.verify
 def test_one_job_that_kills_its_workers_takes_no_other_along(tmp_path: Path) -> None:
     """The first of six jobs that share light; the others are done, and the same command tries it again."""
     file, output = campaign(tmp_path, ranges=1, exposures=6), tmp_path / "out"

@@ -77,7 +77,7 @@ def test_the_first_vertex_is_stratified(samples: int) -> None:
     draw = lane_draws(dr.arange(mi.UInt32, 500), mi.UInt32(3), 99, dr.opaque(mi.UInt32, samples))
     for use in range(6):
         drawn = np.stack(
-            [np.array(draw.vertex(mi.UInt32(k), mi.UInt32(0), use)) for k in range(samples)]
+            [np.array(draw.vertex(dr.opaque(mi.UInt32, k), mi.UInt32(0), use)) for k in range(samples)]
         ).astype(float)
         strata = np.floor(np.sort(drawn, axis=0) * samples)
         # float32 rounds a number at a stratum's upper end into the next, once in 10⁵.
