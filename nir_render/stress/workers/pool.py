@@ -83,7 +83,7 @@ def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Ge
     }
     try:
         with dask.config.set(settings), _client(workers) as client:
-            client.register_plugin(_Context(work), name=_PLUGIN)
+            _tell_workers(client, work)
             order = {job.key: number for number, job in enumerate(jobs)}
             followers: dict[str, list[Job]] = {}
             first: list[Job] = []
@@ -139,6 +139,18 @@ def _started(workers: int) -> LocalCluster:
             if attempt == _STARTS - 1:
                 raise
     raise AssertionError
+
+
+def _tell_workers(client: Client, work: Work) -> None:
+    """Give workers what their jobs share; again where one is killed meanwhile: later ones get it as they start."""
+    for attempt in range(_STARTS):
+        try:
+            client.register_plugin(_Context(work), name=_PLUGIN)
+        except OSError:  # Dask's CommClosedError is one
+            if attempt == _STARTS - 1:
+                raise
+        else:
+            return
 
 
 def _end(cluster: LocalCluster, others: Collection[BaseProcess]) -> None:
