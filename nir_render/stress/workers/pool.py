@@ -142,7 +142,7 @@ def _started(workers: int) -> LocalCluster:
 
 
 def _tell_workers(client: Client, work: Work) -> None:
-    """Give workers what their jobs share; again where one is killed meanwhile: later ones get it as they start."""
+    """Give workers what their jobs share; again where one is killed meanwhile."""
     for attempt in range(_STARTS):
         try:
             client.register_plugin(_Context(work), name=_PLUGIN)
