@@ -7,6 +7,7 @@ angle, and falls on the image where the lens projects it; the PSF spreads it, th
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -60,11 +61,15 @@ class FlareImage:
         Share of the source's whole image (also of what falls outside the window), shape (height, width).
     d_du, d_dv
         Derivative of `fraction` as the image is moved along u and v, per px, same shape.
+    d_dgrowth
+        Derivative of `fraction` as the image grows about its place, by the logarithm of its size, same shape;
+        None where it was not asked for.
     """
 
     fraction: NDArray[np.float64]
     d_du: NDArray[np.float64]
     d_dv: NDArray[np.float64]
+    d_dgrowth: NDArray[np.float64] | None = None
 
 
 def image_radius_px(u_px: float, v_px: float, angular_radius_rad: float, calibration: Calibration) -> float:
@@ -82,7 +87,13 @@ def has_image(u_px: float, v_px: float, angular_radius_rad: float, calibration: 
 
 
 def flare_image(
-    u_px: float, v_px: float, angular_radius_rad: float, window: PixelBox, calibration: Calibration
+    u_px: float,
+    v_px: float,
+    angular_radius_rad: float,
+    window: PixelBox,
+    calibration: Calibration,
+    *,
+    growth: bool = False,
 ) -> FlareImage:
     """Compute the expected image of a sphere: the fraction of its flux in each pixel of a window.
 
@@ -106,6 +117,8 @@ def flare_image(
         The pixels wanted.
     calibration
         Intrinsics, PSF and response.
+    growth
+        Whether to differentiate by the size too.
 
     Returns
     -------
@@ -122,10 +135,18 @@ def flare_image(
     in_x, slope_x = _pixel_shares(x_px, window.left, window.width, calibration.psf_sigma_px)
     in_y, slope_y = _pixel_shares(y_px, window.top, window.height, calibration.psf_sigma_px)
     weighted_y = in_y * weight
+    d_dgrowth = None
+    if growth:
+        # What falls on no pixel stays there.
+        out_x, out_y = (
+            np.where(np.isfinite(at), at - middle, 0.0) for at, middle in ((x_px, u_px), (y_px, v_px))
+        )
+        d_dgrowth = (weighted_y * out_x) @ slope_x.T + (slope_y * weight * out_y) @ in_x.T
     return FlareImage(
         fraction=weighted_y @ in_x.T,
         d_du=weighted_y @ slope_x.T,
         d_dv=(slope_y * weight) @ in_x.T,
+        d_dgrowth=d_dgrowth,
     )
 
 
@@ -145,7 +166,7 @@ def _cap_nodes(
     rings = math.ceil(_RINGS_BASE + _RINGS_SLOPE * fineness)
 
     # dΩ = dh dφ with h = 1 - cos α: uniform in h.
-    node, ring_weight = np.polynomial.legendre.leggauss(rings)
+    node, ring_weight = _gauss_legendre(rings)
     h = (0.5 * (node + 1.0)) * 2.0 * math.sin(0.5 * angular_radius_rad) ** 2
     sin_alpha = np.sqrt(h * (2.0 - h))
     around = np.ceil(
@@ -168,6 +189,12 @@ def _cap_nodes(
     # What lies beyond the lens's fold has no image: its light counts, and falls on no pixel.
     x_px, y_px = np.nan_to_num(project(omega, calibration).T, nan=np.inf)
     return x_px, y_px, weight / weight.sum()
+
+
+@lru_cache(maxsize=256)
+def _gauss_legendre(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    node, weight = np.polynomial.legendre.leggauss(count)
+    return node, weight
 
 
 def _in_front(centre: NDArray[np.float64], angular_radius_rad: float) -> bool:

@@ -1,5 +1,6 @@
 """From a mask to blobs: connected components, and where one of them holds several flares."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,6 +91,44 @@ def split_at_peaks(
     distance2 = np.stack([(rows - row) ** 2 + (columns - column) ** 2 for row, column in peaks])
     nearest = distance2.argmin(axis=0)
     return [_trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
+
+
+def near_groups(blobs: Sequence[Blob], within_px: int) -> list[list[int]]:
+    """Group blobs whose boxes come as near as that to each other, directly or by others between them.
+
+    Returns
+    -------
+    Indices of each group's blobs, groups and blobs in the order given.
+    """
+    if not blobs:
+        return []
+    edges = np.array(
+        [(b.box.top, b.box.left, b.box.top + b.box.height, b.box.left + b.box.width) for b in blobs]
+    )
+    low, high = edges[:, :2], edges[:, 2:]
+    gap_px = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(axis=-1)
+    leader = np.arange(len(blobs))
+    for first, second in np.argwhere(np.triu(gap_px <= within_px, 1)).tolist():
+        one, other = sorted((int(leader[first]), int(leader[second])))
+        leader[leader == other] = one
+    return [np.flatnonzero(leader == each).tolist() for each in np.unique(leader)]
+
+
+def divide(blobs: Sequence[Blob], u_px: NDArray[np.float64], v_px: NDArray[np.float64]) -> list[Blob]:
+    """Divide the pixels of blobs among places, each to the nearest; a place that gets none has its own."""
+    places = np.concatenate([np.argwhere(b.pixels) + np.array([b.box.top, b.box.left]) for b in blobs])
+    nearest = np.argmin((places[:, :1] - v_px) ** 2 + (places[:, 1:] - u_px) ** 2, axis=1)
+    divided = []
+    for index in range(len(u_px)):
+        mine = places[nearest == index]
+        if not len(mine):
+            mine = np.array([[round(float(v_px[index])), round(float(u_px[index]))]])
+        top, left = mine.min(axis=0).tolist()
+        height, width = (mine.max(axis=0) - (top, left) + 1).tolist()
+        pixels = np.zeros((height, width), dtype=bool)
+        pixels[mine[:, 0] - top, mine[:, 1] - left] = True
+        divided.append(Blob(PixelBox(top, left, height, width), pixels))
+    return divided
 
 
 def _brightest(brightness: NDArray[np.floating], mask: NDArray[np.bool_]) -> tuple[int, int]:

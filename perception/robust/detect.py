@@ -6,8 +6,8 @@ import numpy as np
 
 from perception.model.bearing import bearing_body
 from perception.model.sensor import check_frame, gain_dn_per_e
-from perception.robust.blobs import Blob, components, split_at_peaks
-from perception.robust.measure import Candidate, Measurement, candidate, is_extended, measure
+from perception.robust.blobs import Blob, components, near_groups, split_at_peaks
+from perception.robust.measure import Candidate, Measurement, candidate, is_extended, measure_together
 from perception.robust.prepare import PreparedFrame, prepare
 from perception.types import Calibration, Detection, RawFrame
 
@@ -16,6 +16,9 @@ CONTRAST_SIGMAS = 6.03
 
 MAX_FLARES = 100
 """The robust detector measures no more blobs of a frame than this, the brightest: it bounds the time."""
+
+NEAR_PX = 3
+"""Blobs so near to each other are measured by one fit."""
 
 _RING_PX = 4
 _FEWEST_RING_PIXELS = 8
@@ -26,7 +29,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
 
     Counts become electrons; a background on a coarse mesh is subtracted; the rest is matched to the image of
     a point and compared with the level that noise alone passes once in a thousand frames. Each component
-    (divided where it has several maxima) is fitted with the image of a source of known size and strength.
+    is fitted with the image of a source of known size and strength, or with those of several.
 
     Parameters
     ----------
@@ -41,11 +44,11 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         From top to bottom. `area_px` and `mean_dn` are those of the pixels above the detection limit.
         `saturated`: a pixel is clipped; the rest is fitted, and where that does not determine the flux, the
         clipped flux is given as its lower bound, the range that follows is an upper bound, and
-        `range_sigma_m` is NaN. `merged`: the flare shares its component with another, or does not look like
-        one source; its sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror
-        image from a source. Blobs much larger than a source of their flux would be are left out,
-        and so are those that do not stand out from what lies right beside them, and all but the brightest
-        100.
+        `range_sigma_m` is NaN. Flares that overlap are fitted together (`deblend`), and their sigmas know of
+        it. `merged`: what is seen does not look like one source, nor like several that can be told apart; its
+        sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror image from a
+        source. Blobs much larger than a source of their flux would be are left out, and so are those that do
+        not stand out from what lies right beside them, and all but the brightest 100.
 
     Raises
     ------
@@ -61,7 +64,8 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         if _stands_above_surroundings(blob, prepared)
     ]
     flares = _brightest([each for each in candidates if not is_extended(each, prepared)], prepared)
-    measured = [(flare.blob, measure(flare, prepared)) for flare in flares]
+    groups = near_groups([flare.blob for flare in flares], NEAR_PX)
+    measured = [each for group in groups for each in measure_together([flares[k] for k in group], prepared)]
     return [_detection(blob, found, frame, calibration) for blob, found in measured if found.stands_out]
 
 

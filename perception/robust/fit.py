@@ -229,7 +229,12 @@ class Goodness:
 
 
 def core_goodness(
-    image_e: NDArray[np.floating], fit: FlareFit, floor_e2: float, model_error: float
+    image_e: NDArray[np.floating],
+    expected_e: NDArray[np.float64],
+    background_e: float,
+    used: NDArray[np.bool_],
+    floor_e2: float,
+    model_error: float,
 ) -> Goodness:
     """Goodness of fit over the flare's own pixels, allowing for an imperfect model.
 
@@ -241,8 +246,8 @@ def core_goodness(
     ----------
     image_e
         Electrons in the window.
-    fit
-        The fit to judge.
+    expected_e, background_e, used
+        The fit to judge: λ in each pixel, the background of a pixel, and which pixels took part.
     floor_e2
         Variance of a dark pixel.
     model_error
@@ -255,10 +260,10 @@ def core_goodness(
     """
     from scipy.special import chdtrc
 
-    flare_e = fit.expected_e - fit.background_e
-    variance = np.maximum(fit.expected_e, 0.0) + floor_e2
-    core = fit.used & (flare_e > np.sqrt(variance))
-    residual = image_e[core] - fit.expected_e[core]
+    flare_e = expected_e - background_e
+    variance = np.maximum(expected_e, 0.0) + floor_e2
+    core = used & (flare_e > np.sqrt(variance))
+    residual = image_e[core] - expected_e[core]
     chi2 = float(np.sum(residual**2 / (variance[core] + (model_error * flare_e[core]) ** 2)))
     pixels = int(core.sum())
     return Goodness(chi2, pixels, float(chdtrc(pixels, chi2)) if pixels else 1.0)

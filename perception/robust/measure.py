@@ -1,6 +1,7 @@
 """From a blob to its place, flux and range: the fit, and what to do where it cannot be had."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 from perception.model.flare import PixelBox, image_radius_px
 from perception.model.ranging import angular_radius_rad, range_from_flux
 from perception.model.sensor import clip_level_e, gain_dn_per_e, saturation_dn
-from perception.robust.blobs import Blob
+from perception.robust.blobs import Blob, divide
+from perception.robust.deblend import Flares, Window, asks_for_more, deblend
 from perception.robust.fit import aperture_flux, core_goodness
 from perception.robust.prepare import PreparedFrame
 from perception.robust.source_fit import SourceFit, fit_source
@@ -30,7 +32,7 @@ class Measurement:
     """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
 
     `flux_sigma_e` holds for a source of the size found: it says whether there is a flare, not how well its
-    range is known.
+    range is known. `expected_e`: electrons in each pixel of the candidate's window by a lone flare's fit.
     """
 
     u_px: float
@@ -44,6 +46,7 @@ class Measurement:
     range_sigma_m: float
     saturated: bool = False
     misfit: bool = False
+    expected_e: NDArray[np.float64] | None = None
 
     @property
     def stands_out(self) -> bool:
@@ -111,6 +114,75 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
     return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
 
 
+def measure_together(
+    candidates: Sequence[Candidate], prepared: PreparedFrame
+) -> list[tuple[Blob, Measurement]]:
+    """Measure blobs that lie side by side: by one fit of all flares that they hold, where that explains them.
+
+    A blob alone whose own fit leaves nothing over is measured by that. Where flares are clipped, or their
+    joint fit is bad, each blob is measured apart.
+
+    Returns
+    -------
+    A blob and its measurement for each flare.
+    """
+    apart = [(each.blob, measure(each, prepared)) for each in candidates]
+    if any(m.saturated for _, m in apart) or any(c.image_radius_px > MAX_IMAGE_RADIUS_PX for c in candidates):
+        return apart
+    window = _joint_window(candidates, prepared)
+    if len(candidates) == 1:
+        (_, lone), box = apart[0], window.box
+        if lone.expected_e is None or not asks_for_more(window, lone.expected_e, lone.background_e):
+            return apart
+        assert lone.expected_e.shape == (box.height, box.width)
+    flares = deblend(
+        window, [(m.u_px, m.v_px, max(m.flux_e, 1.0)) for _, m in apart], apart[0][1].background_e
+    )
+    if flares is None or flares.count == 1 or not _explains(flares, window):
+        return apart
+    blobs = divide([each.blob for each in candidates], flares.u_px, flares.v_px)
+    return [(blob, _from_joint_fit(flares, index, prepared)) for index, blob in enumerate(blobs)]
+
+
+def _joint_window(candidates: Sequence[Candidate], prepared: PreparedFrame) -> Window:
+    """Return the window that holds those of all candidates; lit pixels of others do not count."""
+    windows = [each.window for each in candidates]
+    top, left = min(w.top for w in windows), min(w.left for w in windows)
+    bottom, right = max(w.top + w.height for w in windows), max(w.left + w.width for w in windows)
+    box = PixelBox(top, left, bottom - top, right - left)
+    own = np.any([_mask_in(box, each.blob) for each in candidates], axis=0)
+    others = _dilate(np.asarray(prepared.lit[box.slices] & ~own), 2)
+    return Window(
+        box=box,
+        image_e=prepared.image_e[box.slices].astype(np.float64),
+        usable=~others,
+        frame=prepared.frame,
+        calibration=prepared.calibration,
+        max_image_radius_px=1.6 * MAX_IMAGE_RADIUS_PX,
+    )
+
+
+def _explains(flares: Flares, window: Window) -> bool:
+    """Tell whether a joint fit leaves no more than noise and an imperfect model do."""
+    good = core_goodness(
+        window.image_e, flares.expected_e, flares.background_e, window.usable, window.floor_e2, MODEL_ERROR
+    )
+    return good.probability >= MISFIT_PROBABILITY
+
+
+def _from_joint_fit(flares: Flares, index: int, prepared: PreparedFrame) -> Measurement:
+    u_sigma_px, v_sigma_px, log_flux_sigma = flares.sigmas(index)
+    flux_e = float(flares.flux_e[index])
+    sigma_e = log_flux_sigma * flux_e
+    return _measurement(
+        (float(flares.u_px[index]), float(flares.v_px[index])),
+        (u_sigma_px, v_sigma_px),
+        (flux_e, sigma_e, flares.background_e),
+        sigma_e * gain_dn_per_e(prepared.frame, prepared.calibration),
+        prepared,
+    )
+
+
 def measure(candidate: Candidate, prepared: PreparedFrame) -> Measurement:
     """Measure one blob; the pixels of all others are left out.
 
@@ -137,12 +209,24 @@ def measure(candidate: Candidate, prepared: PreparedFrame) -> Measurement:
     if candidate.flux_e > 0.0 and not too_large:
         fit = _fit(candidate, free, prepared)
         if fit is not None:
-            good = core_goodness(prepared.image_e[window.slices], fit.fit, prepared.floor_e2, MODEL_ERROR)
+            good = core_goodness(
+                prepared.image_e[window.slices],
+                fit.fit.expected_e,
+                fit.fit.background_e,
+                fit.fit.used,
+                prepared.floor_e2,
+                MODEL_ERROR,
+            )
             misfit = good.probability < MISFIT_PROBABILITY
             recovered = not misfit and fit.flux_sigma_e < CLIPPED_FLUX_SIGMA * fit.fit.flux_e
             if recovered or not saturated:
                 widening = math.sqrt(good.chi2 / good.pixels) if misfit else 1.0
-                return replace(_from_fit(fit, widening, prepared), saturated=saturated, misfit=misfit)
+                return replace(
+                    _from_fit(fit, widening, prepared),
+                    saturated=saturated,
+                    misfit=misfit,
+                    expected_e=fit.fit.expected_e,
+                )
 
     bound = _from_aperture(candidate, free, prepared)
     if saturated:

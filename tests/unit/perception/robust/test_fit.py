@@ -190,6 +190,10 @@ def test_goodness_tells_two_flares_from_one() -> None:
             start=(600.5, 400.0, 2e4, 2.0),
             angular_radius_rad=0.001,
         )
-        probabilities.append(core_goodness(data, fit, noise_floor_e2(camera), 0.05).probability)
+        probabilities.append(
+            core_goodness(
+                data, fit.expected_e, fit.background_e, fit.used, noise_floor_e2(camera), 0.05
+            ).probability
+        )
     assert probabilities[0] > 1e-3
     assert probabilities[1] < 1e-9
