@@ -23,6 +23,8 @@ MISFIT_PROBABILITY = 1e-6
 MAX_IMAGE_RADIUS_PX = 20.0
 """Sources that look larger are measured by aperture: as good for them, and far cheaper than the fit."""
 
+_FEWEST_DARK_PIXELS = 16
+
 CLIPPED_FLUX_SIGMA = 0.25
 """A clipped flare counts as recovered if the fit claims its flux to better than this, relatively."""
 
@@ -119,8 +121,9 @@ def measure_together(
 ) -> list[tuple[Blob, Measurement]]:
     """Measure blobs that lie side by side: by one fit of all flares that they hold, where that explains them.
 
-    A blob alone whose own fit leaves nothing over is measured by that. Where flares are clipped, or their
-    joint fit is bad, each blob is measured apart.
+    A blob alone whose own fit leaves nothing over is measured by that. Where flares are clipped, where what
+    lies around them is not even (enough flares would explain any texture), or where their joint fit is bad,
+    each blob is measured apart.
 
     Returns
     -------
@@ -135,6 +138,8 @@ def measure_together(
         if lone.expected_e is None or not asks_for_more(window, lone.expected_e, lone.background_e):
             return apart
         assert lone.expected_e.shape == (box.height, box.width)
+    if not _stands_on_even_ground(window, prepared):
+        return apart
     flares = deblend(
         window, [(m.u_px, m.v_px, max(m.flux_e, 1.0)) for _, m in apart], apart[0][1].background_e
     )
@@ -160,6 +165,20 @@ def _joint_window(candidates: Sequence[Candidate], prepared: PreparedFrame) -> W
         calibration=prepared.calibration,
         max_image_radius_px=1.6 * MAX_IMAGE_RADIUS_PX,
     )
+
+
+def _stands_on_even_ground(window: Window, prepared: PreparedFrame) -> bool:
+    """Tell whether the unlit pixels of a window scatter about their mean as noise does: χ², to 10⁻⁶."""
+    from scipy.special import chdtrc
+
+    dark = window.usable & ~_dilate(np.asarray(prepared.lit[window.box.slices]), 2)
+    pixels = int(dark.sum())
+    if pixels < _FEWEST_DARK_PIXELS:
+        return False
+    level_e = window.image_e[dark]
+    variance = max(float(level_e.mean()), 0.0) + prepared.floor_e2
+    chi2 = float(np.sum((level_e - level_e.mean()) ** 2)) / variance
+    return float(chdtrc(pixels - 1, chi2)) >= MISFIT_PROBABILITY
 
 
 def _explains(flares: Flares, window: Window) -> bool:
