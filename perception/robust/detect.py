@@ -7,8 +7,9 @@ import numpy as np
 from perception.model.bearing import bearing_body
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.blobs import Blob, components, near_groups, split_at_peaks
-from perception.robust.measure import Candidate, Measurement, candidate, is_extended, measure_together
+from perception.robust.measure import Candidate, Measurement, candidate, is_extended
 from perception.robust.prepare import PreparedFrame, prepare
+from perception.robust.together import measure_together
 from perception.types import Calibration, Detection, RawFrame
 
 CONTRAST_SIGMAS = 6.03

@@ -1,7 +1,6 @@
 """From a blob to its place, flux and range: the fit, and what to do where it cannot be had."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +9,7 @@ from numpy.typing import NDArray
 from perception.model.flare import PixelBox, image_radius_px
 from perception.model.ranging import angular_radius_rad, range_from_flux
 from perception.model.sensor import clip_level_e, gain_dn_per_e, saturation_dn
-from perception.robust.blobs import Blob, divide
-from perception.robust.deblend import Flares, Window, asks_for_more, deblend
+from perception.robust.blobs import Blob
 from perception.robust.fit import aperture_flux, core_goodness
 from perception.robust.prepare import PreparedFrame
 from perception.robust.source_fit import SourceFit, fit_source
@@ -22,8 +20,6 @@ MODEL_ERROR = 0.05
 MISFIT_PROBABILITY = 1e-6
 MAX_IMAGE_RADIUS_PX = 20.0
 """Sources that look larger are measured by aperture: as good for them, and far cheaper than the fit."""
-
-_FEWEST_DARK_PIXELS = 16
 
 CLIPPED_FLUX_SIGMA = 0.25
 """A clipped flare counts as recovered if the fit claims its flux to better than this, relatively."""
@@ -116,92 +112,6 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
     return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
 
 
-def measure_together(
-    candidates: Sequence[Candidate], prepared: PreparedFrame
-) -> list[tuple[Blob, Measurement]]:
-    """Measure blobs that lie side by side: by one fit of all flares that they hold, where that explains them.
-
-    A blob alone whose own fit leaves nothing over is measured by that. Where flares are clipped, where what
-    lies around them is not even (enough flares would explain any texture), or where their joint fit is bad,
-    each blob is measured apart.
-
-    Returns
-    -------
-    A blob and its measurement for each flare.
-    """
-    apart = [(each.blob, measure(each, prepared)) for each in candidates]
-    if any(m.saturated for _, m in apart) or any(c.image_radius_px > MAX_IMAGE_RADIUS_PX for c in candidates):
-        return apart
-    window = _joint_window(candidates, prepared)
-    if len(candidates) == 1:
-        (_, lone), box = apart[0], window.box
-        if lone.expected_e is None or not asks_for_more(window, lone.expected_e, lone.background_e):
-            return apart
-        assert lone.expected_e.shape == (box.height, box.width)
-    if not _stands_on_even_ground(window, prepared):
-        return apart
-    flares = deblend(
-        window, [(m.u_px, m.v_px, max(m.flux_e, 1.0)) for _, m in apart], apart[0][1].background_e
-    )
-    if flares is None or flares.count == 1 or not _explains(flares, window):
-        return apart
-    blobs = divide([each.blob for each in candidates], flares.u_px, flares.v_px)
-    return [(blob, _from_joint_fit(flares, index, prepared)) for index, blob in enumerate(blobs)]
-
-
-def _joint_window(candidates: Sequence[Candidate], prepared: PreparedFrame) -> Window:
-    """Return the window that holds those of all candidates; lit pixels of others do not count."""
-    windows = [each.window for each in candidates]
-    top, left = min(w.top for w in windows), min(w.left for w in windows)
-    bottom, right = max(w.top + w.height for w in windows), max(w.left + w.width for w in windows)
-    box = PixelBox(top, left, bottom - top, right - left)
-    own = np.any([_mask_in(box, each.blob) for each in candidates], axis=0)
-    others = _dilate(np.asarray(prepared.lit[box.slices] & ~own), 2)
-    return Window(
-        box=box,
-        image_e=prepared.image_e[box.slices].astype(np.float64),
-        usable=~others,
-        frame=prepared.frame,
-        calibration=prepared.calibration,
-        max_image_radius_px=1.6 * MAX_IMAGE_RADIUS_PX,
-    )
-
-
-def _stands_on_even_ground(window: Window, prepared: PreparedFrame) -> bool:
-    """Tell whether the unlit pixels of a window scatter about their mean as noise does: χ², to 10⁻⁶."""
-    from scipy.special import chdtrc
-
-    dark = window.usable & ~_dilate(np.asarray(prepared.lit[window.box.slices]), 2)
-    pixels = int(dark.sum())
-    if pixels < _FEWEST_DARK_PIXELS:
-        return False
-    level_e = window.image_e[dark]
-    variance = max(float(level_e.mean()), 0.0) + prepared.floor_e2
-    chi2 = float(np.sum((level_e - level_e.mean()) ** 2)) / variance
-    return float(chdtrc(pixels - 1, chi2)) >= MISFIT_PROBABILITY
-
-
-def _explains(flares: Flares, window: Window) -> bool:
-    """Tell whether a joint fit leaves no more than noise and an imperfect model do."""
-    good = core_goodness(
-        window.image_e, flares.expected_e, flares.background_e, window.usable, window.floor_e2, MODEL_ERROR
-    )
-    return good.probability >= MISFIT_PROBABILITY
-
-
-def _from_joint_fit(flares: Flares, index: int, prepared: PreparedFrame) -> Measurement:
-    u_sigma_px, v_sigma_px, log_flux_sigma = flares.sigmas(index)
-    flux_e = float(flares.flux_e[index])
-    sigma_e = log_flux_sigma * flux_e
-    return _measurement(
-        (float(flares.u_px[index]), float(flares.v_px[index])),
-        (u_sigma_px, v_sigma_px),
-        (flux_e, sigma_e, flares.background_e),
-        sigma_e * gain_dn_per_e(prepared.frame, prepared.calibration),
-        prepared,
-    )
-
-
 def measure(candidate: Candidate, prepared: PreparedFrame) -> Measurement:
     """Measure one blob; the pixels of all others are left out.
 
@@ -220,9 +130,9 @@ def measure(candidate: Candidate, prepared: PreparedFrame) -> Measurement:
     Measurement
     """
     window = candidate.window
-    blob_mask = _mask_in(window, candidate.blob)
+    blob_mask = mask_in(window, candidate.blob)
     saturated = bool(np.any(candidate.clipped & blob_mask))
-    free = ~_dilate(np.asarray(prepared.lit[window.slices] & ~blob_mask), 2)
+    free = ~dilated(np.asarray(prepared.lit[window.slices] & ~blob_mask), 2)
     too_large = candidate.image_radius_px > MAX_IMAGE_RADIUS_PX
 
     if candidate.flux_e > 0.0 and not too_large:
@@ -281,7 +191,7 @@ def _fit(candidate: Candidate, free: NDArray[np.bool_], prepared: PreparedFrame)
 
     u_px, v_px = candidate.u_px, candidate.v_px
     place = (u_px, v_px, float(prepared.background_e[round(v_px), round(u_px)]))
-    first = attempt(free & ~_dilate(clipped, 1), place, _first_fluxes(candidate, prepared))
+    first = attempt(free & ~dilated(clipped, 1), place, _first_fluxes(candidate, prepared))
     if first is None or not clipped.any():
         return first
     fit = first.fit
@@ -304,7 +214,7 @@ def _from_fit(source: SourceFit, widening: float, prepared: PreparedFrame) -> Me
     sigmas_px = (source.u_sigma_px * widening, source.v_sigma_px * widening)
     flux = (fit.flux_e, fit.flux_sigma_e * widening, fit.background_e)
     # Of the range, also what the size assumed adds.
-    return _measurement(
+    return measurement_of(
         (fit.u_px, fit.v_px), sigmas_px, flux, source.flux_sigma_e * gain * widening, prepared
     )
 
@@ -326,10 +236,10 @@ def _from_aperture(candidate: Candidate, free: NDArray[np.bool_], prepared: Prep
     flux = (aperture.flux, aperture.flux_sigma, aperture.background)
     flux_sigma_dn = aperture.flux_sigma * gain_dn_per_e(prepared.frame, prepared.calibration)
     sigmas_px = _centroid_sigmas(candidate, aperture.flux, prepared)
-    return _measurement((u_px, v_px), sigmas_px, flux, flux_sigma_dn, prepared)
+    return measurement_of((u_px, v_px), sigmas_px, flux, flux_sigma_dn, prepared)
 
 
-def _measurement(
+def measurement_of(
     place: tuple[float, float],
     place_sigmas_px: tuple[float, float],
     flux: tuple[float, float, float],
@@ -365,7 +275,7 @@ def _window(blob: Blob, prepared: PreparedFrame) -> PixelBox:
     return PixelBox(top, left, bottom - top, right - left)
 
 
-def _mask_in(window: PixelBox, blob: Blob) -> NDArray[np.bool_]:
+def mask_in(window: PixelBox, blob: Blob) -> NDArray[np.bool_]:
     """Mark the blob's pixels in a mask over a window that holds it."""
     mask = np.zeros((window.height, window.width), dtype=bool)
     top, left = blob.box.top - window.top, blob.box.left - window.left
@@ -373,7 +283,8 @@ def _mask_in(window: PixelBox, blob: Blob) -> NDArray[np.bool_]:
     return mask
 
 
-def _dilate(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+    """Widen a mask by some pixels in each direction, corners too."""
     import cv2
 
     if not mask.any():
