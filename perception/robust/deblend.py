@@ -18,6 +18,7 @@ from perception.model.fisher import covariance, fisher_information
 from perception.model.flare import FlareImage, PixelBox, flare_image, has_image, image_radius_px
 from perception.model.ranging import angular_radius_rad, flux_at_one_metre_dn
 from perception.model.sensor import noise_floor_e2, pixel_variance_e2
+from perception.robust.measure import MODEL_ERROR
 from perception.types import Calibration, RawFrame
 
 Array = NDArray[np.float64]
@@ -31,7 +32,6 @@ LEAST_GAIN = 40.0
 RESIDUAL_SIGMAS = 5.5
 """Where the residual, matched to a point's image, exceeds this, another flare is tried."""
 
-_MODEL_ERROR = 0.05
 _MOST_STEPS = 25
 _MOST_PX_A_STEP = 1.0
 _MOST_LOG_A_STEP = 1.0
@@ -231,7 +231,7 @@ def _model(window: Window, values: Array, background_e: float) -> tuple[Array, A
     expected = np.full((box.height, box.width), background_e)
     rows = []
     for u, v, log_flux in values.tolist():
-        inside = -1.0 <= u - box.left <= box.width and -1.0 <= v - box.top <= box.height
+        inside = -0.5 < u - box.left < box.width - 0.5 and -0.5 < v - box.top < box.height - 0.5
         if not inside or not -5.0 < log_flux < 40.0:
             return None
         flux = math.exp(log_flux)
@@ -264,7 +264,7 @@ def _deviance(window: Window, expected_e: Array) -> float:
 def _variance(window: Window, expected_e: Array, background_e: float) -> Array:
     """Return the variance of pixels, an error of the model of 5 % of the flares' light counted in."""
     variance = pixel_variance_e2(expected_e, window.floor_e2, window.calibration.prnu)
-    return variance + (_MODEL_ERROR * (expected_e - background_e)) ** 2
+    return variance + (MODEL_ERROR * (expected_e - background_e)) ** 2
 
 
 def _gain(window: Window, fewer: Flares, more: Flares) -> float:
