@@ -270,6 +270,45 @@ def lamps(frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
     return {"frames": frames, "lamps": count, "reported": alarms, "reported_share": alarms / count}
 
 
+def empty(kind: str, frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
+    """Frames that hold no source: sheen, sun patches, blinds, or texture of 3 to 20 %, 4 to 30 px."""
+    alarms = 0
+    size = (POINT.height_px, POINT.width_px)
+    rows, columns = np.indices(size, dtype=np.float64)
+    for index in range(frames):
+        generator = random(16, len(kind), index)
+        mean_e = np.full(size, 10.0 ** generator.uniform(1.0, 3.0))
+        if kind == "texture":
+            hills = gaussian_filter(
+                generator.normal(size=size), 10.0 ** generator.uniform(0.6, 1.48), mode="wrap"
+            )
+            mean_e *= np.maximum(1.0 + 10.0 ** generator.uniform(-1.52, -0.7) * hills / hills.std(), 0.05)
+        for _ in range(12):
+            u, v = generator.random(2) * size[::-1]
+            turn, level = generator.uniform(0.0, math.pi), 10.0 ** generator.uniform(2.0, 3.7)
+            x = (columns - u) * math.cos(turn) + (rows - v) * math.sin(turn)
+            y = (rows - v) * math.cos(turn) - (columns - u) * math.sin(turn)
+            if kind == "sheen":  # a glossy lobe, 3 to 30 px wide and longer than wide
+                width = 10.0 ** generator.uniform(0.5, 1.5)
+                mean_e += (
+                    level / (1.0 + (x / width) ** 2 + (y / (width * generator.uniform(1.0, 4.0))) ** 2) ** 1.5
+                )
+            if kind == "sun patches":
+                half_x, half_y = 10.0 ** generator.uniform(0.7, 2.0, 2)
+                mean_e += np.where((abs(x) < half_x) & (abs(y + 0.3 * x) < half_y), level, 0.0)
+        if kind == "blinds":
+            turn, period_px = generator.uniform(-0.3, 0.3), generator.uniform(6.0, 25.0)
+            phase = (rows + turn * columns) / period_px % 1.0
+            mean_e += np.where(phase < 0.5, 10.0 ** generator.uniform(2.0, 3.5), 0.0) * (
+                abs(columns - 280) < 200
+            )
+        frame = expose(
+            gaussian_filter(mean_e, POINT.psf_sigma_px), POINT, random(17, len(kind), index), EXPOSURE_S
+        )
+        alarms += len(perception.detect(frame, POINT, estimator))
+    return {"frames": frames, "false_alarms": alarms, "false_alarms_per_frame": alarms / frames}
+
+
 def crowd(number: int, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
     """Many flares of 2·10³ to 2·10⁵ e⁻ anywhere in a frame of 1280 × 960, and how long each frame takes."""
     camera = replace(POINT, width_px=1280, height_px=960, cx_px=639.5, cy_px=479.5)
@@ -296,6 +335,8 @@ ROWS: dict[str, Callable[..., dict[str, Any]]] = {
     "120 hot pixels": lambda **more: bad_pixels(0, 120, **more),
     **{f"texture of {px} px": lambda px=px, **more: textured(px, **more) for px in (4, 6, 15, 30)},
     "lamps": lamps,
+    **{f"empty, {kind}": lambda kind=kind, **more: empty(kind, **more)
+       for kind in ("texture", "sheen", "sun patches", "blinds")},
     "crowd of 300": lambda **more: crowd(300, **more),
 }  # fmt: skip
 

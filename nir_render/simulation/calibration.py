@@ -78,9 +78,11 @@ def _of_devices(camera: str, device: Camera, sources: tuple[Source, ...]) -> Cal
     constant = float(np.mean(flux_constants))
     of_shares = constant * max(spread.share_sigma for spread in spreads)
     radii_m = [source.radius_m for source in sources]
+    # Through a point spread that is no Gaussian a size seen says nothing: perception knows Gaussians alone.
+    of_size = float(np.mean(radii_m)) if of_shares > 0.0 else 0.0
     spread = {
         "range_constant_dn_m2_per_s": math.hypot(float(np.std(flux_constants)), of_shares),
-        "source_radius_m": float(np.std(radii_m)),
+        "source_radius_m": math.hypot(float(np.std(radii_m)), of_size),
     }
     known = replace(
         _without_rail(camera, device, sources),

@@ -48,6 +48,7 @@ _WIDEST = (0.8, 1.3)  # about the Gaussians that look most like the core
 _BLACK_DN = 2000.0
 _TOP_DN = 60000.0
 _FULL_SCALE_DN = 65535
+_NOT_FOUND = 1e6  # a spread worse than any, and one that a minimiser can reckon with
 # What the answer follows from, besides camera and source: a change of one is another version.
 _CODE = (
     *(f"nir_render/{room}/**/*.py" for room in ("camera", "light", "scene", "spectra")),
@@ -122,8 +123,8 @@ class _RailFrames:
 class _FluxLaw:
     """The share of all light that the fluxes found give together, and how far each of them is from that.
 
-    `spread` is the root of the weighted mean square of their relative distances, infinite where a flare was
-    not found; `uncovered` the largest but for shot noise.
+    `spread` is the root of the weighted mean square of their relative distances, `_NOT_FOUND` where a flare
+    was not found; `uncovered` the largest but for shot noise.
     """
 
     share: float
@@ -203,7 +204,7 @@ def _measured(camera: Camera, source: Source, progress: Progress | None) -> Flar
     ).x
     sigma_px = math.exp(best)
     found = look(sigma_px, law(float(best)).share)
-    if math.isfinite(found.spread):
+    if found.spread < _NOT_FOUND:
         return FlareSpread(sigma_px, found.share, found.uncovered)
     # Perception misses some of the flares whatever the Gaussian: what a point's image has is all there is.
     share = camera.point_spread.core_share * alike[-1].share
@@ -284,7 +285,13 @@ def _law(rail: _RailFrames, sigma_px: float, share: float) -> _FluxLaw:
     """Return what a rail gives with a Gaussian; `share` is that by which perception judges a flare's size."""
     gain = rail.known.system_gain_dn_per_e
     constant = share * gain * rail.at_one_metre_e
-    known = replace(rail.known, psf_sigma_px=sigma_px, range_constant_dn_m2_per_s=constant)
+    # The size may not say how far a source is: what is sought is the flux, whatever the Gaussian.
+    known = replace(
+        rail.known,
+        psf_sigma_px=sigma_px,
+        range_constant_dn_m2_per_s=constant,
+        sigma={"source_radius_m": rail.known.source_radius_m},
+    )
     found = []
     for range_m, exposure_s, image_e in rail.frames:
         counts_dn = np.rint(gain * exposure_s * image_e + _BLACK_DN)
@@ -296,7 +303,7 @@ def _law(rail: _RailFrames, sigma_px: float, share: float) -> _FluxLaw:
             if math.hypot(one.u_px - known.cx_px, one.v_px - known.cy_px) < _NEAR_PX
         ]
         if len(near) != 1 or not near[0] > 0.0:
-            return _FluxLaw(share, math.inf, math.inf)
+            return _FluxLaw(share, _NOT_FOUND, _NOT_FOUND)
         found.append((near[0], exposure_s * rail.at_one_metre_e / range_m**2))
     flux_e, all_e = np.array(found).T
     shot = 1.0 / np.sqrt(flux_e)

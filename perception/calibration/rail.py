@@ -155,8 +155,10 @@ def _brightest_in(frame: RawFrame, range_m: float, calibration: Calibration, est
 
 def _iterate_fit(find: FindIn, indices: Sequence[int], calibration: Calibration) -> _ConvergedFit:
     """Look and fit until the range constant does not change any more, or all passes are used up."""
-    # The constant that is sought has no sigma yet, so a detection claims that of its flux alone.
-    known = replace(calibration, sigma=_without_constants(calibration.sigma))
+    # The constant that is sought has no sigma yet, so a detection claims that of its flux alone. The size may
+    # not say how far a source is, or the flux would follow from the constant that is being tried.
+    free_size = {"source_radius_m": calibration.source_radius_m}
+    known = replace(calibration, sigma={**_without_constants(calibration.sigma), **free_size})
     for passes in range(1, MAX_PASSES + 1):
         sightings = find(indices, known, "robust")
         fit = _fit_range_constant(sightings, known)
@@ -238,10 +240,11 @@ def _held_out_errors(sightings: Sequence[_Sighting]) -> HeldOut:
 
 def _range_limit_m(sighting: _Sighting, found: Detection, calibration: Calibration) -> float:
     """Return the Cramér–Rao σ of the range, from the known range and the background found."""
-    # `flare_limit` knows no gain: a frame at another gain is one of a camera that has it for good.
-    same_camera = at_gain(calibration, sighting.gain)
-    effective_s = effective_exposure_s(
-        found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration
+    # `flare_limit` knows no gain: a frame at another gain is one of a camera that has it for good. Priors are
+    # the same in every frame: what is asked here is what one frame adds.
+    same_camera = replace(at_gain(calibration, sighting.gain), sigma={})
+    effective_s = float(
+        effective_exposure_s(found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration)
     )
     flux_dn = calibration.range_constant_dn_m2_per_s * effective_s / sighting.range_m**2
     background_dn = max(found.background_dn - sighting.black_level_dn, 0.0)

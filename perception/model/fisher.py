@@ -1,36 +1,37 @@
 """The physical limit: how well any unbiased estimator could place and range a flare (Cramér–Rao)."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.flare import FlareImage, PixelBox, flare_image, has_image, image_radius_px
+from perception.model.flare import PixelBox, image_radius_px
 from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import clip_level_e, noise_floor_e2, pixel_variance_e2
+from perception.model.window import Camera, Structure, WindowModel, window_model
 from perception.types import Calibration
 
 WIDE_PX = 64.0
 """Images larger than this, sources within arm's length, have their limit in closed form."""
+
+_RIM_PX = 8.0
+_LEAST_TELLING = 1e-9
 
 
 @dataclass(frozen=True)
 class FlareLimit:
     """Least standard deviations of one flare; infinite where the pixels cannot tell.
 
-    `range_sigma_m` is d/2 · σ_F/F: of the photometry alone, the range constant taken as exact.
+    `range_sigma_m` knows that the range sets flux and size, and of the σ that the calibration states of its
+    range constant, its sources' radius and its point spread.
     """
 
     u_sigma_px: float
     v_sigma_px: float
     flux_sigma_e: float
     range_sigma_m: float
-
-
-def flare_jacobian(image: FlareImage, flux_e: float) -> NDArray[np.float64]:
-    """Differentiate λ = F·S + B by (u, v, F, B); shape (4, height, width)."""
-    return np.stack([flux_e * image.d_du, flux_e * image.d_dv, image.fraction, np.ones_like(image.fraction)])
 
 
 def fisher_information(
@@ -72,6 +73,22 @@ def covariance(information: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))
 
 
+def censored_weight(
+    expected_e: NDArray[np.float64], variance_e2: NDArray[np.float64], clip_e: float
+) -> NDArray[np.float64]:
+    """Share of its information that a pixel keeps which is clipped at a level: 1 far below, 0 far above.
+
+    Of x ~ Normal(λ, σ²) told as min(x, c): Φ(z) - z φ(z) + φ(z)² / Q(z), z = (c - λ) / σ (the variance of the
+    score of a censored normal variable; Cohen, Ann. Math. Stat. 21, 557, 1950).
+    """
+    from scipy.special import log_ndtr, ndtr
+
+    z = np.clip((clip_e - expected_e) / np.sqrt(variance_e2), -38.0, 38.0)
+    log_density = -0.5 * z**2 - 0.5 * math.log(2.0 * math.pi)
+    kept = ndtr(z) - z * np.exp(log_density) + np.exp(2.0 * log_density - log_ndtr(-z))
+    return np.asarray(np.clip(kept, 0.0, 1.0))
+
+
 def _wide_limit(
     calibration: Calibration, range_m: float, flux_e: float, background_e: float, angular_radius: float
 ) -> FlareLimit:
@@ -85,7 +102,8 @@ def _wide_limit(
     lit_e = np.array(flux_e / pixels + max(background_e, 0.0))
     of_pixel_e2 = pixel_variance_e2(lit_e, noise_floor_e2(calibration), calibration.prnu)
     flux_sigma = math.sqrt(pixels * float(of_pixel_e2))
-    return FlareLimit(math.nan, math.nan, flux_sigma, 0.5 * range_m * flux_sigma / flux_e)
+    relative = math.hypot(flux_sigma / flux_e, Camera(calibration, 1.0, 1.0).flux_spread)
+    return FlareLimit(math.nan, math.nan, flux_sigma, 0.5 * range_m * relative)
 
 
 def flare_limit(
@@ -98,54 +116,118 @@ def flare_limit(
     *,
     clipped_tell_nothing: bool = True,
 ) -> FlareLimit:
-    """Cramér–Rao bound of (u, v, flux, background), all four unknown, for one flare.
+    """Cramér–Rao bound of one flare; see `flare_limits`."""
+    (limit,) = flare_limits(
+        calibration, [(u_px, v_px, range_m, flux_e)], background_e, clipped_tell_nothing=clipped_tell_nothing
+    )
+    return limit
 
-    λ = F·S(u, v) + B electrons in a pixel, with variance λ + σ_read² + 1/(12 K²) (shot noise, read noise,
-    rounding). The size of the image is taken as known.
+
+def flare_limits(
+    calibration: Calibration,
+    flares: Sequence[tuple[float, float, float, float]],
+    background_e: float,
+    *,
+    clipped_tell_nothing: bool = True,
+    structure: Structure | None = None,
+) -> list[FlareLimit]:
+    """Cramér–Rao bounds of flares in one another's light: places, ranges and the background are all unknown.
+
+    λ = Σ F·S(u, v, ρ) + B electrons in a pixel (`model.window`), with variance λ + σ_read² + 1/(12 K²) (shot
+    noise, read noise, rounding). Range sets flux and size together; priors are those of the calibration.
 
     Parameters
     ----------
     calibration
-        Camera and source.
-    u_px, v_px
-        Projection of the source's centre; it may lie outside the frame.
-    range_m
-        Distance of the centre; gives the angular radius asin(r / d).
-    flux_e
-        F, electrons in the whole image of the source.
+        Camera and sources.
+    flares
+        u_px, v_px, range_m and flux_e of each: the projection of its centre, which may lie outside the frame,
+        its distance, and the electrons in the whole image of it.
     background_e
         B, electrons per pixel.
     clipped_tell_nothing
-        Leave out pixels whose expected value is clipped.
+        Count pixels as clipped where the camera would clip them: they tell no more than that they are.
+    structure
+        What else may lie on the background, for a window of `limit_box`.
 
     Returns
     -------
-    FlareLimit
+    The bound of each.
 
     Raises
     ------
     ValueError
-        If range or flux is not positive.
+        If a range or flux is not positive.
     """
-    if not (range_m > 0.0 and flux_e > 0.0):
-        raise ValueError(f"range_m and flux_e must be positive, not {range_m} and {flux_e}")
-    angular_radius = angular_radius_rad(range_m, calibration.source_radius_m)
-    if image_radius_px(u_px, v_px, angular_radius, calibration) > WIDE_PX:
-        return _wide_limit(calibration, range_m, flux_e, background_e, angular_radius)
-    if not has_image(u_px, v_px, angular_radius, calibration):
-        return FlareLimit(math.inf, math.inf, math.inf, math.inf)
-    # Beyond 8 σ the pixels tell about the background only, and a ring that wide tells it well enough.
-    half_px = image_radius_px(u_px, v_px, angular_radius, calibration) + 8.0 * calibration.psf_sigma_px + 8.0
-    window = PixelBox.around(u_px, v_px, half_px, calibration)
-    image = flare_image(u_px, v_px, angular_radius, window, calibration)
-    expected_e = flux_e * image.fraction + background_e
-    used = np.ones(expected_e.shape, dtype=bool)
-    if clipped_tell_nothing:
-        used = expected_e < clip_level_e(calibration, calibration.black_level_dn)
+    place = np.array(flares, dtype=np.float64).reshape(-1, 4)
+    if not (place[:, 2:] > 0.0).all():
+        raise ValueError(f"range_m and flux_e must be positive, not {place[:, 2:].tolist()}")
+    radius_rad = angular_radius_rad(place[:, 2], calibration.source_radius_m)
+    radius_px = image_radius_px(place[:, 0], place[:, 1], radius_rad, calibration)
+    if (radius_px > WIDE_PX).any():
+        return [
+            _wide_limit(calibration, *flare[2:], background_e, float(angle))
+            if radius > WIDE_PX
+            else flare_limit(calibration, *flare, background_e, clipped_tell_nothing=clipped_tell_nothing)
+            for flare, angle, radius in zip(flares, radius_rad, radius_px, strict=True)
+        ]
+    box = limit_box(calibration, flares)
+    u_px, v_px, range_m, flux_e = (column[None] for column in place.T)
+    model, imaged = window_model(
+        Camera(calibration, 1.0, 1.0),
+        (np.array([box.top]), np.array([box.left])),
+        (box.height, box.width),
+        (u_px, v_px, np.log(range_m)),
+        structure,
+    )
+    if not imaged[0] or box.height * box.width == 0:
+        return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(flares)
+    model = replace(model, log_flux_at_1_m=np.log(flux_e) + 2.0 * np.log(range_m))
+    values = np.zeros((1, model.layout.size))
+    own = values[:, : model.layout.width].reshape(1, len(flares), -1)
+    own[..., 0], own[..., 1], own[..., 2] = u_px, v_px, np.log(range_m)
+    values[:, model.layout.background] = background_e
+    clip_e = clip_level_e(calibration, calibration.black_level_dn) if clipped_tell_nothing else math.inf
+    expected_e, jacobian = model.expected_e(values)
     variance_e2 = pixel_variance_e2(expected_e, noise_floor_e2(calibration), calibration.prnu)
-    information = fisher_information(flare_jacobian(image, flux_e)[:, used], variance_e2[used])
-    inverse = covariance(information)
+    telling = np.ones(expected_e[0].shape)
+    if clipped_tell_nothing:
+        telling = censored_weight(expected_e, variance_e2, clip_e)[0]
+    used = telling > _LEAST_TELLING
+    information = fisher_information(jacobian[0][:, used], variance_e2[0, used] / telling[used])
+    return _limits(model, place, covariance(information + model.precision[0]))
+
+
+def limit_box(calibration: Calibration, flares: Sequence[tuple[float, float, float, float]]) -> PixelBox:
+    """Return the pixels whose light a bound counts: up to 8 σ from the flares, and a rim.
+
+    Beyond they tell of the background only, and a rim that wide tells that well enough.
+    """
+    place = np.array(flares, dtype=np.float64).reshape(-1, 4)
+    radius_rad = angular_radius_rad(place[:, 2], calibration.source_radius_m)
+    radius_px = np.nan_to_num(image_radius_px(place[:, 0], place[:, 1], radius_rad, calibration))
+    reach_px = radius_px + 8.0 * calibration.psf_sigma_px + _RIM_PX
+    size = (calibration.height_px, calibration.width_px)
+    edges = []
+    for at, length in ((place[:, 1], size[0]), (place[:, 0], size[1])):
+        first = max(0, math.floor(float((at - reach_px).min()) + 0.5))
+        last = min(length, math.floor(float((at + reach_px).max()) + 0.5) + 1)
+        edges.append((first, max(0, last - first)))
+    (top, height), (left, width) = edges
+    return PixelBox(top, left, height, width)
+
+
+def _limits(
+    model: WindowModel, place: NDArray[np.float64], inverse: NDArray[np.float64] | None
+) -> list[FlareLimit]:
+    """Return the bounds that a covariance of all unknowns holds."""
     if inverse is None:
-        return FlareLimit(math.inf, math.inf, math.inf, math.inf)
-    u_sigma, v_sigma, flux_sigma, _ = np.sqrt(np.diagonal(inverse)).tolist()
-    return FlareLimit(u_sigma, v_sigma, flux_sigma, 0.5 * range_m * flux_sigma / flux_e)
+        return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(place)
+    limits, step = [], model.layout.per_source
+    for index, (_, _, range_m, flux_e) in enumerate(place.tolist()):
+        own = inverse[index * step : (index + 1) * step, index * step : (index + 1) * step]
+        slack = np.zeros(()) if model.layout.has_slack else None
+        _, log_sigma = model.camera.log_range(np.zeros(()), slack, own[2:, 2:])
+        u_sigma, v_sigma, l_sigma = np.sqrt(np.diagonal(own)[:3]).tolist()
+        limits.append(FlareLimit(u_sigma, v_sigma, 2.0 * l_sigma * flux_e, range_m * float(log_sigma)))
+    return limits

@@ -63,18 +63,19 @@ def unproject(points_px: Array, calibration: Calibration) -> Array:
     return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
 
-def stretch(direction: Array, calibration: Calibration) -> float:
-    """Return how many pixels the image moves, at most, per radian of a unit direction, shape (3,).
+def stretch(direction: Array, calibration: Calibration) -> Array:
+    """Return how many pixels the image moves, at most, per radian of unit directions, shape (n, 3) → (n,).
 
     NaN where there is no direction.
     """
     focal_px = (calibration.fx_px, calibration.fy_px)
     if calibration.lens_model == "rectilinear":
-        return max(focal_px) / float(direction[2]) ** 2  # along the radius; across it by 1 / cos θ
-    if np.isnan(direction).any():
-        return math.nan
-    slope = np.diag(focal_px) @ distortion_of(calibration).derivative(direction)
-    return float(np.linalg.norm(slope, ord=2))
+        return np.asarray(max(focal_px) / direction[:, 2] ** 2)  # along the radius; across it by 1 / cos θ
+    lens, most = distortion_of(calibration), np.full(len(direction), np.nan)
+    for index in np.flatnonzero(~np.isnan(direction).any(axis=1)):
+        slope = np.diag(focal_px) @ lens.derivative(direction[index])
+        most[index] = np.linalg.norm(slope, ord=2)
+    return most
 
 
 def distortion_of(calibration: Calibration) -> "Distortion":

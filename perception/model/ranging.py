@@ -4,9 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from perception.model.bearing import field_angle_rad
 from perception.types import Calibration
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -18,37 +21,43 @@ class Range:
 
 
 def effective_exposure_s(
-    u_px: float, v_px: float, exposure_s: float, gain: float, calibration: Calibration
-) -> float:
+    u_px: ArrayLike, v_px: ArrayLike, exposure_s: float, gain: float, calibration: Calibration
+) -> Array:
     """Exposure that would give as much flux at unit gain on the axis: t g cos θ · response(θ).
 
     The lens's aperture is seen tilted, and the response (filter, vignetting) changes with the field angle θ.
     The response is taken at the centre of the source. NaN beyond the last angle of the response table: it is
-    not extrapolated.
+    not extrapolated. Places are numbers or arrays of one shape, which the result has.
     """
-    theta = float(field_angle_rad([[u_px, v_px]], calibration)[0])
-    response = float(
-        np.interp(
-            theta,
-            calibration.response_angle_rad,
-            calibration.response_relative,
-            left=math.nan,
-            right=math.nan,
-        )
+    places = np.stack(np.broadcast_arrays(u_px, v_px), axis=-1).astype(np.float64)
+    theta = field_angle_rad(places.reshape(-1, 2), calibration).reshape(places.shape[:-1])
+    response = np.interp(
+        theta,
+        calibration.response_angle_rad,
+        calibration.response_relative,
+        left=math.nan,
+        right=math.nan,
     )
-    return exposure_s * gain * math.cos(theta) * response
+    return np.asarray(exposure_s * gain * np.cos(theta) * response)
 
 
 def flux_at_one_metre_dn(
-    u_px: float, v_px: float, exposure_s: float, gain: float, calibration: Calibration
-) -> float:
+    u_px: ArrayLike, v_px: ArrayLike, exposure_s: float, gain: float, calibration: Calibration
+) -> Array:
     """Integrated flux, in counts, that a source one metre away in the direction of a pixel would give.
 
     K times `effective_exposure_s`; NaN where that is.
     """
-    return calibration.range_constant_dn_m2_per_s * effective_exposure_s(
-        u_px, v_px, exposure_s, gain, calibration
-    )
+    exposed_s = effective_exposure_s(u_px, v_px, exposure_s, gain, calibration)
+    return np.asarray(calibration.range_constant_dn_m2_per_s * exposed_s)
+
+
+def flux_at_one_metre_e(
+    u_px: ArrayLike, v_px: ArrayLike, exposure_s: float, gain: float, calibration: Calibration
+) -> Array:
+    """As `flux_at_one_metre_dn`, in electrons."""
+    at_one_metre_dn = flux_at_one_metre_dn(u_px, v_px, exposure_s, gain, calibration)
+    return np.asarray(at_one_metre_dn / (calibration.system_gain_dn_per_e * gain))
 
 
 def range_from_flux(
@@ -84,7 +93,7 @@ def range_from_flux(
     Range
         NaN for flux that is not positive, or a direction beyond the response table.
     """
-    at_one_metre_dn = flux_at_one_metre_dn(u_px, v_px, exposure_s, gain, calibration)
+    at_one_metre_dn = float(flux_at_one_metre_dn(u_px, v_px, exposure_s, gain, calibration))
     if not (flux_dn > 0.0 and at_one_metre_dn > 0.0):
         return Range(math.nan, math.nan)
     relative = flux_sigma_dn / flux_dn
@@ -97,14 +106,17 @@ def range_from_flux(
     return Range(range_m, 0.5 * range_m * math.hypot(relative, constant_relative))
 
 
-def angular_radius_rad(range_m: float, source_radius_m: float) -> float:
-    """Angular radius of a sphere, asin(r / d), d the distance of its centre.
+def angular_radius_rad(range_m: ArrayLike, source_radius_m: float) -> Array:
+    """Angular radius of a sphere, asin(r / d), d the distance of its centre, a number or an array.
 
     A distance below 1.05 r counts as 1.05 r: a trial value of a fit may put the camera inside the source.
 
     Examples
     --------
-    >>> round(angular_radius_rad(2.0, 0.01), 6)
+    >>> round(float(angular_radius_rad(2.0, 0.01)), 6)
     0.005
     """
-    return math.asin(source_radius_m / max(range_m, 1.05 * source_radius_m)) if source_radius_m > 0.0 else 0.0
+    distance_m = np.maximum(np.asarray(range_m, dtype=np.float64), 1.05 * source_radius_m)
+    if not source_radius_m > 0.0:
+        return np.zeros_like(distance_m)
+    return np.asarray(np.arcsin(source_radius_m / distance_m))

@@ -64,7 +64,9 @@ def noise_floor_e2(calibration: Calibration, gain: float = 1.0) -> float:
     return calibration.read_noise_e**2 + calibration.dsnu_e**2 + rounding_e2
 
 
-def pixel_variance_e2(expected_e: NDArray[np.float64], floor_e2: float, prnu: float) -> NDArray[np.float64]:
+def pixel_variance_e2(
+    expected_e: NDArray[np.float64], floor_e2: float | NDArray[np.float64], prnu: float
+) -> NDArray[np.float64]:
     """Variance of pixels that expect some electrons: max(λ, 0) + (PRNU λ)² + that of a dark pixel.
 
     An expectation below black level (an offset that drifted) has no negative shot noise.

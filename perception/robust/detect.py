@@ -6,20 +6,14 @@ import numpy as np
 
 from perception.model.bearing import bearing_body
 from perception.model.sensor import check_frame, gain_dn_per_e
-from perception.robust.blobs import Blob, components, near_groups, split_at_peaks
-from perception.robust.measure import Candidate, Measurement, candidate, is_extended
+from perception.robust.blobs import Blob, components, split_at_peaks
+from perception.robust.clusters import candidates, clusters, is_extended
+from perception.robust.measure import Measurement, measure
 from perception.robust.prepare import PreparedFrame, prepare
-from perception.robust.together import measure_together
 from perception.types import Calibration, Detection, RawFrame
 
 CONTRAST_SIGMAS = 6.03
 """As for detection against the coarse background: Gaussian noise passes 8e-10 of the time."""
-
-MAX_FLARES = 100
-"""The robust detector measures no more blobs of a frame than this, the brightest: it bounds the time."""
-
-NEAR_PX = 3
-"""Blobs so near to each other are measured by one fit."""
 
 _RING_PX = 4
 _FEWEST_RING_PIXELS = 8
@@ -49,7 +43,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         it. `merged`: what is seen does not look like one source, nor like several that can be told apart; its
         sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror image from a
         source. Blobs much larger than a source of their flux would be are left out, and so are those that do
-        not stand out from what lies right beside them, and all but the brightest 100.
+        not stand out from what lies right beside them.
 
     Raises
     ------
@@ -58,15 +52,15 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     """
     check_frame(frame, calibration)
     prepared = prepare(frame, calibration)
-    candidates = [
-        candidate(blob, prepared)
+    blobs = [
+        blob
         for component in components(prepared.lit)
         for blob in _split(component, prepared)
         if _stands_above_surroundings(blob, prepared)
     ]
-    flares = _brightest([each for each in candidates if not is_extended(each, prepared)], prepared)
-    groups = near_groups([flare.blob for flare in flares], NEAR_PX)
-    measured = [each for group in groups for each in measure_together([flares[k] for k in group], prepared)]
+    flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
+    measured = measure(clusters(flares, prepared), prepared)
+    measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
     return [_detection(blob, found, frame, calibration) for blob, found in measured if found.stands_out]
 
 
@@ -132,19 +126,9 @@ def _detection(blob: Blob, measured: Measurement, frame: RawFrame, calibration: 
         background_dn=frame.black_level_dn + measured.background_e * gain,
         area_px=blob.area_px,
         saturated=measured.saturated,
-        merged=blob.touching or measured.misfit,
+        merged=measured.misfit,
         ghost=False,
         range_m=measured.range_m,
         range_sigma_m=measured.range_sigma_m,
         bearing_body=(x, y, z),
     )
-
-
-def _brightest(candidates: list[Candidate], prepared: PreparedFrame) -> list[Candidate]:
-    """Keep the brightest, in the order in which they are."""
-    if len(candidates) <= MAX_FLARES:
-        return candidates
-    blobs = [each.blob for each in candidates]
-    peaks = [float(prepared.filtered_e[blob.box.slices][blob.pixels].max()) for blob in blobs]
-    kept = np.sort(np.argsort(peaks)[-MAX_FLARES:])
-    return [candidates[index] for index in kept]

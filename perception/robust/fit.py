@@ -1,269 +1,252 @@
-"""How much light a flare gives: by an aperture, and by the maximum-likelihood fit."""
+"""The maximum-likelihood fit of flares, all windows of one size at once.
 
-import math
+What is maximised is `model.likelihood` with the λ and the priors of `model.window`, by damped Fisher scoring.
+"""
+
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.fisher import covariance, fisher_information, flare_jacobian
-from perception.model.flare import PixelBox, flare_image, has_image
-from perception.model.sensor import noise_floor_e2, pixel_variance_e2
-from perception.types import Calibration
+from perception.model.likelihood import Likelihood, Windows
+from perception.model.window import Camera, Structure, WindowModel, window_model
 
-_MAX_STEPS = 20
+Array = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class ApertureFlux:
-    """Flux within a circle above the background of a ring, in the unit of the image.
-
-    `background` is per pixel; `flux_sigma` comes from the scatter within the ring and the flux's own shot
-    noise (one unit of the image taken as one electron).
-    """
-
-    flux: float
-    flux_sigma: float
-    background: float
-
-
-def aperture_flux(
-    image: NDArray[np.floating],
-    u_px: float,
-    v_px: float,
-    radius_px: float,
-    ring_inner_px: float,
-    ring_outer_px: float,
-    usable: NDArray[np.bool_] | None = None,
-) -> ApertureFlux:
-    """Sum an image over a circle, above the mean of a ring around it.
-
-    Whole pixels only, by their centres: make the aperture wide enough that nothing of the flare lies on its
-    rim (image radius + 5 σ leaves out less than 1e-5).
-
-    Parameters
-    ----------
-    image
-        Electrons (or any linear unit), shape (rows, columns).
-    u_px, v_px
-        Centre, in pixels of `image`.
-    radius_px, ring_inner_px, ring_outer_px
-        Radius of the aperture; the ring lies between its two.
-    usable
-        Pixels that count, shape of `image`; all by default. What is left out of the aperture is missing
-        from the flux.
-
-    Returns
-    -------
-    ApertureFlux
-        Background zero, and NaN sigma, if the ring holds fewer than two pixels.
-
-    Raises
-    ------
-    ValueError
-        If the radii do not increase.
-    """
-    if not 0.0 < radius_px <= ring_inner_px < ring_outer_px:
-        raise ValueError(
-            "need 0 < radius_px ≤ ring_inner_px < ring_outer_px, "
-            f"not {radius_px}, {ring_inner_px}, {ring_outer_px}"
-        )
-    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    distance2 = (columns - u_px) ** 2 + (rows - v_px) ** 2
-    inside = distance2 <= radius_px**2
-    ring = (distance2 > ring_inner_px**2) & (distance2 <= ring_outer_px**2)
-    if usable is not None:
-        inside &= usable
-        ring &= usable
-    ring_values = np.asarray(image[ring], dtype=np.float64)
-    background, pixel_variance = 0.0, math.nan
-    if ring_values.size >= 2:
-        background, pixel_variance = float(ring_values.mean()), float(ring_values.var(ddof=1))
-    count = int(inside.sum())
-    flux = float(image[inside].sum(dtype=np.float64)) - count * background
-    # The background's own error enters once per pixel of the aperture, fully correlated.
-    variance = max(flux, 0.0) + count * pixel_variance * (1.0 + count / max(ring_values.size, 1))
-    return ApertureFlux(flux, math.sqrt(variance) if variance >= 0.0 else math.nan, background)
+_MOST_STEPS = 50
+_MOST_LAYOUTS = 6
+_SETTLED_SIGMAS = 0.01
+_LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e7
+_MOST_PX_A_STEP, _MOST_LOG_A_STEP, _MOST_SLACK_A_STEP = 1.0, 0.5, 3.0
+# How far the range by size may move before images are laid out anew: their shape changes with its square.
+_LAYOUT_KEPT = 0.02
+_LAYOUT_KEPT_PX = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class FlareFit:
-    """Maximum-likelihood estimate of one flare, in electrons.
+class Starts:
+    """First guesses: places and ln ranges, shape (windows, sources), and backgrounds, shape (windows,)."""
+
+    u_px: Array
+    v_px: Array
+    log_range: Array
+    background_e: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Maximum-likelihood estimates of some windows.
 
     Attributes
     ----------
-    u_px, v_px, flux_e, background_e
-        The estimate; the background is per pixel.
+    model
+        The model, laid out about the estimates.
+    values
+        Estimates, shape (windows, unknowns), in the order of the model's layout.
     covariance
-        Of (u, v, flux, background), shape (4, 4): the inverse Fisher information. NaN if not converged.
-    reduced_chi2
-        Σ (x - λ)² / variance over the used pixels, per degree of freedom: 1 ± √(2/n) if the model holds.
+        Inverse of information and priors, shape (windows, unknowns, unknowns).
     expected_e
-        λ in each pixel of the window, shape (height, width).
-    used
-        The pixels that took part, same shape.
+        λ, shape (windows, rows, columns).
+    deviance
+        −2 ln L, priors included, but for a constant of the data; shape (windows,).
     converged
         Whether the last step was below a hundredth of a standard deviation.
     """
 
-    u_px: float
-    v_px: float
-    flux_e: float
-    background_e: float
-    covariance: NDArray[np.float64]
-    reduced_chi2: float
-    expected_e: NDArray[np.float64]
-    used: NDArray[np.bool_]
-    converged: bool
+    model: WindowModel
+    values: Array
+    covariance: Array
+    expected_e: Array
+    deviance: Array
+    converged: NDArray[np.bool_]
 
     @property
-    def flux_sigma_e(self) -> float:
-        """Standard deviation of the flux."""
-        return math.sqrt(self.covariance[2, 2])
+    def _own(self) -> Array:
+        layout = self.model.layout
+        return self.values[:, : layout.width].reshape(len(self.values), layout.sources, layout.per_source)
+
+    @property
+    def places_px(self) -> Array:
+        """U and v of each source, shape (windows, sources, 2)."""
+        return self._own[..., :2]
+
+    @property
+    def log_photometric_range(self) -> Array:
+        """L of each source, shape (windows, sources)."""
+        return self._own[..., 2]
+
+    @property
+    def flux_e(self) -> Array:
+        """Flux of each source, shape (windows, sources)."""
+        return np.asarray(np.exp(self.model.log_flux_at_1_m - 2.0 * self._own[..., 2]))
+
+    @property
+    def background_e(self) -> Array:
+        """Background of a pixel, its structure left out, shape (windows,)."""
+        return self.values[:, self.model.layout.background]
+
+    def of_source(self, index: int) -> Array:
+        """Return the covariance of one source's (u, v, l[, a]), shape (windows, 3 or 4, 3 or 4)."""
+        step = self.model.layout.per_source
+        own = slice(index * step, (index + 1) * step)
+        return self.covariance[:, own, own]
+
+    def log_range(self, index: int) -> tuple[Array, Array]:
+        """Return ln range and its σ of one source, shape (windows,) each."""
+        own = self._own[:, index]
+        slack = own[:, 3] if self.model.layout.has_slack else None
+        return self.model.camera.log_range(own[:, 2], slack, self.of_source(index)[:, 2:, 2:])
+
+    def image_radius_px(self) -> Array:
+        """Return the radius of each source's image before the point spread, shape (windows, sources)."""
+        model, own = self.model, self._own
+        slack = model.camera.tie_spread * own[..., 3] if model.layout.has_slack else 0.0
+        reach_px = np.where(np.isfinite(model.nodes.u_px), np.hypot(model.nodes.u_px, model.nodes.v_px), 0.0)
+        at_layout = reach_px.max(axis=1).reshape(own.shape[:2])
+        growth = np.exp(model.log_range_at.reshape(own.shape[:2]) - own[..., 2] + slack)
+        return np.asarray(at_layout * growth)
+
+    def flares_e(self) -> Array:
+        """Return what the sources alone are expected to give, shape of `expected_e`."""
+        flares_e = self.expected_e - self.background_e[:, None, None]
+        if (structure := self.model.structure) is not None:
+            amplitudes = self.values[:, -self.model.layout.structure :]
+            flares_e -= np.einsum("gm,gmrc->grc", amplitudes, structure.columns)
+        return np.asarray(flares_e)
 
 
-def fit_flare(
-    image_e: NDArray[np.floating],
-    usable: NDArray[np.bool_],
-    window: PixelBox,
-    calibration: Calibration,
-    *,
-    start: tuple[float, float, float, float],
-    angular_radius_rad: float,
-    gain: float = 1.0,
-) -> FlareFit:
-    """Fit place, flux and background of a flare of known size, by Fisher scoring.
-
-    Maximises the shifted Poisson likelihood, x + σ² ~ Poisson(λ + σ²) with λ = F·S(u, v) + B and σ² the
-    variance of a dark pixel (Snyder et al., J. Opt. Soc. Am. A 12, 272, 1995), whose score is
-    Σ ∂λ (x - λ)/(λ + σ²). The spread of the pixels' responses adds (PRNU λ)² to each pixel's variance. That
-    comes from the model, not from the data: weights from the data
-    would favour pixels that came out low and bias the flux.
+def fit_flares(windows: Windows, camera: Camera, starts: Starts, structure: Structure | None = None) -> Fits:
+    """Fit the same number of flares to each of some windows.
 
     Parameters
     ----------
-    image_e
-        Electrons above black level in the window, shape (height, width).
-    usable
-        Pixels that count, same shape. Clipped pixels must not: leave out their neighbours too, because a
-        choice made by the noise of a pixel biases what remains.
-    window
-        Where the pixels lie.
-    calibration
-        Camera and PSF.
-    start
-        First guess of (u_px, v_px, flux_e, background_e).
-    angular_radius_rad
-        Angular radius of the source, held fixed.
-    gain
-        Gain of the frame relative to the calibrated one (for the rounding noise).
+    windows
+        What is seen.
+    camera
+        The camera, its exposure and priors.
+    starts
+        First guesses.
+    structure
+        What may lie on the backgrounds.
 
     Returns
     -------
-    FlareFit
-        With `converged` False where the pixels do not determine all four, or the steps do not settle.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, or the start is not finite or its flux not positive.
+    Fits
+        With `converged` False where the pixels do not determine all unknowns, where a flare leaves its
+        window, or where the steps do not settle.
     """
-    shape = (window.height, window.width)
-    if image_e.shape != shape or usable.shape != shape:
-        raise ValueError(
-            f"the window has shape {shape}, image_e {image_e.shape}, usable {usable.shape}; they must match"
+    model, imaged = _laid_out(windows, camera, starts.u_px, starts.v_px, starts.log_range, structure)
+    layout = model.layout
+    values = np.zeros((len(starts.u_px), layout.size))
+    own = values[:, : layout.width].reshape(len(values), layout.sources, layout.per_source)
+    own[..., 0], own[..., 1], own[..., 2] = starts.u_px, starts.v_px, starts.log_range
+    values[:, layout.background] = starts.background_e
+    fits = _climb(windows, model, values, imaged)
+    for _ in range(_MOST_LAYOUTS):
+        stale = np.flatnonzero(fits.converged & _moved(fits))
+        if not len(stale):
+            break
+        # Images are laid out for all windows alike; those that stayed find themselves where they were.
+        own = fits.values[:, : layout.width].reshape(own.shape)
+        slack = camera.tie_spread * own[..., 3] if layout.has_slack else 0.0
+        model, imaged = _laid_out(windows, camera, own[..., 0], own[..., 1], own[..., 2] - slack, structure)
+        fits = _climb(windows, model, fits.values, imaged & fits.converged)
+    return fits
+
+
+def _laid_out(
+    windows: Windows,
+    camera: Camera,
+    u_px: Array,
+    v_px: Array,
+    log_range: Array,
+    structure: Structure | None,
+) -> tuple[WindowModel, NDArray[np.bool_]]:
+    corners = (windows.top, windows.left)
+    return window_model(camera, corners, windows.shape, (u_px, v_px, log_range), structure)
+
+
+def _moved(fits: Fits) -> NDArray[np.bool_]:
+    """Tell where a size has changed so much that images should be laid out anew."""
+    model, own = fits.model, fits._own
+    slack = model.camera.tie_spread * own[..., 3] if model.layout.has_slack else 0.0
+    change = np.abs(own[..., 2] - slack - model.log_range_at.reshape(own.shape[:2]))
+    stale = (change > _LAYOUT_KEPT) & (change * fits.image_radius_px() > _LAYOUT_KEPT_PX)
+    return np.asarray(stale.any(axis=1))
+
+
+def _climb(windows: Windows, model: WindowModel, first: Array, alive: NDArray[np.bool_]) -> Fits:
+    """Maximise the likelihood from first values, by Fisher scoring with Levenberg's damping."""
+    count, size = first.shape
+    values = first.copy()
+    covariance = np.full((count, size, size), np.nan)
+    expected = np.zeros((count, windows.image_e[0].size))
+    deviance = np.full(count, np.inf)
+    converged = np.zeros(count, dtype=bool)
+    damping = np.full(count, 1e-3)
+    going = np.flatnonzero(alive)
+    part = Likelihood(windows, model, going)
+    state = part.state(values[going])
+    for _ in range(_MOST_STEPS):
+        if not len(going):
+            break
+        gradient, information = part.slopes(values[going], state)
+        inverse, sound = _inverses(information)
+        free_step = np.einsum("gij,gj->gi", inverse, gradient)
+        sigmas = np.sqrt(np.maximum(np.einsum("gii->gi", inverse), 0.0))
+        settled = sound & (np.abs(free_step) <= _SETTLED_SIGMAS * sigmas)[:, : model.layout.width].all(axis=1)
+        index = going[settled]
+        if part.any_cut and settled.any():
+            inverse, determined = _inverses(part.expected_information(state))
+            sound &= determined | ~settled
+        covariance[index], expected[index] = inverse[settled], state.expected[settled]
+        converged[index] = sound[settled]
+        deviance[index] = part.deviance(values[going], state)[settled]
+        keep = sound & ~settled & (damping[going] < _MOST_DAMPING)
+        if not keep.all():
+            going, part, state = going[keep], part.at(keep), state.at(keep)
+            gradient, information = gradient[keep], information[keep]
+            if not len(going):
+                break
+        # Each window takes its step if it is a good one, and a shorter one the next time if it is not.
+        extra = damping[going, None] * np.einsum("gii->gi", information)
+        step = np.linalg.solve(information + extra[:, :, None] * np.eye(size), gradient[..., None])[..., 0]
+        now = values[going]
+        trial = now + _shortened(model, step)
+        inside = part.inside(trial)
+        trial = np.where(inside[:, None], trial, now)
+        trial_state = part.state(trial)
+        before = part.objective(now, state, state.expected)
+        after = part.objective(trial, state, trial_state.expected)
+        better = inside & (after <= before + 1e-9 * np.abs(before) + 1e-9)
+        values[going] = np.where(better[:, None], trial, now)
+        state = state.replaced(better, trial_state)
+        damping[going] = np.where(
+            better, np.maximum(0.1 * damping[going], _LEAST_DAMPING), 10.0 * damping[going]
         )
-    if not (all(map(math.isfinite, start)) and start[2] > 0.0):
-        raise ValueError(f"start must be finite with a positive flux, not {start}")
-    floor_e2 = noise_floor_e2(calibration, gain)
-    data = image_e[usable].astype(np.float64)
-    u, v, flux, background = start
-    converged = False
-    inverse: NDArray[np.float64] | None = None
-    expected = np.full(shape, background)
-    variance = pixel_variance_e2(expected, floor_e2, calibration.prnu)
-    for _ in range(_MAX_STEPS):
-        if not has_image(u, v, angular_radius_rad, calibration):
-            break
-        image = flare_image(u, v, angular_radius_rad, window, calibration)
-        expected = flux * image.fraction + background
-        variance = pixel_variance_e2(expected, floor_e2, calibration.prnu)
-        jacobian = flare_jacobian(image, flux)[:, usable]
-        inverse = covariance(fisher_information(jacobian, variance[usable]))
-        if inverse is None:
-            break
-        step = inverse @ (jacobian @ ((data - expected[usable]) / variance[usable]))
-        if np.all(np.abs(step) < 0.01 * np.sqrt(np.diagonal(inverse))):
-            converged = True
-            break
-        # A far start makes the linear step overshoot: at most a pixel, and a factor of three, at a time.
-        u += float(np.clip(step[0], -1.0, 1.0))
-        v += float(np.clip(step[1], -1.0, 1.0))
-        flux = float(np.clip(flux + step[2], flux / 3.0, flux * 3.0))
-        background += float(step[3])
-        if not (
-            abs(u - start[0]) < 0.5 * window.width + 1.0 and abs(v - start[1]) < 0.5 * window.height + 1.0
-        ):
-            break
-    degrees = max(data.size - 4, 1)
-    return FlareFit(
-        u_px=u,
-        v_px=v,
-        flux_e=flux,
-        background_e=background,
-        covariance=inverse if converged and inverse is not None else np.full((4, 4), math.nan),
-        reduced_chi2=float(np.sum((data - expected[usable]) ** 2 / variance[usable])) / degrees,
-        expected_e=expected,
-        used=usable,
-        converged=converged,
+    return Fits(model, values, covariance, expected.reshape(windows.image_e.shape), deviance, converged)
+
+
+def _shortened(model: WindowModel, step: Array) -> Array:
+    """Keep steps within what a linear model may be trusted with."""
+    layout = model.layout
+    most = np.full(layout.size, np.inf)
+    most[: layout.width] = np.tile(
+        [_MOST_PX_A_STEP, _MOST_PX_A_STEP, _MOST_LOG_A_STEP, _MOST_SLACK_A_STEP][: layout.per_source],
+        layout.sources,
     )
+    if layout.has_width:
+        most[layout.width] = _MOST_SLACK_A_STEP
+    return np.clip(step, -most, most)
 
 
-@dataclass(frozen=True)
-class Goodness:
-    """χ² over `pixels` pixels, and the probability of one at least as large if the model holds."""
-
-    chi2: float
-    pixels: int
-    probability: float
-
-
-def core_goodness(
-    image_e: NDArray[np.floating],
-    expected_e: NDArray[np.float64],
-    background_e: float,
-    used: NDArray[np.bool_],
-    floor_e2: float,
-    model_error: float,
-) -> Goodness:
-    """Goodness of fit over the flare's own pixels, allowing for an imperfect model.
-
-    The sum of (x - λ)² / (λ + σ² + (ε F S)²) over the used pixels where F·S exceeds their noise. Over the
-    whole window a bad core drowns in good background; without ε a bright flare shows every per cent by
-    which the real PSF, the pixels' gains or the source differ from the model.
-
-    Parameters
-    ----------
-    image_e
-        Electrons in the window.
-    expected_e, background_e, used
-        The fit to judge: λ in each pixel, the background of a pixel, and which pixels took part.
-    floor_e2
-        Variance of a dark pixel.
-    model_error
-        ε, standard deviation of the model relative to the flare's own light.
-
-    Returns
-    -------
-    Goodness
-        Probability 1 if no pixel stands out.
-    """
-    from scipy.special import chdtrc
-
-    flare_e = expected_e - background_e
-    variance = np.maximum(expected_e, 0.0) + floor_e2
-    core = used & (flare_e > np.sqrt(variance))
-    residual = image_e[core] - expected_e[core]
-    chi2 = float(np.sum(residual**2 / (variance[core] + (model_error * flare_e[core]) ** 2)))
-    pixels = int(core.sum())
-    return Goodness(chi2, pixels, float(chdtrc(pixels, chi2)) if pixels else 1.0)
+def _inverses(information: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Invert information matrices, scaled to a unit diagonal; also tell which are not singular."""
+    diagonal = np.einsum("gii->gi", information)
+    sound = np.isfinite(information).all(axis=(1, 2)) & (diagonal > 0.0).all(axis=1)
+    size = information.shape[1]
+    scale = 1.0 / np.sqrt(np.where(sound[:, None], diagonal, 1.0))
+    scaled = np.where(sound[:, None, None], information * scale[:, :, None] * scale[:, None, :], np.eye(size))
+    sound &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-10
+    scaled[~sound] = np.eye(size)
+    return np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :], sound

@@ -6,11 +6,14 @@ filter for a point source with the level that noise alone does not pass.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2
+from perception.model.flare import PixelBox
+from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2, saturation_dn
+from perception.robust.structure import LEAST_RATIO, Texture, autocorrelation, scatter
 from perception.types import Calibration, RawFrame
 
 CELL_PX = 64
@@ -19,6 +22,8 @@ FALSE_ALARMS_PER_PIXEL = 1e-3 / (1280 * 960)
 """Chance that the noise of one pixel passes: by the union bound, one false alarm in a thousand frames."""
 
 _SAMPLES_PER_AXIS = 32
+_SCATTER_SAMPLES_PER_AXIS = 16
+_BAD_SIGMAS = 5.0
 _CLIP_SIGMA = 3.0
 _CLIP_ROUNDS = 3
 _LIMIT_LEVELS = 12
@@ -44,6 +49,10 @@ class PreparedFrame:
         Pixels above the detection limit.
     floor_e2
         Variance of a dark pixel.
+    texture
+        Structure of the background; None where the frame is even.
+    bad
+        Pixels that are stuck or hot; `filtered_e` has them as dark as the background.
     """
 
     frame: RawFrame
@@ -54,6 +63,25 @@ class PreparedFrame:
     filtered_noise: float
     lit: NDArray[np.bool_]
     floor_e2: float
+    texture: Texture | None
+    bad: NDArray[np.bool_]
+
+    @property
+    def clipped_dn(self) -> int:
+        """Count from which on a pixel is clipped."""
+        return saturation_dn(self.calibration, self.frame.gain)
+
+    def lit_in(self, box: PixelBox) -> NDArray[np.bool_]:
+        """Return `lit` in a box that may reach beyond the frame."""
+        rows, columns = self.lit.shape
+        inside = np.zeros((box.height, box.width), dtype=bool)
+        top, left = max(0, -box.top), max(0, -box.left)
+        part = self.lit[
+            max(box.top, 0) : min(box.top + box.height, rows),
+            max(box.left, 0) : min(box.left + box.width, columns),
+        ]
+        inside[top : top + part.shape[0], left : left + part.shape[1]] = part
+        return inside
 
 
 def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
@@ -70,25 +98,139 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     -------
     PreparedFrame
     """
-    import cv2
-
     floor_e2 = noise_floor_e2(calibration, frame.gain)
     kernel = point_kernel(calibration.psf_sigma_px)
     image_e = electrons(frame, calibration)
     mesh_e = background_mesh_e(frame, calibration)
     background_e = spread_mesh(mesh_e, calibration)
-    filtered_e = matched_filter(image_e - background_e, kernel)
-    limit_e = spread_mesh(_limit_mesh_e(mesh_e, floor_e2, kernel), calibration)
+    excess_e = image_e - background_e
+    filtered_noise = float(np.sum(kernel**2))
+    noise_mesh_e = np.sqrt(np.maximum(mesh_e, 0.0) + floor_e2).astype(np.float32)
+    limit_mesh_e = _limit_mesh_e(mesh_e, floor_e2, kernel)
+    filtered_e = matched_filter(excess_e, kernel)
+    ratio = _scatter_ratio(filtered_e, filtered_noise * noise_mesh_e)
+    limit_e = spread_mesh(limit_mesh_e * ratio, calibration)
+    lit = _above(filtered_e, limit_e)
+    bad = bad_pixels(excess_e, image_e, lit, floor_e2, kernel)
+    if bad.any():
+        excess_e[bad] = 0.0
+        filtered_e = matched_filter(excess_e, kernel)
+        lit = _above(filtered_e, limit_e)
+    texture = None
+    if (ratio > 1.0).any():
+        lit |= _local_contrast(
+            filtered_e, limit_mesh_e, filtered_noise * noise_mesh_e, ratio, kernel, calibration
+        )
+        sigma_e = spread_mesh(filtered_noise * noise_mesh_e * np.sqrt(ratio**2 - 1.0), calibration)
+        known = autocorrelation(excess_e, sigma_e, spread_mesh(noise_mesh_e, calibration))
+        texture = Texture(sigma_e, known)
     return PreparedFrame(
         frame=frame,
         calibration=calibration,
         image_e=image_e,
         background_e=background_e,
         filtered_e=filtered_e,
-        filtered_noise=float(np.sum(kernel**2)),
-        lit=np.asarray(cv2.compare(filtered_e, limit_e, cv2.CMP_GT), dtype=bool).reshape(image_e.shape),
+        filtered_noise=filtered_noise,
+        lit=lit,
         floor_e2=floor_e2,
+        texture=texture,
+        bad=bad,
     )
+
+
+def bad_pixels(
+    excess_e: NDArray[np.float32],
+    image_e: NDArray[np.float32],
+    lit: NDArray[np.bool_],
+    floor_e2: float,
+    kernel: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Find pixels that are stuck or hot: far brighter, beside their neighbours, than light could make them.
+
+    Around a point in the middle of a pixel its eight neighbours hold `least` times its light together, around
+    any other image more. A pixel whose neighbours hold less than half of that, and by 5 σ, is none of light,
+    whether it stands alone or beside another.
+
+    Parameters
+    ----------
+    excess_e, image_e
+        Electrons above the background, and above black level, the frame's shape.
+    lit
+        Where to look.
+    floor_e2
+        Variance of a dark pixel.
+    kernel
+        Image of a point along one axis, of odd length.
+
+    Returns
+    -------
+    Mask of the frame's shape.
+    """
+    bad = np.zeros(lit.shape, dtype=bool)
+    rows, columns = np.nonzero(lit)
+    if not len(rows):
+        return bad
+    middle = len(kernel) // 2
+    least = float(kernel[middle - 1 : middle + 2].sum() / kernel[middle]) ** 2 - 1.0
+    around = np.zeros(len(rows))
+    variance = np.zeros(len(rows))
+    for down in (-1, 0, 1):
+        for across in (-1, 0, 1):
+            if not (down or across):
+                continue
+            row, column = rows + down, columns + across
+            inside = (row >= 0) & (row < lit.shape[0]) & (column >= 0) & (column < lit.shape[1])
+            row, column = np.where(inside, row, rows), np.where(inside, column, columns)
+            # What lies beyond the frame is taken to be as bright as the pixel itself.
+            around += excess_e[row, column]
+            variance += np.maximum(image_e[row, column], 0.0) + floor_e2
+    bad[rows, columns] = around + _BAD_SIGMAS * np.sqrt(variance) < 0.5 * least * excess_e[rows, columns]
+    return bad
+
+
+def _above(image_e: NDArray[np.float32], limit_e: NDArray[np.float32]) -> NDArray[np.bool_]:
+    import cv2
+
+    return np.asarray(cv2.compare(image_e, limit_e, cv2.CMP_GT), dtype=bool).reshape(image_e.shape)
+
+
+def _scatter_ratio(image_e: NDArray[np.float32], noise_mesh_e: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Scatter of a filtered image in each cell relative to that of noise; 1 where it is no larger."""
+    import cv2
+
+    ratio = scatter(_cell_samples(image_e, _SCATTER_SAMPLES_PER_AXIS)) / noise_mesh_e
+    smooth = np.asarray(cv2.medianBlur(ratio, 3), dtype=np.float32).reshape(ratio.shape)
+    return np.where(smooth > LEAST_RATIO, smooth, np.float32(1.0))
+
+
+def _local_contrast(
+    filtered_e: NDArray[np.float32],
+    limit_mesh_e: NDArray[np.float32],
+    noise_mesh_e: NDArray[np.float32],
+    ratio: NDArray[np.float32],
+    kernel: NDArray[np.float64],
+    calibration: Calibration,
+) -> NDArray[np.bool_]:
+    """Mark what stands out of its close surroundings where the background has structure.
+
+    A point on a hill that is wider than the point spread does so though the hill is as bright as the point.
+    """
+    import cv2
+
+    side = 2 * len(kernel) - 1
+    contrast_e = filtered_e - cv2.blur(filtered_e, (side, side))
+    widened = np.zeros(side + len(kernel) - 1)
+    middle = (len(widened) - len(kernel)) // 2
+    widened[middle : middle + len(kernel)] = kernel
+    mean = np.convolve(kernel, np.full(side, 1.0 / side))
+    of_noise = math.sqrt(float(np.sum((np.outer(widened, widened) - np.outer(mean, mean)) ** 2)))
+    noise_e = noise_mesh_e * (of_noise / float(np.sum(kernel**2)))
+    limit_e = limit_mesh_e * (of_noise / float(np.sum(kernel**2))) * _scatter_ratio(contrast_e, noise_e)
+    structured = cv2.dilate((ratio > 1.0).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
+    limit_e = np.where(structured > 0.0, limit_e, np.float32(np.inf)).astype(np.float32)
+    # Cells of even ground have no limit here: infinity must not spread into their neighbours.
+    finite = np.where(np.isfinite(limit_e), limit_e, np.float32(1e9))
+    return _above(contrast_e, spread_mesh(finite, calibration))
 
 
 # --- background ---
@@ -116,7 +258,7 @@ def background_mesh_e(frame: RawFrame, calibration: Calibration) -> NDArray[np.f
     import cv2
 
     gain = gain_dn_per_e(frame, calibration)
-    samples = _cell_samples(frame.data_dn)
+    samples = _cell_samples(frame.data_dn, _SAMPLES_PER_AXIS)
     samples.sort(axis=-1)
     count = samples.shape[-1]
     # The lower median is itself a sample, so at least it is always kept.
@@ -144,19 +286,19 @@ def spread_mesh(mesh: NDArray[np.float32], calibration: Calibration) -> NDArray[
     return np.asarray(full, dtype=np.float32).reshape(calibration.height_px, calibration.width_px)
 
 
-def _cell_samples(data_dn: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def _cell_samples(image: NDArray[Any], per_axis: int) -> NDArray[Any]:
     """Pixels of each cell, shape (cells down, cells across, samples)."""
-    down, rows = _sample_places(data_dn.shape[0])
-    across, columns = _sample_places(data_dn.shape[1])
-    taken = data_dn[np.ix_(rows, columns)]
+    down, rows = _sample_places(image.shape[0], per_axis)
+    across, columns = _sample_places(image.shape[1], per_axis)
+    taken = image[np.ix_(rows, columns)]
     blocks = taken.reshape(down, rows.size // down, across, columns.size // across)
     return blocks.transpose(0, 2, 1, 3).reshape(down, across, -1)
 
 
-def _sample_places(length: int) -> tuple[int, NDArray[np.intp]]:
+def _sample_places(length: int, per_axis: int) -> tuple[int, NDArray[np.intp]]:
     """Divide an axis: the number of cells, and the pixels sampled, evenly in each."""
     cells = max(1, round(length / CELL_PX))
-    per_cell = min(_SAMPLES_PER_AXIS, math.floor(length / cells))
+    per_cell = min(per_axis, math.floor(length / cells))
     place = (np.arange(cells * per_cell) + 0.5) * (length / (cells * per_cell))
     return cells, place.astype(np.intp)
 

@@ -41,12 +41,12 @@ def test_light_from_elsewhere_costs_accuracy() -> None:
 def test_a_frame_at_another_gain_has_the_limit_of_a_camera_that_has_it_for_good() -> None:
     """A flare of 10 000 e, a fifth of it in its brightest pixel: at 16 DN/e pixels clip at 4031/16 = 252 e.
 
-    At the calibrated 1 DN/e, where none clips, its limit is far lower.
+    At the calibrated 1 DN/e, where none clips, its limit is lower; the rim of a clipped disc still tells its size.
     """
     for_good = dataclasses.replace(CAMERA, system_gain_dn_per_e=16.0)  # it clips at the ADC's full scale
     row = truth(gain=16.0, background_e=30.0)
     assert source_limits(row, CAMERA) == source_limits(truth(background_e=30.0), for_good)
-    assert source_limits(row, CAMERA)[0] > 3.0 * source_limits(truth(background_e=30.0), CAMERA)[0]
+    assert source_limits(row, CAMERA)[0] > 1.3 * source_limits(truth(background_e=30.0), CAMERA)[0]
 
 
 def test_dark_current_is_background_that_clips_and_makes_noise() -> None:
@@ -56,7 +56,7 @@ def test_dark_current_is_background_that_clips_and_makes_noise() -> None:
     )
     cold, hot = (source_limits(truth(direct_e=1.0, dark_e=e), CAMERA)[0] for e in (0.0, 45.7))
     assert hot / cold == pytest.approx(math.sqrt(145.783 / 100.083), rel=2e-3)
-    assert source_limits(truth(dark_e=4100.0), CAMERA)[0] == math.inf
+    assert source_limits(truth(dark_e=6000.0), CAMERA)[0] == math.inf
 
 
 def test_light_that_glare_takes_tells_nothing() -> None:

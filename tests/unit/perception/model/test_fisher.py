@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from perception.model.fisher import covariance, flare_limit
-from tests.unit.perception.simulation import calibration
+from perception.model.fisher import censored_weight, covariance, flare_limit, flare_limits
+from tests.unit.perception.simulation import calibration, random
 
 
 @pytest.mark.parametrize(
@@ -19,6 +19,7 @@ def test_figures_of_the_physics_page(flux_e: float, position_px: float, range_si
         system_gain_dn_per_e=100.0,
         read_noise_e=5.0,
         saturation_dn=10**9,
+        sigma={},
     )
     limit = flare_limit(camera, 639.5, 479.5, 10.0, flux_e, background_e=16.0)
     assert limit.u_sigma_px == pytest.approx(position_px, rel=0.03)
@@ -36,8 +37,30 @@ def test_bright_point_reaches_the_shot_noise_limit() -> None:
     assert limit.u_sigma_px == pytest.approx(math.sqrt(4.0 + 1 / 12) / 1e3, rel=0.01)
 
 
+def test_two_on_one_bearing_know_less_than_one() -> None:
+    """Points 1 px apart: each is ranged 3 times worse than alone; 20 px apart they do not know of each other."""
+    camera = calibration(source_radius_m=0.0, sigma={})
+    alone = flare_limit(camera, 640.0, 480.0, 9.0, 1e4, 2.0).range_sigma_m
+    near, _ = flare_limits(camera, [(640.0, 480.0, 9.0, 1e4), (641.0, 480.0, 9.5, 9e3)], 2.0)
+    far, _ = flare_limits(camera, [(640.0, 480.0, 9.0, 1e4), (660.0, 480.0, 9.5, 9e3)], 2.0)
+    assert near.range_sigma_m > 3.0 * alone
+    assert far.range_sigma_m == pytest.approx(alone, rel=0.01)
+    same, _ = flare_limits(camera, [(640.0, 480.0, 9.0, 1e4), (640.0, 480.0, 9.0, 1e4)], 2.0)
+    assert same.range_sigma_m == math.inf
+
+
+def test_a_censored_pixel_keeps_what_its_score_varies_by() -> None:
+    """Against the mean square of the score of 10⁶ drawn pixels, clipped at z = -1, 0, 1."""
+    noise = random(31).normal(size=1_000_000)
+    for z in (-1.0, 0.0, 1.0):
+        mills = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi) / (0.5 * math.erfc(z / math.sqrt(2.0)))
+        score = np.where(noise < z, noise, mills)
+        kept = float(censored_weight(np.zeros(1), np.ones(1), z)[0])
+        assert kept == pytest.approx(float(np.mean(score**2)), rel=0.005)
+
+
 def test_clipped_pixels_tell_nothing() -> None:
-    camera = calibration()
+    camera = calibration(source_radius_m=0.0)
     clipped = flare_limit(camera, 639.5, 479.5, 3.0, 1e5, 2.0)
     unclipped = flare_limit(camera, 639.5, 479.5, 3.0, 1e5, 2.0, clipped_tell_nothing=False)
     assert clipped.flux_sigma_e > 1.25 * unclipped.flux_sigma_e

@@ -25,7 +25,7 @@ def test_against_brute_force(u_px: float, v_px: float, range_m: float, cx_px: fl
     """
     camera = calibration(**SMALL, cx_px=cx_px, cy_px=cy_px)
     window = PixelBox(0, 0, 80, 90)
-    image = flare_image(u_px, v_px, angular_radius_rad(range_m, 0.01), window, camera).fraction
+    image = flare_image(u_px, v_px, float(angular_radius_rad(range_m, 0.01)), window, camera).fraction
     brute = expected_e(camera, [(u_px, v_px, range_m)], 1e-3)
     brute /= brute.sum()
     assert float(np.abs(image - brute).max() / brute.max()) < 2e-4
@@ -46,20 +46,24 @@ def test_point_source_is_the_integrated_gaussian() -> None:
 @pytest.mark.parametrize("range_m", [10.0, 1.0, 0.3])
 def test_three_times_the_nodes_change_nothing(range_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = calibration()
-    radius = angular_radius_rad(range_m, 0.01)
-    window = PixelBox.around(1100.3, 800.7, image_radius_px(1100.3, 800.7, radius, camera) + 6.0, camera)
+    radius = float(angular_radius_rad(range_m, 0.01))
+    window = PixelBox.around(
+        1100.3, 800.7, float(image_radius_px(1100.3, 800.7, radius, camera)) + 6.0, camera
+    )
     image = flare_image(1100.3, 800.7, radius, window, camera).fraction
+    flare_model._cap_rule.cache_clear()
     for name in ("_RINGS_BASE", "_RINGS_SLOPE", "_AROUND_BASE", "_AROUND_SLOPE"):
         monkeypatch.setattr(flare_model, name, 3.0 * getattr(flare_model, name))
     dense = flare_image(1100.3, 800.7, radius, window, camera).fraction
-    assert float(np.abs(image - dense).max() / dense.max()) < 1e-5
+    flare_model._cap_rule.cache_clear()
+    assert float(np.abs(image - dense).max() / dense.max()) < 1e-4
 
 
 def test_flux_centroid_is_the_projection_of_the_centre() -> None:
     """At 45°, 1 m, r = 25 mm: the ellipse's middle is off by 0.6 px, the flux centroid by < 1e-4 px."""
     camera = calibration(source_radius_m=0.025)
     u_px, v_px = 639.5 + 480.0, 479.5
-    radius = angular_radius_rad(1.0, 0.025)
+    radius = float(angular_radius_rad(1.0, 0.025))
     window = PixelBox.around(u_px, v_px, 40.0, camera)
     image = flare_image(u_px, v_px, radius, window, camera).fraction
     columns = np.arange(window.left, window.left + window.width)
@@ -76,7 +80,7 @@ def test_a_response_that_falls_outward_pulls_the_centroid_inward() -> None:
     theta = np.linspace(0.0, 1.0, 2001)
     camera = calibration(response_angle_rad=theta, response_relative=1.0 - a * (theta - np.pi / 6))
     u_px = 639.5 + 480.0 * np.tan(np.pi / 6)
-    radius = angular_radius_rad(0.5, 0.01)
+    radius = float(angular_radius_rad(0.5, 0.01))
     window = PixelBox.around(u_px, 479.5, 40.0, camera)
     image = flare_image(u_px, 479.5, radius, window, camera).fraction
     centroid = image.sum(axis=0) @ np.arange(window.left, window.left + window.width) / image.sum()
@@ -88,7 +92,7 @@ def test_a_response_that_falls_outward_pulls_the_centroid_inward() -> None:
 def test_derivatives(range_m: float) -> None:
     """They are those of the image moved as it is: near the axis, where it does not change its shape."""
     camera = calibration()
-    radius, step = angular_radius_rad(range_m, 0.01), 1e-4
+    radius, step = float(angular_radius_rad(range_m, 0.01)), 1e-4
     window = PixelBox.around(639.8, 479.1, 16.0, camera)
     image = flare_image(639.8, 479.1, radius, window, camera)
     right, left = (flare_image(639.8 + s, 479.1, radius, window, camera).fraction for s in (step, -step))

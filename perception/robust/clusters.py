@@ -1,0 +1,274 @@
+"""Blobs become clusters: what is measured by one fit, with a window around it and first guesses."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.flare import PixelBox, image_radius_px
+from perception.model.ranging import angular_radius_rad, flux_at_one_metre_e
+from perception.model.sensor import clip_level_e, saturation_dn
+from perception.robust.blobs import Blob, near_groups
+from perception.robust.prepare import PreparedFrame
+from perception.robust.solve import Start, Window
+from perception.robust.structure import structure_of
+
+Array = NDArray[np.float64]
+
+NEAR_PX = 3
+"""Blobs so near to each other are measured by one fit."""
+
+MOST_BLOBS = 8
+"""Blobs in larger groups are measured one by one, each with the nearest that lie in its window."""
+
+_CROWD_NEIGHBOURS = 3
+_TOUCHING_PX = 4
+
+MAX_IMAGE_RADIUS_PX = 20.0
+"""Sources that look larger are measured by aperture: as good for them, and far cheaper than the fit."""
+
+# So few sizes of windows that those of many flares go through one batch.
+_SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, 129)
+_CLIPPED_FACTORS = (1.0, 4.0, 16.0, 64.0)
+_CUT_FACTORS = (1.0, 2.0, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A blob with what must be known of it before it is measured.
+
+    Attributes
+    ----------
+    blob
+        The flare's pixels.
+    clipped_px
+        How many of them are clipped.
+    u_px, v_px
+        Centroid of the blob, weighted by what exceeds the background.
+    flux_e
+        Sum of what exceeds the background in the blob.
+    at_one_metre_e
+        Flux of a source one metre away in that direction; NaN where no range can be had.
+    image_radius_px
+        Radius that the image of a source of this flux would have; 0 where no range can be had.
+    """
+
+    blob: Blob
+    clipped_px: int
+    u_px: float
+    v_px: float
+    flux_e: float
+    at_one_metre_e: float
+    image_radius_px: float
+
+    @property
+    def is_clipped(self) -> bool:
+        """Whether any pixel is clipped."""
+        return self.clipped_px > 0
+
+    @property
+    def reach_px(self) -> float:
+        """Radius of a disc of the blob's area."""
+        return math.sqrt(self.blob.area_px / math.pi)
+
+    @property
+    def is_too_large(self) -> bool:
+        """Whether it is measured by aperture."""
+        clipped_disc_px = math.sqrt(self.clipped_px / math.pi)
+        return max(self.image_radius_px, clipped_disc_px) > MAX_IMAGE_RADIUS_PX
+
+    def log_range(self, flux_e: float) -> float:
+        """Logarithm of the range of a source of that flux; where no range can be had, of flux 1 at 1 m."""
+        at_one_metre_e = self.at_one_metre_e if self.at_one_metre_e > 0.0 else 1.0
+        return 0.5 * math.log(at_one_metre_e / flux_e)
+
+
+def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate]:
+    """Look at blobs: their centroids and fluxes, and how large sources of these fluxes would look."""
+    if not blobs:
+        return []
+    frame, calibration = prepared.frame, prepared.calibration
+    clipped_dn = saturation_dn(calibration, frame.gain)
+    clipped = [int((frame.data_dn[b.box.slices][b.pixels] >= clipped_dn).sum()) for b in blobs]
+    u_px, v_px, flux_e = np.array([_moments(blob, prepared) for blob in blobs]).T
+    at_one_metre_e = flux_at_one_metre_e(u_px, v_px, frame.exposure_s, frame.gain, calibration)
+    ranged = (at_one_metre_e > 0.0) & (flux_e > 0.0)
+    range_m = np.sqrt(np.where(ranged, at_one_metre_e / np.where(flux_e > 0.0, flux_e, 1.0), 1.0))
+    radius_px = image_radius_px(
+        u_px, v_px, angular_radius_rad(range_m, calibration.source_radius_m), calibration
+    )
+    rows = zip(
+        blobs, clipped, u_px.tolist(), v_px.tolist(), flux_e.tolist(), at_one_metre_e.tolist(),
+        np.where(ranged, radius_px, 0.0).tolist(), strict=True,
+    )  # fmt: skip
+    return [Candidate(*row) for row in rows]
+
+
+def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
+    """Whether a blob is far larger than a source of its flux: a lit wall's edge, a window, a lamp tube.
+
+    Flux tells the range, range the size. The area above half of the maximum (which the PSF's faint tail does
+    not reach) may be four times what a source would cover, so that flares that overlap are kept. Clipped
+    blobs are never called extended, for neither their flux nor their half maximum is known.
+    """
+    if candidate.is_clipped:
+        return False
+    brightness = prepared.filtered_e[candidate.blob.box.slices][candidate.blob.pixels]
+    half_area = int(np.sum(brightness > 0.5 * brightness.max()))
+    # Half maximum of a Gaussian filtered with itself lies at √(2 ln 2) · √2 σ = 1.67 σ.
+    smooth_px = math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
+    return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """Candidates that are measured by one fit, and the window that holds them.
+
+    `wanted` says which of them: the others are there because their light is.
+    """
+
+    members: Sequence[Candidate]
+    wanted: Sequence[int]
+    window: Window
+    background_e: float
+
+    @property
+    def is_in_crowd(self) -> bool:
+        """Whether it is a part of a larger group."""
+        return len(self.wanted) < len(self.members)
+
+    @property
+    def is_clipped(self) -> bool:
+        """Whether any member is."""
+        return any(member.is_clipped for member in self.members)
+
+
+def clusters(members: Sequence[Candidate], prepared: PreparedFrame) -> list[Cluster]:
+    """Group candidates that lie side by side, and cut their windows out of the frame."""
+    blobs = [member.blob for member in members]
+    chosen: list[tuple[list[int], list[int]]] = []
+    for group in near_groups(blobs, NEAR_PX):
+        if len(group) <= MOST_BLOBS:
+            chosen.append((group, list(range(len(group)))))
+            continue
+        places = np.array([(members[k].u_px, members[k].v_px) for k in group])
+        for at, _ in enumerate(group):
+            apart_px = np.abs(places - places[at]).max(axis=1)
+            box = _window_box([members[group[at]]], prepared)
+            nearest = np.argsort(apart_px, kind="stable")[: 1 + _CROWD_NEIGHBOURS]
+            within = [int(k) for k in nearest if apart_px[k] < 0.5 * box.height]
+            chosen.append(([group[k] for k in within], [within.index(at)]))
+    owner = np.zeros(prepared.lit.shape, dtype=np.int32)
+    owner[prepared.lit] = -1
+    for index, blob in enumerate(blobs):
+        owner[blob.box.slices][blob.pixels] = index + 1
+    return [_cluster([members[k] for k in group], group, wanted, owner, prepared) for group, wanted in chosen]
+
+
+def _cluster(
+    members: Sequence[Candidate],
+    indices: Sequence[int],
+    wanted: Sequence[int],
+    owner: NDArray[np.int32],
+    prepared: PreparedFrame,
+) -> Cluster:
+    frame, calibration = prepared.frame, prepared.calibration
+    # In a crowd the window is that of the one that is wanted.
+    about = members if len(wanted) == len(members) else [members[k] for k in wanted]
+    box = _window_box(about, prepared)
+    rows = np.arange(box.top, box.top + box.height)
+    columns = np.arange(box.left, box.left + box.width)
+    height, width = prepared.image_e.shape
+    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+    place = np.ix_(np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1))
+    owners = owner[place]
+    own = np.isin(owners, np.asarray(indices) + 1)
+    others = (owners > 0) & ~own
+    # Light that is no flare's is left out too, unless it touches: then it is what the flare stands on.
+    extended = owners < 0
+    if not (dilated(own, _TOUCHING_PX) & extended).any():
+        others |= extended
+    u_px, v_px = members[0].u_px, members[0].v_px
+    at = (int(np.clip(round(v_px), 0, height - 1)), int(np.clip(round(u_px), 0, width - 1)))
+    texture, structure = prepared.texture, None
+    sigma_e = 0.0 if texture is None else float(texture.sigma_e[at])
+    if texture is not None and sigma_e > 0.0:
+        structure = structure_of(texture.autocorrelation, box.height, sigma_e)
+    window = Window(
+        box=box,
+        image_e=prepared.image_e[place].astype(np.float64),
+        usable=inside & ~dilated(others, 2) & ~prepared.bad[place],
+        clipped=frame.data_dn[place] >= saturation_dn(calibration, frame.gain),
+        floor_e2=prepared.floor_e2,
+        clip_e=clip_level_e(calibration, frame.black_level_dn, frame.gain),
+        prnu=calibration.prnu,
+        structure=structure,
+        structure_e=sigma_e,
+    )
+    return Cluster(members, wanted, window, float(prepared.background_e[at]))
+
+
+def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
+    """Return sets of first guesses, the best of which is to be followed.
+
+    Of a clipped flare, and of one that the frame's edge cuts, the part seen may be a small part of the flux;
+    but no source is larger than what is seen of it.
+    """
+    height, width = prepared.image_e.shape
+    boxes = [member.blob.box for member in cluster.members]
+    cut = any(
+        b.top == 0 or b.left == 0 or b.top + b.height == height or b.left + b.width == width for b in boxes
+    )
+    factors = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
+    floor_e = 3.0 * math.sqrt(prepared.floor_e2)
+    sets: list[list[Start]] = []
+    for factor in factors:
+        starts: list[Start] = []
+        for member in cluster.members:
+            flux_e = max(member.flux_e, floor_e)
+            times = factor if member.is_clipped or not cluster.is_clipped else 1.0
+            if member.image_radius_px > 0.0:
+                most = (
+                    (max(member.blob.box.height, member.blob.box.width) + 2.0) / member.image_radius_px
+                ) ** 2
+                times = min(times, max(most, 1.0))
+            starts.append((member.u_px, member.v_px, member.log_range(times * flux_e)))
+        if starts not in sets:
+            sets.append(starts)
+    return sets
+
+
+def _window_box(members: Sequence[Candidate], prepared: PreparedFrame) -> PixelBox:
+    """Return the smallest of the sizes that holds the blobs, the PSF around them, and a rim of background."""
+    margin = math.ceil(4.0 * prepared.calibration.psf_sigma_px) + 4
+    boxes = [member.blob.box for member in members]
+    top, left = min(b.top for b in boxes), min(b.left for b in boxes)
+    bottom, right = max(b.top + b.height for b in boxes), max(b.left + b.width for b in boxes)
+    least = max(bottom - top, right - left) + 2 * margin
+    side = next((side for side in _SIDES_PX if side >= least), least)
+    return PixelBox((top + bottom - side) // 2, (left + right - side) // 2, side, side)
+
+
+def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+    """Widen a mask by some pixels in each direction, corners too."""
+    import cv2
+
+    if not mask.any():
+        return mask
+    kernel = np.ones((2 * by_px + 1, 2 * by_px + 1), dtype=np.uint8)
+    return np.asarray(cv2.dilate(mask.view(np.uint8), kernel), dtype=bool).reshape(mask.shape)
+
+
+def _moments(blob: Blob, prepared: PreparedFrame) -> tuple[float, float, float]:
+    """Centroid (u, v), weighted by what exceeds the background, and its sum in electrons."""
+    box = blob.box.slices
+    excess = (prepared.image_e[box] - prepared.background_e[box])[blob.pixels].astype(np.float64)
+    weight = np.maximum(excess, 0.0)
+    if not weight.sum() > 0.0:
+        weight = np.ones_like(excess)
+    rows, columns = np.nonzero(blob.pixels)
+    u_px = blob.box.left + float(weight @ columns) / float(weight.sum())
+    v_px = blob.box.top + float(weight @ rows) / float(weight.sum())
+    return u_px, v_px, float(excess.sum())

@@ -1,0 +1,101 @@
+"""How well flares explain what is seen of them."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.robust.solve import Solution
+
+MODEL_ERROR = 0.05
+"""How far, relative to the flares' own light, point spread and source may be off before a fit is bad."""
+
+MISFIT_PROBABILITY = 1e-6
+
+_FEWEST_PIXELS = 16
+
+
+@dataclass(frozen=True)
+class Goodness:
+    """χ² over `pixels` pixels, and the probability of one at least as large if the model holds.
+
+    `share_left` is the root of Σ residual² / Σ flares² over these pixels.
+    """
+
+    chi2: float
+    pixels: int
+    probability: float
+    share_left: float
+
+    @property
+    def is_good(self) -> bool:
+        """Whether so bad a fit is no mere chance."""
+        return self.probability >= MISFIT_PROBABILITY
+
+
+def core_goodness(solution: Solution, model_error: float = MODEL_ERROR) -> Goodness:
+    """Goodness of fit over the flares' own pixels, allowing for an imperfect model.
+
+    The sum of (x - λ)² / (λ + σ² + (ε F S)²) over the used pixels where F·S exceeds their noise. Over the
+    whole window a bad core drowns in good background; without ε a bright flare shows every per cent by
+    which the real PSF, the pixels' gains or the source differ from the model. A clipped pixel that should
+    clip says nothing, and does not count.
+
+    Parameters
+    ----------
+    solution
+        The fit to judge.
+    model_error
+        ε, standard deviation of the model relative to the flares' own light.
+
+    Returns
+    -------
+    Goodness
+        Probability 1 if no pixel stands out.
+    """
+    from scipy.special import chdtrc
+
+    window, residual = solution.window, solution.residual_e
+    says = window.usable & ~(window.clipped & (residual == 0.0))
+    core = says & (solution.flares_e > np.sqrt(solution.variance_e2(0.0)))
+    chi2 = float(np.sum(residual[core] ** 2 / solution.variance_e2(model_error)[core]))
+    pixels = int(core.sum())
+    left = float(np.sum(residual[core] ** 2)) / max(float(np.sum(solution.flares_e[core] ** 2)), 1e-300)
+    return Goodness(chi2, pixels, float(chdtrc(pixels, chi2)) if pixels else 1.0, math.sqrt(left))
+
+
+def residual_sigmas(solution: Solution) -> NDArray[np.float64]:
+    """Return what a fit leaves over, matched to the image of a point, in units of its noise, for each pixel.
+
+    An error of the model counts as noise.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    weight = np.where(solution.window.usable, 1.0 / solution.variance_e2(MODEL_ERROR), 0.0)
+    sigma_px = math.hypot(solution.psf_sigma_px, math.sqrt(1.0 / 12.0))
+    matched = gaussian_filter(solution.residual_e * weight, sigma_px, mode="constant")
+    # Filtered twice a Gaussian of σ is one of σ/√2 and of peak 1/(4 π σ²): Σ h² w of a kernel h.
+    power = gaussian_filter(weight, sigma_px / math.sqrt(2.0), mode="constant") / (
+        4.0 * math.pi * sigma_px**2
+    )
+    return np.asarray(matched / np.sqrt(np.maximum(power, 1e-300)))
+
+
+def structure_left_e(solution: Solution) -> float:
+    """Return the standard deviation of what lies around the flares beside noise; 0 where that is noise alone.
+
+    By χ² of the pixels that the flares do not reach: noise passes once in a million.
+    """
+    from scipy.ndimage import binary_dilation
+    from scipy.special import chdtrc
+
+    variance = solution.variance_e2(0.0)
+    reached = binary_dilation(solution.flares_e > 0.1 * np.sqrt(variance), iterations=2)
+    around = solution.window.usable & ~solution.window.clipped & ~reached
+    residual2 = solution.residual_e[around] ** 2
+    if len(residual2) < _FEWEST_PIXELS:
+        return 0.0
+    if chdtrc(len(residual2), float(np.sum(residual2 / variance[around]))) >= MISFIT_PROBABILITY:
+        return 0.0
+    return math.sqrt(max(float(np.mean(residual2 - variance[around])), 0.0))

@@ -1,0 +1,127 @@
+"""What a background holds beside noise: how strong its structure is, and how it is correlated.
+
+Structure is told from noise by its scatter: where the filtered image scatters by more than the noise model
+says, the rest is structure. Its autocorrelation, measured in the frame, makes of it a Gaussian process; in a
+window that is a handful of cosines whose amplitudes have a prior (`model.window.Structure`), so that a fit
+knows which backgrounds are likely under a flare, and its sigmas know that it does not see them.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.window import Structure
+
+Array = NDArray[np.float64]
+
+EDGES = tuple(np.exp(-np.arange(16) / 4.0).round(3).tolist())
+"""Autocorrelation of what has edges, as shadows and panels do: it falls at once, and its spectrum slowly."""
+
+LEAST_RATIO = 1.06
+"""Parts of a frame whose scatter exceeds noise by less count as even: so exactly it is measured."""
+
+_LAGS = 48
+_LINES = 96
+_CLIP_SIGMAS = 4.0
+_MOST_WAVES = 6
+_LEAST_EIGENVALUE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """Structure of a frame's background.
+
+    Attributes
+    ----------
+    sigma_e
+        Its standard deviation, per pixel, shape of the frame; 0 where it is even.
+    autocorrelation
+        At distances of 0, 1, 2, ... px, averaged over directions; 1 at 0, and 0 beyond the last.
+    """
+
+    sigma_e: NDArray[np.float32]
+    autocorrelation: tuple[float, ...]
+
+
+def structure_of(correlation: tuple[float, ...], side_px: int, sigma_e: float) -> Structure:
+    """Return the structure of one square window, of an autocorrelation and a standard deviation."""
+    columns, covariance = _cosines(correlation, side_px)
+    precision = np.asarray(np.linalg.inv(covariance), dtype=np.float64) / sigma_e**2
+    return Structure(columns[None], precision[None])
+
+
+def scatter(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the scatter of samples, shape (..., samples), blind to their outer thirds, where flares are."""
+    count = samples.shape[-1]
+    low, high = round(0.1587 * (count - 1)), round(0.8413 * (count - 1))
+    parted = np.partition(samples, (low, high), axis=-1)
+    return np.asarray(0.5 * (parted[..., high] - parted[..., low]), dtype=np.float32)
+
+
+def autocorrelation(
+    excess_e: NDArray[np.float32], sigma_e: NDArray[np.float32], noise_e: NDArray[np.float32]
+) -> tuple[float, ...]:
+    """Measure how the structure of a frame is correlated, along some of its rows and columns.
+
+    Parameters
+    ----------
+    excess_e
+        Electrons above the smooth background.
+    sigma_e
+        Standard deviation of the structure, 0 where there is none.
+    noise_e
+        Standard deviation of a pixel's noise. All three of the frame's shape.
+
+    Returns
+    -------
+    At distances of 0, 1, 2, ... px up to where it has fallen to nothing.
+    """
+    products, pairs = np.zeros(_LAGS), np.zeros(_LAGS)
+    for turned in (False, True):
+        step = max(1, excess_e.shape[1 if turned else 0] // _LINES)
+        excess, sigma, noise = (
+            np.asarray((a.T if turned else a)[step // 2 :: step], dtype=np.float64)
+            for a in (excess_e, sigma_e, noise_e)
+        )
+        total = np.hypot(sigma, noise)
+        # Flares, and whatever else stands far out, are no part of it.
+        counted = (sigma > 0.0) & (np.abs(excess) < _CLIP_SIGMAS * total)
+        value = np.where(counted, excess / np.where(sigma > 0.0, sigma, 1.0), 0.0)
+        padded = 2 * value.shape[1]
+        for line, into in ((value, products), (counted.astype(np.float64), pairs)):
+            power = np.abs(np.fft.rfft(line, padded, axis=1)) ** 2
+            into += np.fft.irfft(power.sum(axis=0), padded)[:_LAGS]
+    measured = products / np.maximum(pairs, 1.0)
+    # Noise adds to distance 0 alone: what structure has there follows from its neighbours, by a parabola.
+    top = max((4.0 * measured[1] - measured[2]) / 3.0, measured[1], 1e-6)
+    measured = np.concatenate([[1.0], measured[1:] / top])
+    gone = np.flatnonzero(measured < 0.02)
+    last = int(gone[0]) if len(gone) else _LAGS
+    return tuple(np.clip(measured[:last], 0.0, 1.0).round(3).tolist())
+
+
+@lru_cache(maxsize=32)
+def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array]:
+    """Return cosines over a square window, and the covariance of their amplitudes at variance 1.
+
+    As many as structure of this correlation needs; the constant is left out, as the background has it.
+    """
+    at = np.arange(side_px)
+    distance = np.hypot(at[:, None], at[None, :])  # by how many rows and columns two pixels differ
+    known = np.interp(distance, np.arange(len(correlation) + 1), [*correlation, 0.0])
+    waves = np.cos(np.pi * np.arange(_MOST_WAVES)[:, None] * (at + 0.5) / side_px)
+    waves /= np.linalg.norm(waves, axis=1, keepdims=True)
+    # Cov(nm, n'm') = Σ waves_n(r) waves_m(c) ρ(r - r', c - c') waves_n'(r') waves_m'(c').
+    lag = np.abs(at[:, None] - at[None, :])
+    by_rows = np.einsum("nr,rsd,ps->npd", waves, known[lag], waves, optimize=True)  # d: columns apart
+    full = np.einsum("mc,npce,qe->nmpq", waves, by_rows[:, :, lag], waves, optimize=True)
+    number = _MOST_WAVES**2
+    covariance = full.reshape(number, number)
+    order = [k for k in range(1, number) if sum(divmod(k, _MOST_WAVES)) < _MOST_WAVES + 1]
+    covariance = covariance[np.ix_(order, order)]
+    values, vectors = np.linalg.eigh(covariance)
+    values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
+    basis = np.einsum("nr,mc->nmrc", waves, waves).reshape(number, side_px, side_px)[order]
+    return basis, (vectors * values) @ vectors.T
