@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.window import Structure
 from perception.robust.solve import Solution
 
 MODEL_ERROR = 0.05
@@ -99,3 +100,12 @@ def structure_left_e(solution: Solution) -> float:
     if chdtrc(len(residual2), float(np.sum(residual2 / variance[around]))) >= MISFIT_PROBABILITY:
         return 0.0
     return math.sqrt(max(float(np.mean(residual2 - variance[around])), 0.0))
+
+
+def halo_sigmas(solution: Solution, halo: Structure) -> float:
+    """Return by how many standard deviations, at least, a halo around a lone flare shows in what its fit leaves."""
+    window = solution.window
+    weight = np.where(window.usable & ~window.clipped, 1.0 / solution.variance_e2(0.0), 0.0)
+    columns = halo.columns[0]
+    score = (columns * solution.residual_e * weight).sum(axis=(1, 2))
+    return float(np.max(score / np.sqrt((columns**2 * weight).sum(axis=(1, 2)) + 1e-300)))

@@ -14,14 +14,18 @@ from perception.robust.aperture import aperture_flux
 from perception.robust.blobs import Blob, divide
 from perception.robust.clusters import Candidate, Cluster, dilated, guesses
 from perception.robust.deblend import RESIDUAL_SIGMAS, deblend, of_free_size
-from perception.robust.goodness import Goodness, core_goodness, residual_sigmas, structure_left_e
+from perception.robust.goodness import Goodness, core_goodness, halo_sigmas, residual_sigmas, structure_left_e
 from perception.robust.prepare import PreparedFrame
 from perception.robust.solve import Problem, Solution, solve
-from perception.robust.structure import EDGES, structure_of
+from perception.robust.structure import EDGES, halo_of, joined, structure_of
 from perception.robust.verdict import LEAST_RANGE_M, is_no_large_disc, is_one_pixel, is_other_size
 
 CLIPPED_RANGE_SIGMA = 0.125
 """A clipped flare counts as recovered if its fit claims its range to better than this, relatively."""
+
+HALO_SEEMS_SIGMAS = 1.5
+HALO_GAIN = 10.0
+"""2 Δ ln L that a halo must bring: noise gives χ² of at most three degrees of freedom, 10 twice in a hundred."""
 
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
@@ -98,23 +102,57 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     for index, (cluster, solution) in enumerate(zip(found, best, strict=True)):
         if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
             best[index] = None
-    _retry_on_uneven_ground(best, camera)
-    _retry_without_spill(best, camera)
     # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
     # flares would explain better.
+    parted = {}
     if prepared.frame.line_time_s == 0.0:
-        parted = [
-            (index, solution)
-            for index, solution in enumerate(best)
-            if solution is not None and not found[index].is_in_crowd and not solution.window.on_edges
-        ]
-        for (index, one), more in zip(parted, deblend([each for _, each in parted], camera), strict=True):
-            # Enough flares would explain anything by half.
-            best[index] = more if more is one or core_goodness(more).is_good else one
+        parted = _parted([None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)], camera)
+    uneven = [one is not None and structure_left_e(one) > 0.0 for one in best]
+    _retry_with_halo(best, camera)
+    _retry_on_uneven_ground(best, uneven, camera)
+    for index, more in parted.items():
+        one = best[index]
+        if one is None or more.cost < one.cost:
+            best[index] = more
+    _retry_without_spill(best, camera)
     return best
 
 
-def _retry_on_uneven_ground(best: list[Solution | None], camera: Camera) -> None:
+def _parted(plain: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
+    """Deblend, and return what explains all that is seen, by index: enough flares explain anything by half."""
+    tried = [(index, one) for index, one in enumerate(plain) if one is not None]
+    more = deblend([one for _, one in tried], camera)
+    return {
+        index: several
+        for (index, one), several in zip(tried, more, strict=True)
+        if several is not one and core_goodness(several).is_good and structure_left_e(several) == 0.0
+    }
+
+
+def _retry_with_halo(best: list[Solution | None], camera: Camera) -> None:
+    """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it."""
+    tried: list[tuple[int, Solution]] = []
+    problems = []
+    for index, solution in enumerate(best):
+        if solution is None or solution.count != 1:
+            continue
+        u_px, v_px, _ = solution.starts[0]
+        radius_px, flux_e = float(solution.image_radius_px[0]), float(solution.flux_e[0])
+        window = solution.window
+        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e)
+        if halo_sigmas(solution, halo) < HALO_SEEMS_SIGMAS:
+            continue
+        tried.append((index, solution))
+        window = replace(window, structure=joined(window.structure, halo))
+        problems.append(Problem(window, solution.starts, solution.background_e))
+    for (index, without), again in zip(tried, solve(problems, camera), strict=True):
+        if again is not None and without.deviance - again.deviance > HALO_GAIN:
+            best[index] = again
+
+
+def _retry_on_uneven_ground(
+    best: list[Solution | None], uneven: Sequence[bool], camera: Camera
+) -> None:
     """Fit again where something lies around the flares: edges, of any strength that what is left over has.
 
     What is too sharp even for them counts as noise of the window.
@@ -122,7 +160,7 @@ def _retry_on_uneven_ground(best: list[Solution | None], camera: Camera) -> None
     for is_noise in (False, True):
         tried, problems = [], []
         for index, solution in enumerate(best):
-            left_e = 0.0 if solution is None else structure_left_e(solution)
+            left_e = structure_left_e(solution) if solution is not None and uneven[index] else 0.0
             if solution is None or left_e == 0.0:
                 continue
             window = solution.window
@@ -216,7 +254,7 @@ def _measurement(
         range_sigma_m=unknown if bound_only else range_m * log_sigma,
         saturated=saturated,
         misfit=misfit,
-        on_texture=solution.window.structure is not None,
+        on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges,
     )
 

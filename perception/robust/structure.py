@@ -12,9 +12,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.flare import PixelBox
 from perception.model.window import Structure
 
 Array = NDArray[np.float64]
+
+HALO_WIDTHS = (1.0, 2.0, 4.0)
+_LEAST_HALO_PX = 3.0
+_MOST_HALO_SHARE = 0.5
 
 EDGES = tuple(np.exp(-np.arange(16) / 4.0).round(3).tolist())
 """Autocorrelation of what has edges, as shadows and panels do: it falls at once, and its spectrum slowly."""
@@ -125,3 +130,36 @@ def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array
     values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
     basis = np.einsum("nr,mc->nmrc", waves, waves).reshape(number, side_px, side_px)[order]
     return basis, (vectors * values) @ vectors.T
+
+
+def halo_of(box: PixelBox, u_px: float, v_px: float, image_radius_px: float, flux_e: float) -> Structure:
+    """Return the light that a wall close behind a source throws back around its flare.
+
+    A wall at a distance h behind an isotropic source is lit as (1 + ρ²/h²)^(-3/2), ρ from the foot of the
+    source: seen from the front that is a halo of width f h / d, wider than the source's image by h / r. Of
+    three widths each may have up to about half of the flare's own light (a white wall throws back as much as
+    twice that, over a hemisphere); narrower ones cannot be told from the flare itself.
+
+    Parameters
+    ----------
+    box
+        The window.
+    u_px, v_px, image_radius_px, flux_e
+        The flare.
+    """
+    rows, columns = np.ogrid[box.top : box.top + box.height, box.left : box.left + box.width]
+    distance2 = (columns - u_px) ** 2 + (rows - v_px) ** 2
+    narrowest_px = max(_LEAST_HALO_PX, 1.5 * image_radius_px)
+    widths2 = [(narrowest_px * factor) ** 2 for factor in HALO_WIDTHS]
+    profiles = np.stack([(1.0 + distance2 / w2) ** -1.5 / (2.0 * np.pi * w2) for w2 in widths2])
+    return Structure(profiles[None], np.eye(len(widths2))[None] / (_MOST_HALO_SHARE * flux_e) ** 2)
+
+
+def joined(one: Structure | None, other: Structure) -> Structure:
+    """Return two structures on top of each other."""
+    if one is None:
+        return other
+    count, more = one.precision.shape[1], other.precision.shape[1]
+    precision = np.zeros((len(one.precision), count + more, count + more))
+    precision[:, :count, :count], precision[:, count:, count:] = one.precision, other.precision
+    return Structure(np.concatenate([one.columns, other.columns], axis=1), precision)
