@@ -119,7 +119,27 @@ def _more(current: Solution) -> list[list[Start]]:
     halves = _halves(current, worst)
     if halves is not None:
         guesses.append([*flares[:worst], *halves, *flares[worst + 1 :]])
+    peaks = _sharp_peaks(current)
+    if current.count == 1 and 2 <= len(peaks) <= MOST_FLARES:
+        guesses.append(peaks)
     return guesses
+
+
+def _sharp_peaks(current: Solution) -> list[Start]:
+    """Return the maxima of a window once its smooth part is taken off, as flares that share the light."""
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    window, box = current.window, current.window.box
+    excess_e = np.where(window.usable, window.image_e - current.background_e, 0.0)
+    sharp_e = excess_e - gaussian_filter(excess_e, 1.5 * current.psf_sigma_px)
+    noise_e = np.sqrt(np.maximum(excess_e, 0.0) + window.floor_e2)
+    rows, columns = np.nonzero(
+        (sharp_e == maximum_filter(sharp_e, 3)) & (sharp_e > RESIDUAL_SIGMAS * noise_e)
+    )
+    shares = sharp_e[rows, columns] / max(float(sharp_e[rows, columns].sum()), 1e-300)
+    farther = 0.5 * np.log(1.0 / shares) + current.starts[0][2]
+    places = zip((box.left + columns).tolist(), (box.top + rows).tolist(), farther.tolist(), strict=True)
+    return [(float(u), float(v), log_range) for u, v, log_range in places]
 
 
 def _misfit(current: Solution, u_px: float, v_px: float) -> float:

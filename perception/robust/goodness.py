@@ -102,8 +102,15 @@ def structure_left_e(solution: Solution) -> float:
     return math.sqrt(max(float(np.mean(residual2 - variance[around])), 0.0))
 
 
+def excess_e(solution: Solution) -> float:
+    """Return the root of the mean square of what a fit leaves over in its window, noise taken off."""
+    usable = solution.window.usable
+    excess_e2 = solution.residual_e[usable] ** 2 - solution.variance_e2(0.0)[usable]
+    return math.sqrt(max(float(np.mean(excess_e2)), 0.0)) if usable.any() else 0.0
+
+
 def halo_sigmas(solution: Solution, halo: Structure) -> float:
-    """Return by how many standard deviations, at least, a halo around a lone flare shows in what its fit leaves."""
+    """Return by how many standard deviations, at least, a halo shows in what a lone flare's fit leaves."""
     window = solution.window
     weight = np.where(window.usable & ~window.clipped, 1.0 / solution.variance_e2(0.0), 0.0)
     columns = halo.columns[0]

@@ -14,7 +14,14 @@ from perception.robust.aperture import aperture_flux
 from perception.robust.blobs import Blob, divide
 from perception.robust.clusters import Candidate, Cluster, dilated, guesses
 from perception.robust.deblend import RESIDUAL_SIGMAS, deblend, of_free_size
-from perception.robust.goodness import Goodness, core_goodness, halo_sigmas, residual_sigmas, structure_left_e
+from perception.robust.goodness import (
+    Goodness,
+    core_goodness,
+    excess_e,
+    halo_sigmas,
+    residual_sigmas,
+    structure_left_e,
+)
 from perception.robust.prepare import PreparedFrame
 from perception.robust.solve import Problem, Solution, solve
 from perception.robust.structure import EDGES, halo_of, joined, structure_of
@@ -25,7 +32,7 @@ CLIPPED_RANGE_SIGMA = 0.125
 
 HALO_SEEMS_SIGMAS = 1.5
 HALO_GAIN = 10.0
-"""2 Δ ln L that a halo must bring: noise gives χ² of at most three degrees of freedom, 10 twice in a hundred."""
+"""2 Δ ln L that a halo must bring: noise gives χ² of three degrees of freedom, 10 twice in a hundred."""
 
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
@@ -107,9 +114,18 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     parted = {}
     if prepared.frame.line_time_s == 0.0:
         parted = _parted([None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)], camera)
-    uneven = [one is not None and structure_left_e(one) > 0.0 for one in best]
-    _retry_with_halo(best, camera)
-    _retry_on_uneven_ground(best, uneven, camera)
+    uneven_e = [0.0 if one is None else structure_left_e(one) for one in best]
+    # Many flares where one blob was seen may be something wide: its whole residual counts.
+    spread_e = {
+        index: excess_e(one)
+        for index, more in parted.items()
+        if (one := best[index]) is not None and more.count > one.count + 1
+    }
+    for index in _retry_with_halo(best, camera):
+        one = best[index]
+        uneven_e[index] = 0.0 if one is None else structure_left_e(one)
+    uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
+    _retry_on_uneven_ground(best, uneven_e, camera)
     for index, more in parted.items():
         one = best[index]
         if one is None or more.cost < one.cost:
@@ -119,7 +135,7 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
 
 
 def _parted(plain: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
-    """Deblend, and return what explains all that is seen, by index: enough flares explain anything by half."""
+    """Deblend, and return by index what explains all that is seen: enough flares explain anything by half."""
     tried = [(index, one) for index, one in enumerate(plain) if one is not None]
     more = deblend([one for _, one in tried], camera)
     return {
@@ -129,8 +145,11 @@ def _parted(plain: Sequence[Solution | None], camera: Camera) -> dict[int, Solut
     }
 
 
-def _retry_with_halo(best: list[Solution | None], camera: Camera) -> None:
-    """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it."""
+def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
+    """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it.
+
+    Returns which have one.
+    """
     tried: list[tuple[int, Solution]] = []
     problems = []
     for index, solution in enumerate(best):
@@ -145,31 +164,33 @@ def _retry_with_halo(best: list[Solution | None], camera: Camera) -> None:
         tried.append((index, solution))
         window = replace(window, structure=joined(window.structure, halo))
         problems.append(Problem(window, solution.starts, solution.background_e))
+    having = []
     for (index, without), again in zip(tried, solve(problems, camera), strict=True):
         if again is not None and without.deviance - again.deviance > HALO_GAIN:
             best[index] = again
+            having.append(index)
+    return having
 
 
-def _retry_on_uneven_ground(
-    best: list[Solution | None], uneven: Sequence[bool], camera: Camera
-) -> None:
-    """Fit again where something lies around the flares: edges, of any strength that what is left over has.
+def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:
+    """Fit again where something lies around the flares: edges, of the strength that plain fits leave over.
 
     What is too sharp even for them counts as noise of the window.
     """
     for is_noise in (False, True):
         tried, problems = [], []
         for index, solution in enumerate(best):
-            left_e = structure_left_e(solution) if solution is not None and uneven[index] else 0.0
-            if solution is None or left_e == 0.0:
+            if solution is None or uneven_e[index] == 0.0:
                 continue
-            window = solution.window
-            if is_noise:
+            window, left_e = solution.window, structure_left_e(solution) if is_noise else 0.0
+            if left_e > 0.0:
                 window = replace(window, floor_e2=window.floor_e2 + left_e**2)
-            else:
-                strength_e = math.hypot(left_e, window.structure_e)
+            elif not is_noise:
+                strength_e = math.hypot(uneven_e[index], window.structure_e)
                 edges = structure_of(EDGES, window.box.height, strength_e)
                 window = replace(window, structure=edges, structure_e=strength_e, on_edges=True)
+            else:
+                continue
             tried.append(index)
             problems.append(Problem(window, solution.starts, solution.background_e))
         for index, again in zip(tried, solve(problems, camera), strict=True):

@@ -115,8 +115,9 @@ class Solution:
     def cost(self) -> float:
         """−2 ln of the evidence, but for a constant of the window: flares and structure at a price.
 
-        Laplace's approximation (MacKay, Neural Comput. 4, 415, 1992): an unknown costs the logarithm of how much
-        narrower the data leave it than its prior, which for a flare is any of `_PLACES` places and brightnesses.
+        Laplace's approximation (MacKay, Neural Comput. 4, 415, 1992): an unknown costs the logarithm of how
+        much narrower the data leave it than its prior, which for a flare is any of `_PLACES` places and
+        brightnesses.
         """
         by_flares = self.count * (2.0 * math.log(_PLACES) - 3.0 * math.log(2.0 * math.pi))
         return self.deviance + self.log_information + by_flares
