@@ -7,16 +7,21 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from nir_render.evaluate.match import countable, match, on_a_lamp
+from nir_render.evaluate.match import countable, image_radius_px, match, on_a_lamp
 from nir_render.truth.lamps import LampTruth, Outline
 from nir_render.truth.sources import SourceTruth
 from perception.model.bearing import direction_camera
-from perception.model.fisher import flare_limit
+from perception.model.fisher import flare_limits, limit_box
+from perception.model.flare import PixelBox, flare_image
+from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import at_gain
 from perception.types import Calibration, Detection, FrameKey
 
 Item = TypeVar("Item", SourceTruth, LampTruth, Detection)
+
+_OVERLAP_SIGMAS = 6.0
 
 
 @dataclass(frozen=True)
@@ -114,15 +119,18 @@ def _score_frame(
     for name, found in detections.items():
         sources = [detection for detection in found if not detection.ghost]
         pairing = match(rows, sources, calibration)
-        unmatched = [sources[j] for j in pairing.unmatched]
+        # What calls itself a ghost counts apart only where there is a mirror image.
+        called = [detection for detection in found if detection.ghost]
+        mirrored = match([row for row in rows if row.ghost_of is not None], called, calibration)
+        unmatched = [sources[j] for j in pairing.unmatched] + [called[j] for j in mirrored.unmatched]
         alarms[name] = [detection for detection in unmatched if not on_a_lamp(detection, outlines_px)]
         lamps[name] = len(unmatched) - len(alarms[name])
-        ghosts[name] = len(found) - len(sources)
+        ghosts[name] = len(mirrored.pairs)
         for i, j in pairing.pairs:
             hits[i][name] = sources[j]
             ghosts[name] += rows[i].ghost_of is not None
     scores = tuple(
-        Score(row, countable(row, calibration), *source_limits(row, calibration), hit)
+        Score(row, countable(row, calibration), *source_limits(row, calibration, rows), hit)
         for row, hit in zip(rows, hits, strict=True)
     )
     return _FrameScores(scores, alarms, ghosts, lamps)
@@ -153,28 +161,62 @@ def _summary(
     }
 
 
-def source_limits(truth: SourceTruth, calibration: Calibration) -> tuple[float, float]:
-    """Return the Cramér–Rao bounds (1 σ) of a source's range from its flux, in metres, and of its bearing.
+def source_limits(
+    truth: SourceTruth, calibration: Calibration, rows: Sequence[SourceTruth] = ()
+) -> tuple[float, float]:
+    """Return the Cramér–Rao bounds (1 σ) of a source's range, in metres, and of its bearing.
 
     They are those of a camera that has the frame's gain for good, of the light that is in the flare, with the
-    light of elsewhere and the dark signal as background. The bearing's, in degrees, is the root of the mean
-    squared angle, both directions together. NaN without light.
+    light of elsewhere and the dark signal as background. Flares of the same frame, `rows`, whose images
+    overlap have to be told from it: their places and ranges are not known either. The bearing's, in degrees,
+    is the root of the mean squared angle, both directions together. NaN without light.
     """
     if not truth.direct_e > 0.0:
         return math.nan, math.nan
-    limit = flare_limit(
-        at_gain(calibration, truth.gain),
-        truth.u_px,
-        truth.v_px,
-        truth.range_m,
-        truth.flare_share * truth.direct_e,
-        truth.background_e + truth.dark_e,
-    )
+    camera = at_gain(calibration, truth.gain)
+    flares = [_as_flare(row) for row in (truth, *_overlapping(truth, calibration, rows))]
+    background_e = truth.background_e + truth.dark_e
+    if len(flares) > 1:
+        # What the others shine into its pixels is theirs.
+        box = limit_box(camera, flares[:1])
+        own, *others = (_share(flare, box, camera) * flare[3] for flare in flares)
+        shone_e = sum(other[own > 0.01 * own.max()].mean() for other in others)
+        background_e = max(background_e - float(shone_e), truth.dark_e)
+    limit = flare_limits(camera, flares, background_e)[0]
     steps_px = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
     left, right, above, below = direction_camera(steps_px + np.array([truth.u_px, truth.v_px]), calibration)
     along_u_rad = float(np.linalg.norm(right - left)) * limit.u_sigma_px
     along_v_rad = float(np.linalg.norm(below - above)) * limit.v_sigma_px
     return limit.range_sigma_m, math.degrees(math.hypot(along_u_rad, along_v_rad))
+
+
+_Flare = tuple[float, float, float, float]  # u_px, v_px, range_m, flux_e
+
+
+def _as_flare(row: SourceTruth) -> _Flare:
+    return row.u_px, row.v_px, row.range_m, row.flare_share * (row.direct_e + row.mirrored_e)
+
+
+def _share(flare: _Flare, box: PixelBox, camera: Calibration) -> NDArray[np.float64]:
+    u_px, v_px, range_m, _ = flare
+    radius_rad = float(angular_radius_rad(range_m, camera.source_radius_m))
+    return flare_image(u_px, v_px, radius_rad, box, camera).fraction
+
+
+def _overlapping(
+    truth: SourceTruth, calibration: Calibration, rows: Sequence[SourceTruth]
+) -> list[SourceTruth]:
+    """Return the rows whose images reach into a source's, as far as the limit knows images of their size."""
+    near = []
+    for row in rows:
+        reach_px = sum(image_radius_px(each, calibration) for each in (truth, row))
+        reach_px += _OVERLAP_SIGMAS * calibration.psf_sigma_px
+        apart_px = math.hypot(row.u_px - truth.u_px, row.v_px - truth.v_px)
+        light_e = row.direct_e + row.mirrored_e
+        in_front = row.range_m > 2.0 * calibration.source_radius_m
+        if row is not truth and light_e > 0.0 and in_front and apart_px < reach_px:
+            near.append(row)
+    return near if truth.range_m > 2.0 * calibration.source_radius_m else []
 
 
 def _estimator_numbers(counted: Sequence[Score], name: str) -> dict[str, Any]:

@@ -89,8 +89,9 @@ def test_what_counts_for_recall(changes: dict[str, object], counts: bool) -> Non
 
 
 def test_the_summary_of_a_run_worked_out_by_hand() -> None:
-    """Three frames; two countable sources at 2 m, one found 10 cm too far and 1° off; a false alarm; a ghost; a
-    detection on a source that does not count is neither hit nor false alarm."""
+    """Three frames; two countable sources at 2 m, one found 10 cm too far and 1° off; a false alarm, and
+    one that calls itself a ghost where none is; a detection on a source that does not count is neither hit nor
+    false alarm."""
     tilted = (math.cos(math.radians(1.0)), math.sin(math.radians(1.0)), 0.0)
     truth = [_truth(100.0), _truth(200.0, index=1), _truth(300.0, index=1, peak_snr=2.0)]
     detections = {
@@ -115,12 +116,21 @@ def test_the_summary_of_a_run_worked_out_by_hand() -> None:
         "saturated": 0,
         "ranges_missing": 0,
         "bearing_rms_deg": pytest.approx(1.0),
-        "false_alarms_per_frame": pytest.approx(1.0 / 3.0),
-        "ghosts_reported": 1,
+        "false_alarms_per_frame": pytest.approx(2.0 / 3.0),
+        "ghosts_reported": 0,
         "lamps_reported": 0,
     }
     assert summary["estimators"]["paper"]["recall"] == 0.0
     assert summary["estimators"]["paper"]["range_mae_m"] is None
+
+
+def test_what_calls_itself_a_ghost_is_believed_only_where_one_is() -> None:
+    """A mirror image at 200 px: a detection there that says ghost counts apart, one at 400 px is a false alarm."""
+    rows = [_truth(100.0), _truth(200.0, ghost_of="r2.top", direct_e=0.0, mirrored_e=1e4, range_m=4.0)]
+    found = [_detection(100.0), _detection(200.5, ghost=True), _detection(400.0, ghost=True)]
+    summary = evaluate([("r1.front", 0)], rows, {"r1.front": CALIBRATION}, {"robust": found}).summary
+    robust = summary["estimators"]["robust"]
+    assert (robust["recall"], robust["ghosts_reported"], robust["false_alarms_per_frame"]) == (1.0, 1, 1.0)
 
 
 def test_detections_of_ghosts_are_counted_apart() -> None:

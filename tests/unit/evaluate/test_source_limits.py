@@ -59,6 +59,19 @@ def test_dark_current_is_background_that_clips_and_makes_noise() -> None:
     assert source_limits(truth(dark_e=6000.0), CAMERA)[0] == math.inf
 
 
+def test_two_on_one_bearing_have_to_be_told_apart() -> None:
+    """Two points 1.5 px apart: each limit is far above that of one in the other's light; 40 px apart they are alone."""
+    alone = truth(background_e=20.0)
+    beside, far = (truth(u_px=alone.u_px + apart, background_e=20.0) for apart in (1.5, 40.0))
+    single_m, single_deg = source_limits(alone, CAMERA)
+    paired_m, paired_deg = source_limits(alone, CAMERA, [alone, beside])
+    assert paired_m > 1.5 * single_m
+    assert paired_deg > 1.3 * single_deg
+    assert source_limits(alone, CAMERA, [alone, far]) == (single_m, single_deg)
+    hidden = truth(u_px=alone.u_px + 1.5, direct_e=0.0)
+    assert source_limits(alone, CAMERA, [alone, hidden]) == (single_m, single_deg)
+
+
 def test_light_that_glare_takes_tells_nothing() -> None:
     """Of 10 000 e half are in the flare: its limits are those of 5 000 e, √2 times as large by shot noise alone."""
     row = truth(direct_e=1e4, flare_share=0.5, background_e=20.0)

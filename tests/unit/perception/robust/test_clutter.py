@@ -1,0 +1,126 @@
+"""Frames that are hard to read: what is no source stays unsaid, and what is one is measured as light allows."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+import perception
+from perception.robust.prepare import bad_pixels, point_kernel
+from perception.robust.structure import autocorrelation, structure_of
+from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, frame_of, textured
+from tests.unit.perception.simulation import random
+
+EMPTY = (
+    "60 stuck pixels",
+    "120 hot pixels",
+    "empty, texture",
+    "empty, sheen",
+    "empty, sun patches",
+    "empty, blinds",
+)
+
+
+@pytest.mark.parametrize("row", [*EMPTY, "lamps"])
+def test_nothing_is_reported_where_no_source_is(row: str) -> None:
+    result = ROWS[row](frames=2)
+    assert result.get("false_alarms_per_frame", result.get("reported")) == 0
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("row", EMPTY)
+def test_false_alarms_are_rarer_than_one_in_ten_frames(row: str) -> None:
+    """40 frames with at most one: below 0.12 a frame at 95 %."""
+    assert ROWS[row](frames=40)["false_alarms_per_frame"] <= 1.0 / 40.0
+
+
+@pytest.mark.parametrize("correlation_px", [4, 15])
+def test_flares_on_texture_are_found_and_their_sigmas_know_of_it(correlation_px: float) -> None:
+    """81 flares on hills of 10 %, three times their noise: all are found, pulls have the root mean square 1."""
+    result = textured(correlation_px, frames=1)
+    assert (result["recall"], result["false_alarms"]) == (1.0, 0)
+    assert result["pull_rms_u_v"] == pytest.approx([1.0, 1.0], abs=4.0 / math.sqrt(2 * 81))
+
+
+@pytest.mark.parametrize("times", [3, 50])
+def test_points_clipped_many_times_are_ranged(times: float) -> None:
+    """All of 81, to better than 1 %, and as well as they claim."""
+    result = ROWS[f"clipped {times} times"](frames=1)
+    assert (result["recall"], result["only_a_bound"]) == (1.0, 0.0)
+    assert result["range_rmse_share"] < 0.01
+    assert result["pull_rms"] == pytest.approx(1.0, abs=4.0 / math.sqrt(2 * 81))
+
+
+def test_a_flare_with_a_bad_pixel_in_it_is_measured_by_the_others() -> None:
+    """Its second brightest pixel is stuck at full scale: the place is right within 4 claimed σ, the flux within 5."""
+    flare = Flare(200.3, 150.2, 3e4)
+    frame = frame_of([flare], POINT, BACKGROUND_E, 41)
+    frame.data_dn[150, 201] = POINT.saturation_dn
+    (hit,) = perception.detect(frame, POINT)
+    assert abs(hit.u_px - flare.u_px) < 4.0 * hit.u_sigma_px
+    assert abs(hit.v_px - flare.v_px) < 4.0 * hit.v_sigma_px
+    assert hit.range_m == pytest.approx(flare.source(POINT)[2], abs=5.0 * hit.range_sigma_m)
+
+
+def test_bad_pixels_are_told_from_the_sharpest_flare() -> None:
+    """A hot pixel, two side by side, and a flare in the middle of its pixel, all of 2 000 e in the brightest pixel."""
+    kernel = point_kernel(POINT.psf_sigma_px)
+    image_e = np.full((60, 60), 3.0, dtype=np.float32)
+    image_e[10, 10] = image_e[30, 30] = image_e[30, 31] = 2000.0
+    half = len(kernel) // 2
+    image_e[45 - half : 46 + half, 15 - half : 16 + half] += (
+        2000.0 * np.outer(kernel, kernel) / kernel[half] ** 2
+    ).astype(np.float32)
+    found = bad_pixels(image_e - 3.0, image_e, np.ones(image_e.shape, dtype=bool), 24.0, kernel)
+    assert np.argwhere(found).tolist() == [[10, 10], [30, 30], [30, 31]]
+
+
+def test_the_autocorrelation_of_texture_is_that_of_its_making() -> None:
+    """Noise of 5 e on hills of 20 e, smoothed over 6 px: exp(-Δ² / 4·36) to 0.1 up to 10 px."""
+    hills = gaussian_filter(random(42).normal(size=(400, 500)), 6.0, mode="wrap")
+    excess_e = (20.0 * hills / hills.std() + random(43).normal(0.0, 5.0, hills.shape)).astype(np.float32)
+    even = np.ones(hills.shape, dtype=np.float32)
+    found = np.array(autocorrelation(excess_e, 20.0 * even, 5.0 * even))
+    at = np.arange(11)
+    assert found[:11] == pytest.approx(np.exp(-(at**2) / (4.0 * 36.0)), abs=0.1)
+
+
+def test_cosines_carry_the_variance_of_the_texture() -> None:
+    """Amplitudes drawn from their prior make a texture of that variance but for its mean over the window."""
+    correlation = tuple(np.exp(-(np.arange(40.0) ** 2) / 64.0).tolist())
+    structure = structure_of(correlation, 21, 3.0)
+    covariance = np.linalg.inv(structure.precision[0])
+    columns = structure.columns[0].reshape(len(covariance), -1)
+    made = float(np.einsum("ip,ij,jp->p", columns, covariance, columns).mean())
+    at = np.arange(21)
+    rows, across = (each.ravel() for each in np.meshgrid(at, at, indexing="ij"))
+    apart2 = (rows[:, None] - rows) ** 2 + (across[:, None] - across) ** 2
+    of_mean = float(np.exp(-apart2 / 64.0).mean())
+    assert made == pytest.approx(9.0 * (1.0 - of_mean), rel=0.03)
+
+
+def test_a_wall_behind_a_source_does_not_draw_it_nearer() -> None:
+    """25 flares at 9 m with a halo of 30 % of their light, 4 px wide: ranges are right on average, and claims are.
+
+    Without the halo in the model they come out 4 % too near, 5 σ of a single flare.
+    """
+    rows, columns = np.indices((POINT.height_px, POINT.width_px), dtype=np.float64)
+    flares, halos = [], np.zeros(rows.shape)
+    for index in range(25):
+        du, dv = random(44, index).random(2)
+        u_px, v_px = 60.0 + 110.0 * (index % 5) + du, 60.0 + 110.0 * (index // 5) + dv
+        flares.append(Flare(u_px, v_px, 2e4))
+        distance2 = (columns - u_px) ** 2 + (rows - v_px) ** 2
+        halos += 0.3 * 2e4 * (1.0 + distance2 / 16.0) ** -1.5 / (2.0 * math.pi * 16.0)
+    frame = frame_of(flares, POINT, BACKGROUND_E + halos, 45)
+    hits = perception.detect(frame, POINT)
+    assert len(hits) == 25
+    errors, pulls = [], []
+    for flare in flares:
+        hit = min(hits, key=lambda one: math.hypot(one.u_px - flare.u_px, one.v_px - flare.v_px))
+        true_m = flare.source(POINT)[2]
+        errors.append(hit.range_m / true_m - 1.0)
+        pulls.append((hit.range_m - true_m) / hit.range_sigma_m)
+    assert abs(np.mean(errors)) < 0.006
+    assert float(np.sqrt(np.mean(np.square(pulls)))) < 1.0 + 4.0 / math.sqrt(50)
