@@ -47,7 +47,7 @@ from perception.files.recording import (
     read_frame_records,
     read_frames,
 )
-from perception.model.fisher import FlareLimit, flare_limit
+from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
 from perception.types import Calibration, Detection, RawFrame
 
@@ -72,6 +72,7 @@ __all__ = [
     "encode_png16",
     "encode_ranges",
     "flare_limit",
+    "flare_limits",
     "frame_record",
     "load_estimator",
     "parse_calibration_document",

@@ -37,13 +37,13 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     -------
     Detections
         From top to bottom. `area_px` and `mean_dn` are those of the pixels above the detection limit.
-        `saturated`: a pixel is clipped; the rest is fitted, and where that does not determine the flux, the
-        clipped flux is given as its lower bound, the range that follows is an upper bound, and
+        `saturated`: a pixel is clipped, which counts as censored; where that does not determine the range, or
+        of a disc too large to be fitted, the flux is a lower bound, the range an upper one, and
         `range_sigma_m` is NaN. Flares that overlap are fitted together (`deblend`), and their sigmas know of
         it. `merged`: what is seen does not look like one source, nor like several that can be told apart; its
         sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror image from a
-        source. Blobs much larger than a source of their flux would be are left out, and so are those that do
-        not stand out from what lies right beside them.
+        source. What is no source by its shape, size or brightness is left out, and so is what does not stand
+        out from what lies right beside it.
 
     Raises
     ------
