@@ -48,6 +48,7 @@ _WIDEST = (0.8, 1.3)  # about the Gaussians that look most like the core
 _BLACK_DN = 2000.0
 _TOP_DN = 60000.0
 _FULL_SCALE_DN = 65535
+_SIZE_SPREAD = 0.1
 _NOT_FOUND = 1e6  # a spread worse than any, and one that a minimiser can reckon with
 # What the answer follows from, besides camera and source: a change of one is another version.
 _CODE = (
@@ -285,12 +286,12 @@ def _law(rail: _RailFrames, sigma_px: float, share: float) -> _FluxLaw:
     """Return what a rail gives with a Gaussian; `share` is that by which perception judges a flare's size."""
     gain = rail.known.system_gain_dn_per_e
     constant = share * gain * rail.at_one_metre_e
-    # The size may not say how far a source is: what is sought is the flux, whatever the Gaussian.
+    # The size may hardly say how far a source is: what is sought is the flux that perception finds.
     known = replace(
         rail.known,
         psf_sigma_px=sigma_px,
         range_constant_dn_m2_per_s=constant,
-        sigma={"source_radius_m": rail.known.source_radius_m},
+        sigma={"source_radius_m": _SIZE_SPREAD * rail.known.source_radius_m},
     )
     found = []
     for range_m, exposure_s, image_e in rail.frames:

@@ -80,7 +80,9 @@ def residual_sigmas(solution: Solution) -> NDArray[np.float64]:
     power = gaussian_filter(weight, sigma_px / math.sqrt(2.0), mode="constant") / (
         4.0 * math.pi * sigma_px**2
     )
-    return np.asarray(matched / np.sqrt(np.maximum(power, 1e-300)))
+    # Where hardly any pixel counts nothing is known.
+    known = power > 1e-3 * float(power.max())
+    return np.where(known, matched / np.sqrt(np.where(known, power, 1.0)), 0.0)
 
 
 def structure_left_e(solution: Solution) -> float:

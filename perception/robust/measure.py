@@ -1,7 +1,7 @@
 """From clusters to measured flares: the fit, what to do where it is bad, and what is no source at all."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,8 @@ HALO_GAIN = 10.0
 
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
+
+MOST_LEFT_ON_EDGES = 0.1
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     parted = {}
     if prepared.frame.line_time_s == 0.0:
         parted = _parted([None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)], camera)
+    _retry_without_spill(best, parted, camera)
     uneven_e = [0.0 if one is None else structure_left_e(one) for one in best]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
     spread_e = {
@@ -130,7 +133,6 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
         one = best[index]
         if one is None or more.cost < one.cost:
             best[index] = more
-    _retry_without_spill(best, camera)
     return best
 
 
@@ -197,12 +199,15 @@ def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[floa
             best[index] = again
 
 
-def _retry_without_spill(best: list[Solution | None], camera: Camera) -> None:
+def _retry_without_spill(best: list[Solution | None], parted: Container[int], camera: Camera) -> None:
     """Fit badly fitted clipped flares without the columns of their clipped pixels, where charge may spill."""
     tried = [
         (index, solution)
         for index, solution in enumerate(best)
-        if solution is not None and solution.window.clipped.any() and not core_goodness(solution).is_good
+        if solution is not None
+        and index not in parted
+        and solution.window.clipped.any()
+        and not core_goodness(solution).is_good
     ]
     problems = []
     for _, solution in tried:
@@ -211,7 +216,7 @@ def _retry_without_spill(best: list[Solution | None], camera: Camera) -> None:
         dry = replace(window, usable=window.usable & ~spilled)
         problems.append(Problem(dry, solution.starts, solution.background_e))
     for (index, _), again in zip(tried, solve(problems, camera), strict=True):
-        if again is not None and core_goodness(again).is_good:
+        if again is not None and core_goodness(again).share_left < MOST_LEFT:
             best[index] = again
 
 
@@ -230,7 +235,8 @@ def _judged(
         solution.count == 1 and bool(residual_sigmas(solution).max() > RESIDUAL_SIGMAS)
     )
     doubted = misfit or cluster.is_clipped
-    if (doubted and good.share_left > MOST_LEFT) or (misfit and solution.window.on_edges):
+    most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
+    if doubted and good.share_left > most_left:
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
