@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,18 +72,21 @@ def residual_sigmas(solution: Solution) -> NDArray[np.float64]:
 
     An error of the model counts as noise.
     """
-    from scipy.ndimage import gaussian_filter
-
     weight = np.where(solution.window.usable, 1.0 / solution.variance_e2(MODEL_ERROR), 0.0)
-    sigma_px = math.hypot(solution.psf_sigma_px, math.sqrt(1.0 / 12.0))
-    matched = gaussian_filter(solution.residual_e * weight, sigma_px, mode="constant")
-    # Filtered twice a Gaussian of σ is one of σ/√2 and of peak 1/(4 π σ²): Σ h² w of a kernel h.
-    power = gaussian_filter(weight, sigma_px / math.sqrt(2.0), mode="constant") / (
-        4.0 * math.pi * sigma_px**2
-    )
+    spread = _gaussian(len(weight), math.hypot(solution.psf_sigma_px, math.sqrt(1.0 / 12.0)))
+    matched = spread @ (solution.residual_e * weight) @ spread
+    power = spread**2 @ weight @ spread**2
     # Where hardly any pixel counts nothing is known.
     known = power > 1e-3 * float(power.max())
     return np.where(known, matched / np.sqrt(np.where(known, power, 1.0)), 0.0)
+
+
+@lru_cache(maxsize=64)
+def _gaussian(side_px: int, sigma_px: float) -> NDArray[np.float64]:
+    """Return the symmetric matrix that smooths a row of pixels by a Gaussian, zero beyond its ends."""
+    at = np.arange(side_px)
+    kernel = np.exp(-0.5 * ((at[:, None] - at) / sigma_px) ** 2)
+    return np.asarray(kernel / (math.sqrt(2.0 * math.pi) * sigma_px))
 
 
 def structure_left_e(solution: Solution) -> float:

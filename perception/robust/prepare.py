@@ -6,6 +6,7 @@ filter for a point source with the level that noise alone does not pass.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
 from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2, saturation_dn
-from perception.robust.structure import LEAST_RATIO, Texture, autocorrelation, scatter
+from perception.robust.structure import LEAST_RATIO, LEAST_RATIO_AROUND, Texture, autocorrelation, scatter
 from perception.types import Calibration, RawFrame
 
 CELL_PX = 64
@@ -21,12 +22,11 @@ CELL_PX = 64
 FALSE_ALARMS_PER_PIXEL = 1e-3 / (1280 * 960)
 """Chance that the noise of one pixel passes: by the union bound, one false alarm in a thousand frames."""
 
-_SAMPLES_PER_AXIS = 32
+_SAMPLES_PER_AXIS = 24
 _SCATTER_SAMPLES_PER_AXIS = 16
 _BAD_SIGMAS = 5.0
 _CLIP_SIGMA = 3.0
 _CLIP_ROUNDS = 3
-_LIMIT_LEVELS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +200,10 @@ def _scatter_ratio(image_e: NDArray[np.float32], noise_mesh_e: NDArray[np.float3
 
     ratio = scatter(_cell_samples(image_e, _SCATTER_SAMPLES_PER_AXIS)) / noise_mesh_e
     smooth = np.asarray(cv2.medianBlur(ratio, 3), dtype=np.float32).reshape(ratio.shape)
-    return np.where(smooth > LEAST_RATIO, smooth, np.float32(1.0))
+    # A cell's ratio is known to 6 % only: those around must have some structure too.
+    around = np.asarray(cv2.blur(ratio, (5, 5)), dtype=np.float32).reshape(ratio.shape)
+    structured = (smooth > LEAST_RATIO) & (around > LEAST_RATIO_AROUND)
+    return np.where(structured, smooth, np.float32(1.0))
 
 
 def _local_contrast(
@@ -241,7 +244,7 @@ def background_mesh_e(frame: RawFrame, calibration: Calibration) -> NDArray[np.f
 
     In each cell the mean of what lies within 3 σ of the median, σ from the noise model at that median; the
     median of what is kept decides the next round. Then a median over 3 × 3 cells removes cells that a large
-    flare fills. A cell is sampled at 32 × 32 of its pixels: the error is σ/32, of which a detection notices
+    flare fills. A cell is sampled at 24 × 24 of its pixels: the error is σ/24, of which a detection notices
     nothing.
 
     Parameters
@@ -389,11 +392,16 @@ def detection_limit_e(
 def _limit_mesh_e(
     mesh_e: NDArray[np.float32], floor_e2: float, kernel: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Compute the detection limit of each cell.
-
-    It is smooth in √B, so a few levels and straight lines between them will do.
-    """
+    """Compute the detection limit of each cell, by straight lines in √B between the levels of a table."""
     root = np.sqrt(np.maximum(mesh_e, 0.0, dtype=np.float64))
-    levels = np.linspace(float(root.min()), float(root.max()), _LIMIT_LEVELS)
-    limits = detection_limit_e(levels**2, floor_e2, kernel)
-    return np.interp(root, levels, limits).astype(np.float32)
+    roots, limits = _limit_table(math.ceil(math.log2(max(float(root.max()), 1.0))), floor_e2, tuple(kernel))
+    return np.interp(root, roots, limits).astype(np.float32)
+
+
+@lru_cache(maxsize=32)
+def _limit_table(
+    octaves: int, floor_e2: float, kernel: tuple[float, ...]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return levels of √B up to 2^octaves, dense where the limit bends, and the limits there."""
+    roots = np.concatenate([[0.0], 2.0 ** np.arange(-3.0, octaves + 0.01, 0.25)])
+    return roots, detection_limit_e(roots**2, floor_e2, np.array(kernel))

@@ -27,6 +27,9 @@ EDGES = tuple(np.exp(-np.arange(16) / 4.0).round(3).tolist())
 LEAST_RATIO = 1.06
 """Parts of a frame whose scatter exceeds noise by less count as even: so exactly it is measured."""
 
+LEAST_RATIO_AROUND = 1.04
+"""As much the mean over 5 × 5 parts must have: of nine even frames of 1280 × 960 one has it, in one part."""
+
 _LAGS = 48
 _LINES = 96
 _CLIP_SIGMAS = 4.0
