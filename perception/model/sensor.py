@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from perception.types import Calibration, RawFrame
 
+_LEAST = {"psf_sigma_px": 1e-3, "system_gain_dn_per_e": 1e-12, "read_noise_e": 0.0, "source_radius_m": 0.0}
+
 
 def check_frame(frame: RawFrame, calibration: Calibration) -> None:
     """Refuse a frame that the calibration does not describe.
@@ -15,8 +17,8 @@ def check_frame(frame: RawFrame, calibration: Calibration) -> None:
     Raises
     ------
     ValueError
-        If the camera's name, the shape or the type of the counts differ, or if exposure or gain are not
-        positive.
+        If the camera's name, the shape or the type of the counts differ, if exposure or gain are not
+        positive, or if the calibration's point spread, gain, read noise or source radius cannot be.
     """
     where = f"frame {frame.index} of camera {frame.camera!r}"
     if frame.camera != calibration.camera:
@@ -27,6 +29,16 @@ def check_frame(frame: RawFrame, calibration: Calibration) -> None:
     if frame.data_dn.shape != expected:
         raise ValueError(
             f"{where} has shape {frame.data_dn.shape}, its calibration says (rows, columns) = {expected}"
+        )
+    wrong = [
+        f"{name} = {getattr(calibration, name)}"
+        for name, least in _LEAST.items()
+        if not least <= getattr(calibration, name) < math.inf
+    ]
+    if wrong:
+        raise ValueError(
+            f"{where}: its calibration has {', '.join(wrong)}; wanted finite numbers, psf_sigma_px and "
+            "system_gain_dn_per_e above 0, read_noise_e and source_radius_m 0 or more"
         )
     if not (frame.exposure_s > 0.0 and frame.gain > 0.0):
         raise ValueError(

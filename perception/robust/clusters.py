@@ -75,9 +75,14 @@ class Candidate:
 
     @property
     def is_too_large(self) -> bool:
-        """Whether it is measured by aperture."""
+        """Whether its image is larger than is fitted."""
         clipped_disc_px = math.sqrt(self.clipped_px / math.pi)
         return max(self.image_radius_px, clipped_disc_px) > MAX_IMAGE_RADIUS_PX
+
+    @property
+    def is_beyond_fit(self) -> bool:
+        """Whether it is measured by aperture: too large, or where no range can be had to say its size."""
+        return self.is_too_large or not self.at_one_metre_e > 0.0
 
     def log_range(self, flux_e: float) -> float:
         """Logarithm of the range of a source of that flux; where no range can be had, of flux 1 at 1 m."""
@@ -120,6 +125,14 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
     # Half maximum of a Gaussian filtered with itself lies at √(2 ln 2) · √2 σ = 1.67 σ.
     smooth_px = math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
     return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
+
+
+def brightest(found: Sequence[Candidate], most: int) -> list[Candidate]:
+    """Return the candidates of the greatest flux, in the order in which they are."""
+    if len(found) <= most:
+        return list(found)
+    kept = np.sort(np.argsort([each.flux_e for each in found], kind="stable")[-most:])
+    return [found[index] for index in kept]
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,9 @@ from perception.robust.solve import Problem, Solution, Start, solve
 MOST_FLARES = 8
 """So many flares one window is divided into at most."""
 
+MOST_WINDOWS = 100
+"""In so many windows of a frame more flares are looked for at most, the brightest: it bounds the time."""
+
 LEAST_GAIN = 40.0
 """2 Δ ln L that one more flare must bring: noise gives χ² of three degrees of freedom, 40 once in 10⁸."""
 
@@ -41,6 +44,7 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
     """
     found = list(solutions)
     asking = [index for index, each in enumerate(found) if asks_for_more(each)]
+    asking = sorted(sorted(asking, key=lambda index: -float(found[index].flux_e.max()))[:MOST_WINDOWS])
     lone = [index for index in asking if found[index].count == 1]
     free = _with_spread(camera, "psf_sigma_px", _WIDTH_FREE)
     of_free_width = solve([_again(found[index]) for index in lone], free)

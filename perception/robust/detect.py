@@ -7,13 +7,16 @@ import numpy as np
 from perception.model.bearing import bearing_body
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.blobs import Blob, components, split_at_peaks
-from perception.robust.clusters import candidates, clusters, is_extended
+from perception.robust.clusters import brightest, candidates, clusters, is_extended
 from perception.robust.measure import Measurement, measure
 from perception.robust.prepare import PreparedFrame, prepare
 from perception.types import Calibration, Detection, RawFrame
 
 CONTRAST_SIGMAS = 6.03
 """As for detection against the coarse background: Gaussian noise passes 8e-10 of the time."""
+
+MOST_FLARES = 1000
+"""The robust detector measures no more blobs of a frame than this, the brightest: it bounds the time."""
 
 _RING_PX = 4
 _FEWEST_RING_PIXELS = 8
@@ -43,7 +46,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         it. `merged`: what is seen does not look like one source, nor like several that can be told apart; its
         sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror image from a
         source. What is no source by its shape, size or brightness is left out, and so is what does not stand
-        out from what lies right beside it.
+        out from what lies right beside it, and all but the brightest thousand.
 
     Raises
     ------
@@ -59,7 +62,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         if _stands_above_surroundings(blob, prepared)
     ]
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
-    measured = measure(clusters(flares, prepared), prepared)
+    measured = measure(clusters(brightest(flares, MOST_FLARES), prepared), prepared)
     measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
     return [_detection(blob, found, frame, calibration) for blob, found in measured if found.stands_out]
 

@@ -85,15 +85,20 @@ def measure(found: Sequence[Cluster], prepared: PreparedFrame) -> list[tuple[Blo
     A blob and its measurement for each flare.
     """
     camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
-    fitted = [cluster for cluster in found if not any(member.is_too_large for member in cluster.members)]
+    fitted = [cluster for cluster in found if not any(member.is_beyond_fit for member in cluster.members)]
     solutions = _best(fitted, prepared, camera)
+    odd = [index for index, solution in enumerate(solutions) if solution is not None and _is_odd(solution)]
+    of_odd = of_free_size([solution for k in odd if (solution := solutions[k]) is not None], camera)
+    free = dict(zip(odd, of_odd, strict=True))
     measured = [
         each
-        for cluster, solution in zip(fitted, solutions, strict=True)
-        for each in _judged(cluster, solution, prepared, camera)
+        for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True))
+        if solution is not None
+        and not (index in free and is_other_size(solution, free[index], camera.tie_spread))
+        for each in _judged(cluster, solution, prepared)
     ]
-    large = [cluster for cluster in found if any(member.is_too_large for member in cluster.members)]
-    return measured + [each for cluster in large for each in _by_apertures(cluster, prepared)]
+    others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
+    return measured + [each for cluster in others for each in _by_apertures(cluster, prepared)]
 
 
 def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
@@ -220,17 +225,14 @@ def _retry_without_spill(best: list[Solution | None], parted: Container[int], ca
             best[index] = again
 
 
-def _judged(
-    cluster: Cluster, solution: Solution | None, prepared: PreparedFrame, camera: Camera
-) -> list[tuple[Blob, Measurement]]:
+def _is_odd(solution: Solution) -> bool:
+    """Tell whether a lone flare fits so badly that its size has to be looked at."""
+    return solution.count == 1 and not core_goodness(solution).is_good
+
+
+def _judged(cluster: Cluster, solution: Solution, prepared: PreparedFrame) -> list[tuple[Blob, Measurement]]:
     """Turn a solution into measurements, if it is one of sources."""
-    if solution is None:
-        return []
     good = core_goodness(solution)
-    if solution.count == 1 and not good.is_good:
-        (free,) = of_free_size([solution], camera)
-        if is_other_size(solution, free, camera.tie_spread):
-            return []
     misfit = not good.is_good or (
         solution.count == 1 and bool(residual_sigmas(solution).max() > RESIDUAL_SIGMAS)
     )
@@ -291,7 +293,7 @@ def _by_apertures(cluster: Cluster, prepared: PreparedFrame) -> list[tuple[Blob,
     return [
         (member.blob, _from_aperture(member, cluster, prepared))
         for member in members
-        if not is_no_large_disc(member, prepared)
+        if not (member.is_too_large and is_no_large_disc(member, prepared))
     ]
 
 
@@ -334,7 +336,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         range_m=ranged.range_m,
         range_sigma_m=unknown if member.is_clipped else ranged.range_sigma_m,
         saturated=member.is_clipped,
-        misfit=not member.is_clipped and not member.is_too_large,
+        misfit=not member.is_clipped and not member.is_beyond_fit,
     )
 
 

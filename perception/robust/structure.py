@@ -97,10 +97,10 @@ def autocorrelation(
         # Flares, and whatever else stands far out, are no part of it.
         counted = (sigma > 0.0) & (np.abs(excess) < _CLIP_SIGMAS * total)
         value = np.where(counted, excess / np.where(sigma > 0.0, sigma, 1.0), 0.0)
-        padded = 2 * value.shape[1]
+        padded, lags = 2 * value.shape[1], min(_LAGS, value.shape[1])
         for line, into in ((value, products), (counted.astype(np.float64), pairs)):
             power = np.abs(np.fft.rfft(line, padded, axis=1)) ** 2
-            into += np.fft.irfft(power.sum(axis=0), padded)[:_LAGS]
+            into[:lags] += np.fft.irfft(power.sum(axis=0), padded)[:lags]
     measured = products / np.maximum(pairs, 1.0)
     # Noise adds to distance 0 alone: what structure has there follows from its neighbours, by a parabola.
     top = max((4.0 * measured[1] - measured[2]) / 3.0, measured[1], 1e-6)

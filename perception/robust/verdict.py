@@ -68,7 +68,8 @@ def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     cut = box.top == 0 or box.left == 0 or box.top + box.height == rows or box.left + box.width == columns
     fill = member.blob.area_px / (0.25 * math.pi * box.height * box.width)
     aspect = max(box.height, box.width) / min(box.height, box.width)
-    if not cut and (not _DISC_FILLS[0] < fill < _DISC_FILLS[1] or aspect > _MOST_ASPECT):
+    # What the frame's edge cuts off a disc leaves no rectangle.
+    if fill > _DISC_FILLS[1] or (not cut and (fill < _DISC_FILLS[0] or aspect > _MOST_ASPECT)):
         return True
     radius_px = 0.5 * math.sqrt(box.height * box.width)
     if calibration.fx_px * calibration.source_radius_m / radius_px < LEAST_RANGE_M:
