@@ -2,8 +2,8 @@
 
 Sets of four frames of 1280 × 960 with 0, 1, 5, 20 and 100 points or near spheres in each; milliseconds for
 a set, on as many threads as it takes by itself; errors of place over the Cramér–Rao limit (1 is all that
-light allows). Beside it, where they are installed, `sep` (Source Extractor as a library) and `photutils`, on the
-same frames, in the same process.
+light allows). Beside it, where they are installed, `sep` (Source Extractor as a library) and `photutils`,
+on the same frames, in the same process.
 """
 
 import importlib.util

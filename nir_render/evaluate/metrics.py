@@ -14,7 +14,7 @@ from nir_render.truth.lamps import LampTruth, Outline
 from nir_render.truth.sources import SourceTruth
 from perception.model.bearing import direction_camera
 from perception.model.fisher import flare_limits, limit_box
-from perception.model.flare import PixelBox, flare_image
+from perception.model.flare import PixelBox, flare_image, has_image
 from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import at_gain
 from perception.types import Calibration, Detection, FrameKey
@@ -176,9 +176,9 @@ def source_limits(
     camera = at_gain(calibration, truth.gain)
     flares = [_as_flare(row) for row in (truth, *_overlapping(truth, calibration, rows))]
     background_e = truth.background_e + truth.dark_e
-    if len(flares) > 1:
+    box = limit_box(camera, flares[:1])
+    if len(flares) > 1 and box.height * box.width > 0:
         # What the others shine into its pixels is theirs.
-        box = limit_box(camera, flares[:1])
         own, *others = (_share(flare, box, camera) * flare[3] for flare in flares)
         shone_e = sum(other[own > 0.01 * own.max()].mean() for other in others)
         background_e = max(background_e - float(shone_e), truth.dark_e)
@@ -213,7 +213,11 @@ def _overlapping(
         reach_px += _OVERLAP_SIGMAS * calibration.psf_sigma_px
         apart_px = math.hypot(row.u_px - truth.u_px, row.v_px - truth.v_px)
         light_e = row.direct_e + row.mirrored_e
-        in_front = row.range_m > 2.0 * calibration.source_radius_m
+        in_front = row.range_m > 2.0 * calibration.source_radius_m and bool(
+            has_image(
+                row.u_px, row.v_px, angular_radius_rad(row.range_m, calibration.source_radius_m), calibration
+            )
+        )
         if row is not truth and light_e > 0.0 and in_front and apart_px < reach_px:
             near.append(row)
     return near if truth.range_m > 2.0 * calibration.source_radius_m else []

@@ -224,10 +224,13 @@ def _limits(
     if inverse is None:
         return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(place)
     limits, step = [], model.layout.per_source
+    ranged = model.camera.calibration.range_constant_dn_m2_per_s > 0.0
     for index, (_, _, range_m, flux_e) in enumerate(place.tolist()):
         own = inverse[index * step : (index + 1) * step, index * step : (index + 1) * step]
         slack = np.zeros(()) if model.layout.has_slack else None
         _, log_sigma = model.camera.log_range(np.zeros(()), slack, own[2:, 2:])
         u_sigma, v_sigma, l_sigma = np.sqrt(np.diagonal(own)[:3]).tolist()
-        limits.append(FlareLimit(u_sigma, v_sigma, 2.0 * l_sigma * flux_e, range_m * float(log_sigma)))
+        # Without a range constant there is no range to be had from whatever is seen.
+        range_sigma_m = range_m * float(log_sigma) if ranged else math.inf
+        limits.append(FlareLimit(u_sigma, v_sigma, 2.0 * l_sigma * flux_e, range_sigma_m))
     return limits

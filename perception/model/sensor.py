@@ -35,10 +35,13 @@ def check_frame(frame: RawFrame, calibration: Calibration) -> None:
         for name, least in _LEAST.items()
         if not least <= getattr(calibration, name) < math.inf
     ]
+    wrong += [
+        f"sigma of {k} = {sigma}" for k, sigma in calibration.sigma.items() if not 0.0 <= sigma < math.inf
+    ]
     if wrong:
         raise ValueError(
             f"{where}: its calibration has {', '.join(wrong)}; wanted finite numbers, psf_sigma_px and "
-            "system_gain_dn_per_e above 0, read_noise_e and source_radius_m 0 or more"
+            "system_gain_dn_per_e above 0, read_noise_e, source_radius_m and every sigma 0 or more"
         )
     if not (frame.exposure_s > 0.0 and frame.gain > 0.0):
         raise ValueError(

@@ -62,7 +62,7 @@ class Camera:
         """Return the logarithms of sources' ranges, and their standard deviations.
 
         What was assumed of flux and radius is told apart by their spreads: of the slack found, flux is to
-        blame for σ_φ²/2σ_t parts, σ_φ = σ_K/2K; what that leaves open of the flux is part of σ.
+        blame for σ_φ²/σ_t parts, σ_φ = σ_K/2K; what that leaves open of the flux is part of σ.
 
         Parameters
         ----------
@@ -261,7 +261,7 @@ def window_model(
     at_1_m_e = flux_at_one_metre_e(flat_u, flat_v, camera.exposure_s, camera.gain, calibration)
     ranged = at_1_m_e > 0.0
     radius_m = calibration.source_radius_m if math.isfinite(calibration.source_radius_m) else 0.0
-    radius_rad = np.where(ranged, angular_radius_rad(np.exp(log_range.ravel()), radius_m), 0.0)
+    radius_rad = angular_radius_rad(np.exp(log_range.ravel()), radius_m)
     imaged = has_image(flat_u, flat_v, radius_rad, calibration)
     nodes = disc_nodes(
         np.where(imaged, flat_u, calibration.cx_px),

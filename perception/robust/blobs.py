@@ -13,14 +13,10 @@ _MAX_PEAKS = 16
 
 @dataclass(frozen=True, eq=False)
 class Blob:
-    """One flare's pixels: a box, and which pixels of it belong, shape (box.height, box.width).
-
-    `touching` says that the component it comes from holds other flares as well.
-    """
+    """One flare's pixels: a box, and which pixels of it belong, shape (box.height, box.width)."""
 
     box: PixelBox
     pixels: NDArray[np.bool_]
-    touching: bool = False
 
     @property
     def area_px(self) -> int:
@@ -89,7 +85,7 @@ def split_at_peaks(
 
     Returns
     -------
-    The blob itself, or one touching blob for each maximum, brightest first.
+    The blob itself, or one blob for each maximum, brightest first.
     """
     import cv2
 
@@ -166,4 +162,4 @@ def _trimmed(blob: Blob, pixels: NDArray[np.bool_]) -> Blob:
     top, left = int(rows[0]), int(columns[0])
     height, width = int(rows[-1]) - top + 1, int(columns[-1]) - left + 1
     box = PixelBox(blob.box.top + top, blob.box.left + left, height, width)
-    return Blob(box, pixels[top : top + height, left : left + width], touching=True)
+    return Blob(box, pixels[top : top + height, left : left + width])

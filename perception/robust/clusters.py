@@ -69,15 +69,11 @@ class Candidate:
         return self.clipped_px > 0
 
     @property
-    def reach_px(self) -> float:
-        """Radius of a disc of the blob's area."""
-        return math.sqrt(self.blob.area_px / math.pi)
-
-    @property
     def is_too_large(self) -> bool:
         """Whether its image is larger than is fitted."""
         clipped_disc_px = math.sqrt(self.clipped_px / math.pi)
-        return max(self.image_radius_px, clipped_disc_px) > MAX_IMAGE_RADIUS_PX
+        longest_px = max(self.blob.box.height, self.blob.box.width)
+        return max(self.image_radius_px, clipped_disc_px, longest_px / 3.0) > MAX_IMAGE_RADIUS_PX
 
     @property
     def is_beyond_fit(self) -> bool:
@@ -96,7 +92,11 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
         return []
     frame, calibration = prepared.frame, prepared.calibration
     clipped_dn = saturation_dn(calibration, frame.gain)
-    clipped = [int((frame.data_dn[b.box.slices][b.pixels] >= clipped_dn).sum()) for b in blobs]
+    of_light = [b.pixels & ~prepared.bad[b.box.slices] for b in blobs]
+    clipped = [
+        int((frame.data_dn[blob.box.slices][pixels] >= clipped_dn).sum())
+        for blob, pixels in zip(blobs, of_light, strict=True)
+    ]
     u_px, v_px, flux_e = np.array([_moments(blob, prepared) for blob in blobs]).T
     at_one_metre_e = flux_at_one_metre_e(u_px, v_px, frame.exposure_s, frame.gain, calibration)
     ranged = (at_one_metre_e > 0.0) & (flux_e > 0.0)
@@ -158,12 +158,13 @@ class Cluster:
         return any(member.is_clipped for member in self.members)
 
 
-def clusters(members: Sequence[Candidate], prepared: PreparedFrame) -> list[Cluster]:
-    """Group candidates that lie side by side, and cut their windows out of the frame."""
+def clusters(members: Sequence[Candidate], prepared: PreparedFrame, apart: bool = False) -> list[Cluster]:
+    """Group candidates that lie side by side, unless `apart`, and cut their windows out of the frame."""
     blobs = [member.blob for member in members]
     chosen: list[tuple[list[int], list[int]]] = []
-    for group in near_groups(blobs, NEAR_PX):
-        if len(group) <= MOST_BLOBS:
+    for group in [[k] for k in range(len(blobs))] if apart else near_groups(blobs, NEAR_PX):
+        fits = _window_box([members[k] for k in group], prepared).height <= _SIDES_PX[-1]
+        if len(group) == 1 or (len(group) <= MOST_BLOBS and fits):
             chosen.append((group, list(range(len(group)))))
             continue
         places = np.array([(members[k].u_px, members[k].v_px) for k in group])
@@ -207,13 +208,13 @@ def _cluster(
     at = (int(np.clip(round(v_px), 0, height - 1)), int(np.clip(round(u_px), 0, width - 1)))
     texture, structure = prepared.texture, None
     sigma_e = 0.0 if texture is None else float(texture.sigma_e[at])
-    if texture is not None and sigma_e > 0.0:
+    if texture is not None and sigma_e > 0.0 and box.height <= _SIDES_PX[-1]:
         structure = structure_of(texture.autocorrelation, box.height, sigma_e)
     window = Window(
         box=box,
         image_e=prepared.image_e[place].astype(np.float64),
         usable=inside & ~dilated(others, 2) & ~prepared.bad[place],
-        clipped=frame.data_dn[place] >= saturation_dn(calibration, frame.gain),
+        clipped=(frame.data_dn[place] >= saturation_dn(calibration, frame.gain)) & ~prepared.bad[place],
         floor_e2=prepared.floor_e2,
         clip_e=clip_level_e(calibration, frame.black_level_dn, frame.gain),
         prnu=calibration.prnu,
@@ -277,7 +278,8 @@ def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
 def _moments(blob: Blob, prepared: PreparedFrame) -> tuple[float, float, float]:
     """Centroid (u, v), weighted by what exceeds the background, and its sum in electrons."""
     box = blob.box.slices
-    excess = (prepared.image_e[box] - prepared.background_e[box])[blob.pixels].astype(np.float64)
+    light_e = np.where(prepared.bad[box], 0.0, prepared.image_e[box] - prepared.background_e[box])
+    excess = light_e[blob.pixels].astype(np.float64)
     weight = np.maximum(excess, 0.0)
     if not weight.sum() > 0.0:
         weight = np.ones_like(excess)

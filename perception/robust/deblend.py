@@ -28,6 +28,7 @@ RESIDUAL_SIGMAS = 5.5
 """Where the residual, matched to a point's image, exceeds this, another flare is tried."""
 
 _WIDTH_FREE = 0.3
+_LEAST_RADIUS_PX = 1.0
 
 
 def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
@@ -49,7 +50,11 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
     free = _with_spread(camera, "psf_sigma_px", _WIDTH_FREE)
     of_free_width = solve([_again(found[index]) for index in lone], free)
     null = dict(enumerate(found))
-    null |= {index: wide for index, wide in zip(lone, of_free_width, strict=True) if wide is not None}
+    large = [index for index in lone if float(found[index].image_radius_px[0]) > _LEAST_RADIUS_PX]
+    of_any_size = of_free_size([found[index] for index in large], camera)
+    for index, other in [*zip(lone, of_free_width, strict=True), *zip(large, of_any_size, strict=True)]:
+        if other is not None and other.deviance < null[index].deviance:
+            null[index] = other
     while asking:
         trials = [(index, starts) for index in asking for starts in _more(found[index])]
         fits = solve(

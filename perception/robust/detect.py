@@ -40,13 +40,14 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     -------
     Detections
         From top to bottom. `area_px` and `mean_dn` are those of the pixels above the detection limit.
-        `saturated`: a pixel is clipped, which counts as censored; where that does not determine the range, or
-        of a disc too large to be fitted, the flux is a lower bound, the range an upper one, and
-        `range_sigma_m` is NaN. Flares that overlap are fitted together (`deblend`), and their sigmas know of
-        it. `merged`: what is seen does not look like one source, nor like several that can be told apart; its
-        sigmas are then widened by √χ². `ghost` is never set: one frame cannot tell a mirror image from a
-        source. What is no source by its shape, size or brightness is left out, and so is what does not stand
-        out from what lies right beside it, and all but the brightest thousand.
+        `saturated`: a pixel is clipped, which counts as censored. Where that does not determine the range
+        `range_sigma_m` is NaN; of a disc too large to be fitted the flux is a lower bound, too, and the range
+        an upper one. Flares that overlap are fitted together (`deblend`), and their sigmas know of it; behind
+        a rolling shutter a blob stays one. `merged`: what is seen does not look like one source, nor like
+        several that can be told apart; its sigmas are then widened by √χ². `ghost` is never set: one frame
+        cannot tell a mirror image from a source. What is no source by its shape, size or brightness is left
+        out, and so is what does not stand out from what lies right beside it, and all but the brightest
+        thousand.
 
     Raises
     ------

@@ -32,7 +32,7 @@ class Goodness:
 
     @property
     def is_good(self) -> bool:
-        """Whether so bad a fit is no mere chance."""
+        """Whether chance alone may leave so much."""
         return self.probability >= MISFIT_PROBABILITY
 
 

@@ -12,7 +12,7 @@ from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux
 from perception.robust.blobs import Blob, divide
-from perception.robust.clusters import Candidate, Cluster, dilated, guesses
+from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guesses
 from perception.robust.deblend import RESIDUAL_SIGMAS, deblend, of_free_size
 from perception.robust.goodness import (
     Goodness,
@@ -73,12 +73,23 @@ class Measurement:
         return self.saturated or (self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e)
 
 
-def measure(found: Sequence[Cluster], prepared: PreparedFrame) -> list[tuple[Blob, Measurement]]:
+def measure(
+    found: Sequence[Cluster], prepared: PreparedFrame, apart: bool = False
+) -> list[tuple[Blob, Measurement]]:
     """Measure clusters, and leave out what is no source.
 
     Flares of known size and strength are fitted to each window. What a fit leaves over may be more flares
-    (`deblend`), or charge that clipped pixels spilled over their columns. Where no fit is to be had the flux
-    comes from an aperture; that of a clipped flare is then a lower bound.
+    (`deblend`), or charge that clipped pixels spilled over their columns. Blobs that are too large to be
+    fitted, or have no range, are measured by aperture; the flux of a clipped one is then a lower bound.
+
+    Parameters
+    ----------
+    found
+        The clusters.
+    prepared
+        The frame.
+    apart
+        That blobs side by side have been tried together before.
 
     Returns
     -------
@@ -90,13 +101,19 @@ def measure(found: Sequence[Cluster], prepared: PreparedFrame) -> list[tuple[Blo
     odd = [index for index, solution in enumerate(solutions) if solution is not None and _is_odd(solution)]
     of_odd = of_free_size([solution for k in odd if (solution := solutions[k]) is not None], camera)
     free = dict(zip(odd, of_odd, strict=True))
-    measured = [
-        each
-        for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True))
-        if solution is not None
-        and not (index in free and is_other_size(solution, free[index], camera.tie_spread))
-        for each in _judged(cluster, solution, prepared)
-    ]
+    measured: list[tuple[Blob, Measurement]] = []
+    again: list[Candidate] = []
+    for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True)):
+        other_size = (
+            index in free and solution is not None and is_other_size(solution, free[index], camera.tie_spread)
+        )
+        judged = [] if solution is None or other_size else _judged(cluster, solution, prepared)
+        measured += judged
+        if not judged and len(cluster.members) > 1 and not apart:
+            again += [cluster.members[k] for k in cluster.wanted]
+    if again:
+        # What spoils a cluster spoils it for all: each by itself, the others left out.
+        measured += measure(clusters(again, prepared, apart=True), prepared, apart=True)
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
     return measured + [each for cluster in others for each in _by_apertures(cluster, prepared)]
 
@@ -261,14 +278,13 @@ def _measurement(
     frame, calibration = prepared.frame, prepared.calibration
     gain = gain_dn_per_e(frame, calibration)
     ranged = range_from_flux(flux_e * gain, math.nan, u_px, v_px, frame.exposure_s, frame.gain, calibration)
-    # The logarithm's estimate is even; noise alone makes d too large on average, as in `range_from_flux`.
+    # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.
     range_m = math.nan
     if math.isfinite(ranged.range_m):
-        range_m = math.exp(float(solution.log_range[index])) / (
-            1.0 + 1.5 * (flux_sigma_e / flux_e / 2.0) ** 2
-        )
+        range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * (flux_sigma_e / flux_e) ** 2)
     clipped_dn = prepared.clipped_dn
-    saturated = bool((frame.data_dn[blob.box.slices][blob.pixels] >= clipped_dn).any())
+    light = blob.pixels & ~prepared.bad[blob.box.slices]
+    saturated = bool((frame.data_dn[blob.box.slices][light] >= clipped_dn).any())
     bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
     unknown = math.nan
     return Measurement(

@@ -111,7 +111,7 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     ratio = _scatter_ratio(filtered_e, filtered_noise * noise_mesh_e)
     limit_e = spread_mesh(limit_mesh_e * ratio, calibration)
     lit = _above(filtered_e, limit_e)
-    bad = bad_pixels(excess_e, image_e, lit, floor_e2, kernel)
+    bad = bad_pixels(excess_e, image_e, lit, floor_e2, kernel, along_rows=frame.line_time_s > 0.0)
     if bad.any():
         excess_e[bad] = 0.0
         filtered_e = matched_filter(excess_e, kernel)
@@ -144,6 +144,8 @@ def bad_pixels(
     lit: NDArray[np.bool_],
     floor_e2: float,
     kernel: NDArray[np.float64],
+    *,
+    along_rows: bool = False,
 ) -> NDArray[np.bool_]:
     """Find pixels that are stuck or hot: far brighter, beside their neighbours, than light could make them.
 
@@ -161,6 +163,9 @@ def bad_pixels(
         Variance of a dark pixel.
     kernel
         Image of a point along one axis, of odd length.
+    along_rows
+        Look at the neighbours in the same row alone: behind a rolling shutter the rows of a flare may be lit
+        at different times.
 
     Returns
     -------
@@ -171,10 +176,11 @@ def bad_pixels(
     if not len(rows):
         return bad
     middle = len(kernel) // 2
-    least = float(kernel[middle - 1 : middle + 2].sum() / kernel[middle]) ** 2 - 1.0
+    in_line = float(kernel[middle - 1 : middle + 2].sum() / kernel[middle])
+    least = in_line - 1.0 if along_rows else in_line**2 - 1.0
     around = np.zeros(len(rows))
     variance = np.zeros(len(rows))
-    for down in (-1, 0, 1):
+    for down in (0,) if along_rows else (-1, 0, 1):
         for across in (-1, 0, 1):
             if not (down or across):
                 continue

@@ -110,7 +110,7 @@ def autocorrelation(
     return tuple(np.clip(measured[:last], 0.0, 1.0).round(3).tolist())
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)
 def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array]:
     """Return cosines over a square window, and the covariance of their amplitudes at variance 1.
 

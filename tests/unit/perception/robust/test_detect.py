@@ -1,5 +1,6 @@
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -145,6 +146,46 @@ def test_the_border_of_a_shadow_is_no_flare() -> None:
     mean[:, 90:] += 380.0
     (hit,) = detect_robust(expose(mean, SMALL, random(62), 5e-4), SMALL)
     assert abs(hit.range_m - 6.0) < 4.0 * hit.range_sigma_m
+
+
+def test_one_bad_neighbour_does_not_cost_a_flare() -> None:
+    """Beside a flare, 6 px off, two pixels in a column at 700 counts: no fit of both explains them, one alone does."""
+    frame = take([(90.3, 80.4, 5.0)], 6e-4, 64)
+    frame.data_dn[83:85, 96] = 700
+    found = detect_robust(frame, SMALL)
+    hit = nearest(found, 90.3, 80.4)
+    assert abs(hit.range_m - 5.0) < 4.0 * hit.range_sigma_m
+
+
+def test_a_stuck_pixel_beside_a_flare_does_not_make_it_saturated() -> None:
+    frame = take([(90.3, 80.4, 5.0)], 3e-4, 65)
+    frame.data_dn[80, 94] = 4095
+    (hit,) = detect_robust(frame, SMALL)
+    assert not hit.saturated
+    assert abs(hit.range_m - 5.0) < 4.0 * hit.range_sigma_m
+
+
+def test_without_a_range_constant_flares_are_found_unranged() -> None:
+    frame = take([(90.3, 80.4, 5.0), (30.2, 40.1, 8.0)], 4e-4, 66)
+    found = detect_robust(frame, replace(SMALL, range_constant_dn_m2_per_s=math.nan))
+    assert len(found) == 2
+    assert all(math.isnan(hit.range_m) and math.isfinite(hit.u_sigma_px) for hit in found)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"psf_sigma_px": math.nan}, {"source_radius_m": -0.01}, {"sigma": {"psf_sigma_px": math.inf}}]
+)
+def test_a_calibration_that_cannot_be_is_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="its calibration has"):
+        detect_robust(take([(90.3, 80.4, 5.0)], 6e-4, 67), replace(SMALL, **changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("side_px", [1, 3, 8, 20])
+def test_tiny_frames(side_px: int) -> None:
+    """Noise alone: nothing, and no exception."""
+    camera = calibration(width_px=side_px, height_px=side_px, cx_px=0.5 * side_px, cy_px=0.5 * side_px)
+    for key in range(10):
+        assert detect_robust(expose(np.full((side_px, side_px), 3.0), camera, random(68, key)), camera) == []
 
 
 def test_garbage_takes_bounded_time() -> None:
