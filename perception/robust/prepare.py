@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2, saturation_dn
+from perception.model.sensor import bad_pixels, electrons, gain_dn_per_e, noise_floor_e2, saturation_dn
 from perception.robust.structure import LEAST_RATIO, LEAST_RATIO_AROUND, Texture, autocorrelation, scatter
 from perception.types import Calibration, RawFrame
 
@@ -24,7 +24,6 @@ FALSE_ALARMS_PER_PIXEL = 1e-3 / (1280 * 960)
 
 _SAMPLES_PER_AXIS = 24
 _SCATTER_SAMPLES_PER_AXIS = 16
-_BAD_SIGMAS = 5.0
 _CLIP_SIGMA = 3.0
 _CLIP_ROUNDS = 3
 
@@ -136,62 +135,6 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
         texture=texture,
         bad=bad,
     )
-
-
-def bad_pixels(
-    excess_e: NDArray[np.float32],
-    image_e: NDArray[np.float32],
-    lit: NDArray[np.bool_],
-    floor_e2: float,
-    kernel: NDArray[np.float64],
-    *,
-    along_rows: bool = False,
-) -> NDArray[np.bool_]:
-    """Find pixels that are stuck or hot: far brighter, beside their neighbours, than light could make them.
-
-    Around a point in the middle of a pixel its eight neighbours hold `least` times its light together, around
-    any other image more. A pixel whose neighbours hold less than half of that, and by 5 σ, is none of light,
-    whether it stands alone or beside another.
-
-    Parameters
-    ----------
-    excess_e, image_e
-        Electrons above the background, and above black level, the frame's shape.
-    lit
-        Where to look.
-    floor_e2
-        Variance of a dark pixel.
-    kernel
-        Image of a point along one axis, of odd length.
-    along_rows
-        Look at the neighbours in the same row alone: behind a rolling shutter the rows of a flare may be lit
-        at different times.
-
-    Returns
-    -------
-    Mask of the frame's shape.
-    """
-    bad = np.zeros(lit.shape, dtype=bool)
-    rows, columns = np.nonzero(lit)
-    if not len(rows):
-        return bad
-    middle = len(kernel) // 2
-    in_line = float(kernel[middle - 1 : middle + 2].sum() / kernel[middle])
-    least = in_line - 1.0 if along_rows else in_line**2 - 1.0
-    around = np.zeros(len(rows))
-    variance = np.zeros(len(rows))
-    for down in (0,) if along_rows else (-1, 0, 1):
-        for across in (-1, 0, 1):
-            if not (down or across):
-                continue
-            row, column = rows + down, columns + across
-            inside = (row >= 0) & (row < lit.shape[0]) & (column >= 0) & (column < lit.shape[1])
-            row, column = np.where(inside, row, rows), np.where(inside, column, columns)
-            # What lies beyond the frame is taken to be as bright as the pixel itself.
-            around += excess_e[row, column]
-            variance += np.maximum(image_e[row, column], 0.0) + floor_e2
-    bad[rows, columns] = around + _BAD_SIGMAS * np.sqrt(variance) < 0.5 * least * excess_e[rows, columns]
-    return bad
 
 
 def _above(image_e: NDArray[np.float32], limit_e: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -7,7 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import perception
-from perception.robust.prepare import bad_pixels, point_kernel
+from perception.model.sensor import bad_pixels
+from perception.robust.prepare import point_kernel
 from perception.robust.structure import autocorrelation, structure_of
 from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, frame_of, textured
 from tests.unit.perception.simulation import random
