@@ -66,10 +66,10 @@ class Measurement:
         """Whether its flux exceeds the background right beside it by 4 σ (a clipped one always does).
 
         What only the coarse background made look bright, such as the border of a shadow, does not. On
-        texture, of which the detection limit knows the scatter alone, it must exceed 6 σ; on edges, whose
-        scatter is not normal, and where it does not look like a source, 10 σ.
+        texture, which need not be as normal as the fit takes it to be, it must exceed 8 σ; on edges, which
+        never are, and where it does not look like a source, 10 σ.
         """
-        least = 10.0 if self.misfit or self.on_edges else 6.0 if self.on_texture else 4.0
+        least = 10.0 if self.misfit or self.on_edges else 8.0 if self.on_texture else 4.0
         return self.saturated or (self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e)
 
 
