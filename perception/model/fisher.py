@@ -184,7 +184,7 @@ def flare_limits(
         return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(flares)
     model = replace(model, log_flux_at_1_m=np.log(flux_e) + 2.0 * np.log(range_m))
     values = np.zeros((1, model.layout.size))
-    own = values[:, : model.layout.width].reshape(1, len(flares), -1)
+    own = model.layout.of_sources(values)
     own[..., 0], own[..., 1], own[..., 2] = u_px, v_px, np.log(range_m)
     values[:, model.layout.background] = background_e
     clip_e = clip_level_e(calibration, calibration.black_level_dn) if clipped_tell_nothing else math.inf

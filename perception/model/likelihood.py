@@ -117,8 +117,7 @@ class Likelihood:
 
     def inside(self, values: Array) -> NDArray[np.bool_]:
         """Tell which values have all flares on their window's pixels, at a range that can be."""
-        layout = self.model.layout
-        own = values[:, : layout.width].reshape(len(values), layout.sources, layout.per_source)
+        own = self.model.layout.of_sources(values)
         rows, columns = self.windows.shape
         column, row = own[..., 0] - self.left[:, None], own[..., 1] - self.top[:, None]
         within = (column > -0.5) & (column < columns - 0.5) & (row > -0.5) & (row < rows - 0.5)

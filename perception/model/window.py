@@ -103,6 +103,10 @@ class Layout:
         """Unknowns of each source."""
         return 4 if self.has_slack else 3
 
+    def of_sources(self, values: Array) -> Array:
+        """Return the sources' part of unknowns, a view of shape (windows, sources, unknowns of each)."""
+        return values[:, : self.width].reshape(len(values), self.sources, self.per_source)
+
     @property
     def width(self) -> int:
         """Index of w."""
@@ -177,6 +181,13 @@ class WindowModel:
             precision[:, -layout.structure :, -layout.structure :] = self.structure.precision
         return precision
 
+    def log_range_by_size(self, values: Array) -> Array:
+        """Return ln of the range that each source's size stands for, shape (windows, sources)."""
+        own = self.layout.of_sources(values)
+        if not self.layout.has_slack:
+            return own[..., 2]
+        return np.asarray(own[..., 2] - self.camera.tie_spread * own[..., 3])
+
     def expected_e(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives.
 
@@ -190,9 +201,8 @@ class WindowModel:
         λ in electrons, shape (windows, pixels), and its derivatives, shape (windows, unknowns, pixels).
         """
         layout, count = self.layout, len(values)
-        of_sources = values[:, : layout.width].reshape(count, layout.sources, layout.per_source)
-        slack = self.camera.tie_spread * of_sources[..., 3] if layout.has_slack else 0.0
-        by_size = (of_sources[..., 2] - slack).ravel()
+        of_sources = layout.of_sources(values)
+        by_size = self.log_range_by_size(values).ravel()
         calibration = self.camera.calibration
         width_px = np.full(count, calibration.psf_sigma_px)
         if layout.has_width:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox, image_radius_px
 from perception.model.ranging import angular_radius_rad, flux_at_one_metre_e
-from perception.model.sensor import clip_level_e, saturation_dn
+from perception.model.sensor import clip_level_e
 from perception.robust.blobs import Blob, near_groups
 from perception.robust.prepare import PreparedFrame
 from perception.robust.solve import Start, Window
@@ -91,10 +91,9 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
     if not blobs:
         return []
     frame, calibration = prepared.frame, prepared.calibration
-    clipped_dn = saturation_dn(calibration, frame.gain)
     of_light = [b.pixels & ~prepared.bad[b.box.slices] for b in blobs]
     clipped = [
-        int((frame.data_dn[blob.box.slices][pixels] >= clipped_dn).sum())
+        int((frame.data_dn[blob.box.slices][pixels] >= prepared.clipped_dn).sum())
         for blob, pixels in zip(blobs, of_light, strict=True)
     ]
     u_px, v_px, flux_e = np.array([_moments(blob, prepared) for blob in blobs]).T
@@ -214,7 +213,7 @@ def _cluster(
         box=box,
         image_e=prepared.image_e[place].astype(np.float64),
         usable=inside & ~dilated(others, 2) & ~prepared.bad[place],
-        clipped=(frame.data_dn[place] >= saturation_dn(calibration, frame.gain)) & ~prepared.bad[place],
+        clipped=(frame.data_dn[place] >= prepared.clipped_dn) & ~prepared.bad[place],
         floor_e2=prepared.floor_e2,
         clip_e=clip_level_e(calibration, frame.black_level_dn, frame.gain),
         prnu=calibration.prnu,

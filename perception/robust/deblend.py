@@ -48,7 +48,7 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
     asking = sorted(sorted(asking, key=lambda index: -float(found[index].flux_e.max()))[:MOST_WINDOWS])
     lone = [index for index in asking if found[index].count == 1]
     free = _with_spread(camera, "psf_sigma_px", _WIDTH_FREE)
-    of_free_width = solve([_again(found[index]) for index in lone], free)
+    of_free_width = solve([found[index].again() for index in lone], free)
     null = dict(enumerate(found))
     large = [index for index in lone if float(found[index].image_radius_px[0]) > _LEAST_RADIUS_PX]
     of_any_size = of_free_size([found[index] for index in large], camera)
@@ -91,11 +91,7 @@ def asks_for_more(solution: Solution) -> bool:
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     """Fit lone flares whose size may be any, whatever their flux says."""
     free = _with_spread(camera, "range_constant_dn_m2_per_s", 8.0)
-    return solve([_again(solution) for solution in solutions], free)
-
-
-def _again(solution: Solution) -> Problem:
-    return Problem(solution.window, solution.starts, solution.background_e)
+    return solve([solution.again() for solution in solutions], free)
 
 
 def _with_spread(camera: Camera, name: str, spread: float) -> Camera:

@@ -62,8 +62,7 @@ class Fits:
 
     @property
     def _own(self) -> Array:
-        layout = self.model.layout
-        return self.values[:, : layout.width].reshape(len(self.values), layout.sources, layout.per_source)
+        return self.model.layout.of_sources(self.values)
 
     @property
     def places_px(self) -> Array:
@@ -99,12 +98,10 @@ class Fits:
 
     def image_radius_px(self) -> Array:
         """Return the radius of each source's image before the point spread, shape (windows, sources)."""
-        model, own = self.model, self._own
-        slack = model.camera.tie_spread * own[..., 3] if model.layout.has_slack else 0.0
+        model, shape = self.model, self._own.shape[:2]
         reach_px = np.where(np.isfinite(model.nodes.u_px), np.hypot(model.nodes.u_px, model.nodes.v_px), 0.0)
-        at_layout = reach_px.max(axis=1).reshape(own.shape[:2])
-        growth = np.exp(model.log_range_at.reshape(own.shape[:2]) - own[..., 2] + slack)
-        return np.asarray(at_layout * growth)
+        growth = np.exp(model.log_range_at.reshape(shape) - model.log_range_by_size(self.values))
+        return np.asarray(reach_px.max(axis=1).reshape(shape) * growth)
 
     def flares_e(self) -> Array:
         """Return what the sources alone are expected to give, shape of `expected_e`."""
@@ -138,7 +135,7 @@ def fit_flares(windows: Windows, camera: Camera, starts: Starts, structure: Stru
     model, imaged = _laid_out(windows, camera, starts.u_px, starts.v_px, starts.log_range, structure)
     layout = model.layout
     values = np.zeros((len(starts.u_px), layout.size))
-    own = values[:, : layout.width].reshape(len(values), layout.sources, layout.per_source)
+    own = layout.of_sources(values)
     own[..., 0], own[..., 1], own[..., 2] = starts.u_px, starts.v_px, starts.log_range
     values[:, layout.background] = starts.background_e
     fits = _climb(windows, model, values, imaged)
@@ -147,9 +144,8 @@ def fit_flares(windows: Windows, camera: Camera, starts: Starts, structure: Stru
         if not len(stale):
             break
         # Images are laid out for all windows alike; those that stayed find themselves where they were.
-        own = fits.values[:, : layout.width].reshape(own.shape)
-        slack = camera.tie_spread * own[..., 3] if layout.has_slack else 0.0
-        model, imaged = _laid_out(windows, camera, own[..., 0], own[..., 1], own[..., 2] - slack, structure)
+        own, by_size = layout.of_sources(fits.values), model.log_range_by_size(fits.values)
+        model, imaged = _laid_out(windows, camera, own[..., 0], own[..., 1], by_size, structure)
         fits = _climb(windows, model, fits.values, imaged & fits.converged)
     return fits
 
@@ -168,9 +164,8 @@ def _laid_out(
 
 def _moved(fits: Fits) -> NDArray[np.bool_]:
     """Tell where a size has changed so much that images should be laid out anew."""
-    model, own = fits.model, fits._own
-    slack = model.camera.tie_spread * own[..., 3] if model.layout.has_slack else 0.0
-    change = np.abs(own[..., 2] - slack - model.log_range_at.reshape(own.shape[:2]))
+    by_size = fits.model.log_range_by_size(fits.values)
+    change = np.abs(by_size - fits.model.log_range_at.reshape(by_size.shape))
     stale = (change > _LAYOUT_KEPT) & (change * fits.image_radius_px() > _LAYOUT_KEPT_PX)
     return np.asarray(stale.any(axis=1))
 

@@ -186,8 +186,7 @@ def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
         if halo_sigmas(solution, halo) < HALO_SEEMS_SIGMAS:
             continue
         tried.append((index, solution))
-        window = replace(window, structure=joined(window.structure, halo))
-        problems.append(Problem(window, solution.starts, solution.background_e))
+        problems.append(solution.again(replace(window, structure=joined(window.structure, halo))))
     having = []
     for (index, without), again in zip(tried, solve(problems, camera), strict=True):
         if again is not None and without.deviance - again.deviance > HALO_GAIN:
@@ -216,7 +215,7 @@ def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[floa
             else:
                 continue
             tried.append(index)
-            problems.append(Problem(window, solution.starts, solution.background_e))
+            problems.append(solution.again(window))
         for index, again in zip(tried, solve(problems, camera), strict=True):
             best[index] = again
 
@@ -236,7 +235,7 @@ def _retry_without_spill(best: list[Solution | None], parted: Container[int], ca
         window = solution.window
         spilled = window.clipped.any(axis=0)
         dry = replace(window, usable=window.usable & ~spilled)
-        problems.append(Problem(dry, solution.starts, solution.background_e))
+        problems.append(solution.again(dry))
     for (index, _), again in zip(tried, solve(problems, camera), strict=True):
         if again is not None and core_goodness(again).share_left < MOST_LEFT:
             best[index] = again
@@ -282,9 +281,8 @@ def _measurement(
     range_m = math.nan
     if math.isfinite(ranged.range_m):
         range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * (flux_sigma_e / flux_e) ** 2)
-    clipped_dn = prepared.clipped_dn
     light = blob.pixels & ~prepared.bad[blob.box.slices]
-    saturated = bool((frame.data_dn[blob.box.slices][light] >= clipped_dn).any())
+    saturated = bool((frame.data_dn[blob.box.slices][light] >= prepared.clipped_dn).any())
     bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
     unknown = math.nan
     return Measurement(

@@ -4,6 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +134,11 @@ class Solution:
         rows = zip(self.u_px, self.v_px, self.log_photometric_range, strict=True)
         return [(float(u), float(v), float(log_range)) for u, v, log_range in rows]
 
-    @property
+    def again(self, window: Window | None = None) -> Problem:
+        """Return the problem of fitting these flares again, or to another view of their window."""
+        return Problem(self.window if window is None else window, self.starts, self.background_e)
+
+    @cached_property
     def residual_e(self) -> Array:
         """What the fit leaves over: 0 where unusable, or clipped as is expected."""
         left = self.window.image_e - self.expected_e
