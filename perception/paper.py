@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from perception.model.bearing import direction_camera
 from perception.model.flare import PixelBox
 from perception.model.sensor import check_frame, saturation_dn
-from perception.robust.blobs import components
+from perception.robust.search.blobs import components
 from perception.types import Calibration, Detection, RawFrame
 
 # --- Grayscale-based Ranging ----------------------------------------------------------------------------

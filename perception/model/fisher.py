@@ -2,15 +2,17 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox, image_radius_px
+from perception.model.layout import Layout, Structure, View, even
+from perception.model.pixels import expectation
 from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import clip_level_e, noise_floor_e2, pixel_variance_e2
-from perception.model.window import Camera, Structure, WindowModel, window_model
+from perception.model.window import Camera, lay_out
 from perception.types import Calibration
 
 WIDE_PX = 64.0
@@ -172,30 +174,31 @@ def flare_limits(
             for flare, angle, radius in zip(flares, radius_rad, radius_px, strict=True)
         ]
     box = limit_box(calibration, flares)
-    u_px, v_px, range_m, flux_e = (column[None] for column in place.T)
-    model, imaged = window_model(
-        Camera(calibration, 1.0, 1.0),
-        (np.array([box.top]), np.array([box.left])),
-        (box.height, box.width),
-        (u_px, v_px, np.log(range_m)),
-        structure,
-    )
-    if not imaged[0] or box.height * box.width == 0:
-        return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(flares)
-    model = replace(model, log_flux_at_1_m=np.log(flux_e) + 2.0 * np.log(range_m))
-    values = np.zeros((1, model.layout.size))
-    own = model.layout.of_sources(values)
-    own[..., 0], own[..., 1], own[..., 2] = u_px, v_px, np.log(range_m)
-    values[:, model.layout.background] = background_e
+    nothing = [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(flares)
+    camera = Camera(calibration, 1.0, 1.0)
+    log_range, pixels = np.log(place[:, 2]), box.height * box.width
+    sources, imaged = lay_out(camera, place[:, 0], place[:, 1], log_range)
+    if not imaged.all() or pixels == 0:
+        return nothing
     clip_e = clip_level_e(calibration, calibration.black_level_dn) if clipped_tell_nothing else math.inf
-    expected_e, jacobian = model.expected_e(values)
-    variance_e2 = pixel_variance_e2(expected_e, noise_floor_e2(calibration), calibration.prnu)
-    telling = np.ones(expected_e[0].shape)
+    known, structure = camera.known(clip_e), structure or even(pixels)
+    layout = known.layout(len(flares), len(structure.columns))
+    values = np.zeros(layout.size)
+    own = values[: layout.width].reshape(len(flares), layout.per_source)
+    own[:, 0], own[:, 1], own[:, 2] = place[:, 0], place[:, 1], log_range
+    values[layout.background] = background_e
+    expected_e, variance_e2, jacobian = np.empty(pixels), np.empty(pixels), np.empty((layout.size, pixels))
+    at_1_m = sources._replace(log_flux_at_1_m=np.log(place[:, 3]) + 2.0 * log_range)
+    blank = np.zeros((box.height, box.width))
+    view = View(box.top, box.left, blank, blank.astype(np.uint8), noise_floor_e2(calibration))
+    expectation(values, view, at_1_m, structure, known, expected_e, jacobian, variance_e2)
+    telling = np.ones(pixels)
     if clipped_tell_nothing:
-        telling = censored_weight(expected_e, variance_e2, clip_e)[0]
+        telling = censored_weight(expected_e, variance_e2, clip_e)
     used = telling > _LEAST_TELLING
-    information = fisher_information(jacobian[0][:, used], variance_e2[0, used] / telling[used])
-    return _limits(model, place, covariance(information + model.precision[0]))
+    information = fisher_information(jacobian[:, used], variance_e2[used] / telling[used])
+    inverse = covariance(information + layout.prior(structure))
+    return nothing if inverse is None else _limits(camera, layout, place, inverse)
 
 
 def limit_box(calibration: Calibration, flares: Sequence[tuple[float, float, float, float]]) -> PixelBox:
@@ -218,17 +221,15 @@ def limit_box(calibration: Calibration, flares: Sequence[tuple[float, float, flo
 
 
 def _limits(
-    model: WindowModel, place: NDArray[np.float64], inverse: NDArray[np.float64] | None
+    camera: Camera, layout: Layout, place: NDArray[np.float64], inverse: NDArray[np.float64]
 ) -> list[FlareLimit]:
     """Return the bounds that a covariance of all unknowns holds."""
-    if inverse is None:
-        return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(place)
-    limits, step = [], model.layout.per_source
-    ranged = model.camera.calibration.range_constant_dn_m2_per_s > 0.0
+    limits, step = [], layout.per_source
+    ranged = camera.calibration.range_constant_dn_m2_per_s > 0.0
     for index, (_, _, range_m, flux_e) in enumerate(place.tolist()):
         own = inverse[index * step : (index + 1) * step, index * step : (index + 1) * step]
-        slack = np.zeros(()) if model.layout.has_slack else None
-        _, log_sigma = model.camera.log_range(np.zeros(()), slack, own[2:, 2:])
+        slack = np.zeros(()) if layout.has_slack else None
+        _, log_sigma = camera.log_range(np.zeros(()), slack, own[2:, 2:])
         u_sigma, v_sigma, l_sigma = np.sqrt(np.diagonal(own)[:3]).tolist()
         # Without a range constant there is no range to be had from whatever is seen.
         range_sigma_m = range_m * float(log_sigma) if ranged else math.inf

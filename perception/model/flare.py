@@ -6,23 +6,20 @@ angle, and falls on the image where the lens projects it; the PSF spreads it, th
 """
 
 import math
-from dataclasses import dataclass, fields
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from perception.model.bearing import direction_camera
-from perception.model.lens import project, stretch
+from perception.model.layout import Sources
+from perception.model.lens import stretch
+from perception.model.nodes import disc_nodes
+from perception.model.pixels import spread_nodes
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
-
-# Quadrature nodes per ratio of image radius to smoothing: the smallest numbers, found by comparison with
-# three times as many, that keep the error below 1e-4 of the peak for radii from 0 to 130 px.
-_RINGS_BASE, _RINGS_SLOPE = 0.85, 1.2
-_AROUND_BASE, _AROUND_SLOPE = 5.0, 4.5
 
 
 @dataclass(frozen=True)
@@ -57,8 +54,6 @@ class PixelBox:
 class FlareImage:
     """Fraction of the flux in each pixel of a window, and its change as the image moves.
 
-    Of several flares each array has one more axis in front.
-
     Attributes
     ----------
     fraction
@@ -76,24 +71,6 @@ class FlareImage:
     d_dv: Array
     d_dgrowth: Array
     d_dspread: Array
-
-
-@dataclass(frozen=True, eq=False)
-class DiscNodes:
-    """Quadrature nodes of the images of some sources.
-
-    Attributes
-    ----------
-    u_px, v_px
-        Where they are, relative to the source's place, shape (sources, nodes); infinite beyond the lens's
-        fold.
-    weight
-        Share of the light, sum 1 for each source, same shape.
-    """
-
-    u_px: Array
-    v_px: Array
-    weight: Array
 
 
 def image_radius_px(
@@ -115,9 +92,14 @@ def has_image(
 ) -> NDArray[np.bool_]:
     """Tell which spheres lie within 90° of the axis, and so have an image. Numbers or arrays of one shape."""
     places = np.stack(np.broadcast_arrays(u_px, v_px), axis=-1).astype(np.float64)
-    along = direction_camera(places.reshape(-1, 2), calibration)[:, 2].reshape(places.shape[:-1])
-    # A middle without a direction (NaN) has none.
-    reach_rad = np.arccos(np.clip(along, -1.0, 1.0)) + np.asarray(angular_radius_rad, dtype=np.float64)
+    direction = direction_camera(places.reshape(-1, 2), calibration).reshape(*places.shape[:-1], 3)
+    return is_before(direction, np.asarray(angular_radius_rad, dtype=np.float64))
+
+
+def is_before(direction: Array, angular_radius_rad: Array) -> NDArray[np.bool_]:
+    """Tell which spheres in some unit directions lie within 90° of the axis, shape (..., 3) → (...)."""
+    # A middle without a direction (NaN) does not.
+    reach_rad = np.arccos(np.clip(direction[..., 2], -1.0, 1.0)) + angular_radius_rad
     return np.asarray(reach_rad < 0.5 * np.pi)
 
 
@@ -164,130 +146,10 @@ def flare_image(
             "has no image; the radius must be ≥ 0 and the sphere within 90° of the axis"
         )
     u, v, radius = (np.array([value], dtype=np.float64) for value in (u_px, v_px, angular_radius_rad))
-    images = images_of_nodes(
-        disc_nodes(u, v, radius, calibration),
-        u - window.left,
-        v - window.top,
-        np.ones(1),
-        np.full(1, calibration.psf_sigma_px),
-        (window.height, window.width),
-    )
-    return FlareImage(*(getattr(images, field.name)[0] for field in fields(FlareImage)))
-
-
-def disc_nodes(u_px: Array, v_px: Array, angular_radius_rad: Array, calibration: Calibration) -> DiscNodes:
-    """Return quadrature nodes over the caps of spheres, as many for each as the largest image needs.
-
-    Parameters
-    ----------
-    u_px, v_px, angular_radius_rad
-        Places and sizes, shape (sources,); spheres that have an image (`has_image`).
-    calibration
-        Intrinsics, PSF and response.
-    """
-    centre = direction_camera(np.stack([u_px, v_px], axis=1), calibration)
-    # The pixel smooths like a box of variance 1/12 px², on top of the PSF.
-    smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
-    radius_px = stretch(centre, calibration) * np.tan(angular_radius_rad)
-    share_h, phi, ring_weight = _cap_rule(math.ceil(2.0 * float(radius_px.max()) / smooth_px))
-
-    # dΩ = dh dφ with h = 1 - cos α: uniform in h.
-    h = share_h * (2.0 * np.sin(0.5 * angular_radius_rad) ** 2)[:, None]
-    sin_alpha = np.sqrt(h * (2.0 - h))
-    across, down = _tangents(centre)
-    omega = (
-        (1.0 - h)[..., None] * centre[:, None]
-        + (sin_alpha * np.cos(phi))[..., None] * across[:, None]
-        + (sin_alpha * np.sin(phi))[..., None] * down[:, None]
-    )
-    theta = np.arctan2(np.hypot(omega[..., 0], omega[..., 1]), omega[..., 2])
-    response = np.interp(theta, calibration.response_angle_rad, calibration.response_relative)
-    weight = ring_weight * omega[..., 2] * response  # cos θ · response(θ) · dΩ
-    # What lies beyond the lens's fold has no image: its light counts, and falls on no pixel.
-    at_px = np.nan_to_num(project(omega.reshape(-1, 3), calibration), nan=np.inf).reshape(*h.shape, 2)
-    return DiscNodes(
-        u_px=at_px[..., 0] - u_px[:, None],
-        v_px=at_px[..., 1] - v_px[:, None],
-        weight=weight / weight.sum(axis=1, keepdims=True),
-    )
-
-
-def images_of_nodes(
-    nodes: DiscNodes, u_px: Array, v_px: Array, growth: Array, sigma_px: Array, shape: tuple[int, int]
-) -> FlareImage:
-    """Spread quadrature nodes by the PSF and integrate them over the pixels of windows, one for each source.
-
-    Parameters
-    ----------
-    nodes
-        As of `disc_nodes`.
-    u_px, v_px
-        Where each source is in its window, counted from the middle of its first pixel, shape (sources,).
-    growth
-        Factor on the size at which the nodes were made, shape (sources,).
-    sigma_px
-        Width of each source's PSF, shape (sources,).
-    shape
-        Rows and columns of each window.
-
-    Returns
-    -------
-    FlareImage
-        Its arrays have shape (sources, rows, columns).
-    """
-    out_u, out_v = nodes.u_px * growth[:, None], nodes.v_px * growth[:, None]
-    in_u, slope_u, wider_u = _pixel_shares(u_px[:, None] + out_u, shape[1], sigma_px)
-    in_v, slope_v, wider_v = _pixel_shares(v_px[:, None] + out_v, shape[0], sigma_px)
-    # What falls on no pixel stays there.
-    out_u, out_v = (np.where(np.isfinite(out), out, 0.0)[:, None] for out in (out_u, out_v))
-    weight = nodes.weight[:, None]
-    in_v, slope_v, wider_v = in_v * weight, slope_v * weight, wider_v * weight
-    in_u_t, slope_u_t = in_u.transpose(0, 2, 1), slope_u.transpose(0, 2, 1)
-    return FlareImage(
-        fraction=in_v @ in_u_t,
-        d_du=in_v @ slope_u_t,
-        d_dv=slope_v @ in_u_t,
-        d_dgrowth=(in_v * out_u) @ slope_u_t + (slope_v * out_v) @ in_u_t,
-        d_dspread=in_v @ wider_u.transpose(0, 2, 1) + wider_v @ in_u_t,
-    )
-
-
-@lru_cache(maxsize=256)
-def _cap_rule(twice_fineness: int) -> tuple[Array, Array, Array]:
-    """Return nodes over a cap, as shares of its height and angles around, and their weights (sum 1).
-
-    For images of up to half that many times the width of what smooths them.
-    """
-    fineness = 0.5 * twice_fineness
-    rings = math.ceil(_RINGS_BASE + _RINGS_SLOPE * fineness)
-    node, ring_weight = np.polynomial.legendre.leggauss(rings)
-    share_h = 0.5 * (node + 1.0)
-    around = np.ceil(_AROUND_BASE + _AROUND_SLOPE * fineness * np.sqrt(share_h)).astype(int)
-    ring = np.repeat(np.arange(rings), around)
-    step = np.arange(len(ring)) - np.repeat(np.cumsum(around) - around, around)
-    # The golden angle turns each ring against the last, so that their errors do not line up.
-    phi = 2.0 * math.pi * (step / around[ring]) + ring * 2.399963
-    return share_h[ring], phi, (0.5 * ring_weight / around)[ring]
-
-
-def _tangents(direction: Array) -> tuple[Array, Array]:
-    """Two unit vectors that complete each direction (not along x) to an orthonormal frame."""
-    down = np.cross(direction, [1.0, 0.0, 0.0])
-    down /= np.linalg.norm(down, axis=-1, keepdims=True)
-    return np.cross(down, direction), down
-
-
-def _pixel_shares(at_px: Array, count: int, sigma_px: Array) -> tuple[Array, Array, Array]:
-    """Share of a Gaussian at each node in each pixel of a row, and its slopes by place and by ln σ.
-
-    `at_px` has shape (sources, nodes), counted from the first pixel's middle; results (sources, count,
-    nodes).
-    """
-    from scipy.special import erf
-
-    edges = np.arange(count + 1) - 0.5
-    # Nodes on no pixel stand so far off that nothing of them is left.
-    away = np.clip(edges[:, None] - at_px[:, None, :], -1e6, 1e6) / sigma_px[:, None, None]
-    share = 0.5 * np.diff(erf(away * math.sqrt(0.5)), axis=1)
-    density = np.exp(-0.5 * away**2) / math.sqrt(2.0 * math.pi)
-    return share, -np.diff(density, axis=1) / sigma_px[:, None, None], -np.diff(away * density, axis=1)
+    direction = direction_camera(np.stack([u, v], axis=1), calibration)
+    nodes = disc_nodes(u, v, direction, radius, calibration)
+    image = np.zeros((5, window.height, window.width))
+    source = Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.weight, np.zeros(1), np.zeros(1))
+    place = (float(u_px) - window.left, float(v_px) - window.top)
+    spread_nodes(source, 0, place, 1.0, calibration.psf_sigma_px, image)
+    return FlareImage(*image)

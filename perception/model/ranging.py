@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.model.bearing import field_angle_rad
+from perception.model.bearing import direction_camera
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
@@ -30,7 +30,13 @@ def effective_exposure_s(
     not extrapolated. Places are numbers or arrays of one shape, which the result has.
     """
     places = np.stack(np.broadcast_arrays(u_px, v_px), axis=-1).astype(np.float64)
-    theta = field_angle_rad(places.reshape(-1, 2), calibration).reshape(places.shape[:-1])
+    direction = direction_camera(places.reshape(-1, 2), calibration).reshape(*places.shape[:-1], 3)
+    return exposure_towards(direction, exposure_s, gain, calibration)
+
+
+def exposure_towards(direction: Array, exposure_s: float, gain: float, calibration: Calibration) -> Array:
+    """As `effective_exposure_s`, of unit directions in camera axes, shape (..., 3) → (...)."""
+    theta = np.arctan2(np.hypot(direction[..., 0], direction[..., 1]), direction[..., 2])
     response = np.interp(
         theta,
         calibration.response_angle_rad,
@@ -38,7 +44,7 @@ def effective_exposure_s(
         left=math.nan,
         right=math.nan,
     )
-    return np.asarray(exposure_s * gain * np.cos(theta) * response)
+    return np.asarray(exposure_s * gain * direction[..., 2] * response)
 
 
 def flux_at_one_metre_dn(
@@ -56,7 +62,13 @@ def flux_at_one_metre_e(
     u_px: ArrayLike, v_px: ArrayLike, exposure_s: float, gain: float, calibration: Calibration
 ) -> Array:
     """As `flux_at_one_metre_dn`, in electrons."""
-    at_one_metre_dn = flux_at_one_metre_dn(u_px, v_px, exposure_s, gain, calibration)
+    exposed_s = effective_exposure_s(u_px, v_px, exposure_s, gain, calibration)
+    return flux_e_of(exposed_s, gain, calibration)
+
+
+def flux_e_of(exposed_s: Array, gain: float, calibration: Calibration) -> Array:
+    """Electrons that a source one metre away gives in an effective exposure (`effective_exposure_s`)."""
+    at_one_metre_dn = calibration.range_constant_dn_m2_per_s * exposed_s
     return np.asarray(at_one_metre_dn / (calibration.system_gain_dn_per_e * gain))
 
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from perception.types import Calibration, RawFrame
 
-_BAD_SIGMAS = 5.0
 _LEAST = {"psf_sigma_px": 1e-3, "system_gain_dn_per_e": 1e-12, "read_noise_e": 0.0, "source_radius_m": 0.0}
 
 
@@ -121,59 +120,3 @@ def clip_level_e(calibration: Calibration, black_level_dn: float, gain: float = 
     """Electrons at which a pixel is clipped, at a gain."""
     above_black_dn = saturation_dn(calibration, gain) - black_level_dn
     return above_black_dn / (calibration.system_gain_dn_per_e * gain)
-
-
-def bad_pixels(
-    excess_e: NDArray[np.float32],
-    image_e: NDArray[np.float32],
-    lit: NDArray[np.bool_],
-    floor_e2: float,
-    kernel: NDArray[np.float64],
-    *,
-    along_rows: bool = False,
-) -> NDArray[np.bool_]:
-    """Find pixels that are stuck or hot: far brighter, beside their neighbours, than light could make them.
-
-    Around a point in the middle of a pixel its eight neighbours hold `least` times its light together, around
-    any other image more. A pixel whose neighbours hold less than half of that, and by 5 σ, is none of light,
-    whether it stands alone or beside another.
-
-    Parameters
-    ----------
-    excess_e, image_e
-        Electrons above the background, and above black level, the frame's shape.
-    lit
-        Where to look.
-    floor_e2
-        Variance of a dark pixel.
-    kernel
-        Image of a point along one axis, of odd length.
-    along_rows
-        Look at the neighbours in the same row alone: behind a rolling shutter the rows of a flare may be lit
-        at different times.
-
-    Returns
-    -------
-    Mask of the frame's shape.
-    """
-    bad = np.zeros(lit.shape, dtype=bool)
-    rows, columns = np.nonzero(lit)
-    if not len(rows):
-        return bad
-    middle = len(kernel) // 2
-    in_line = float(kernel[middle - 1 : middle + 2].sum() / kernel[middle])
-    least = in_line - 1.0 if along_rows else in_line**2 - 1.0
-    around = np.zeros(len(rows))
-    variance = np.zeros(len(rows))
-    for down in (0,) if along_rows else (-1, 0, 1):
-        for across in (-1, 0, 1):
-            if not (down or across):
-                continue
-            row, column = rows + down, columns + across
-            inside = (row >= 0) & (row < lit.shape[0]) & (column >= 0) & (column < lit.shape[1])
-            row, column = np.where(inside, row, rows), np.where(inside, column, columns)
-            # What lies beyond the frame is taken to be as bright as the pixel itself.
-            around += excess_e[row, column]
-            variance += np.maximum(image_e[row, column], 0.0) + floor_e2
-    bad[rows, columns] = around + _BAD_SIGMAS * np.sqrt(variance) < 0.5 * least * excess_e[rows, columns]
-    return bad

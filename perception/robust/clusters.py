@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from perception.model.flare import PixelBox, image_radius_px
 from perception.model.ranging import angular_radius_rad, flux_at_one_metre_e
 from perception.model.sensor import clip_level_e
-from perception.robust.blobs import Blob, near_groups
-from perception.robust.prepare import PreparedFrame
+from perception.robust.search.blobs import Blob, near_groups
+from perception.robust.search.frame import cut, light_of
+from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Start, Window
-from perception.robust.structure import structure_of
 
 Array = NDArray[np.float64]
 
@@ -25,6 +25,7 @@ MOST_BLOBS = 8
 
 _CROWD_NEIGHBOURS = 3
 _TOUCHING_PX = 4
+_KEPT_PX = 2
 
 MAX_IMAGE_RADIUS_PX = 20.0
 """Sources that look larger are measured by aperture: as good for them, and far cheaper than the fit."""
@@ -51,6 +52,8 @@ class Candidate:
         Sum of what exceeds the background in the blob.
     at_one_metre_e
         Flux of a source one metre away in that direction; NaN where no range can be had.
+    half_area_px
+        How many pixels of the filtered image exceed half of its maximum.
     image_radius_px
         Radius that the image of a source of this flux would have; 0 where no range can be had.
     """
@@ -60,6 +63,7 @@ class Candidate:
     u_px: float
     v_px: float
     flux_e: float
+    half_area_px: int
     at_one_metre_e: float
     image_radius_px: float
 
@@ -91,23 +95,25 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
     if not blobs:
         return []
     frame, calibration = prepared.frame, prepared.calibration
-    of_light = [b.pixels & ~prepared.bad[b.box.slices] for b in blobs]
-    clipped = [
-        int((frame.data_dn[blob.box.slices][pixels] >= prepared.clipped_dn).sum())
-        for blob, pixels in zip(blobs, of_light, strict=True)
-    ]
-    u_px, v_px, flux_e = np.array([_moments(blob, prepared) for blob in blobs]).T
+    light = [
+        light_of(
+            prepared.pixels, prepared.filtered_e, prepared.bad, blob.pixels,
+            (blob.box.top, blob.box.left), prepared.clipped_dn,
+        )
+        for blob in blobs
+    ]  # fmt: skip
+    u_px, v_px, flux_e = np.array([each[:3] for each in light]).T
     at_one_metre_e = flux_at_one_metre_e(u_px, v_px, frame.exposure_s, frame.gain, calibration)
     ranged = (at_one_metre_e > 0.0) & (flux_e > 0.0)
     range_m = np.sqrt(np.where(ranged, at_one_metre_e / np.where(flux_e > 0.0, flux_e, 1.0), 1.0))
     radius_px = image_radius_px(
         u_px, v_px, angular_radius_rad(range_m, calibration.source_radius_m), calibration
     )
-    rows = zip(
-        blobs, clipped, u_px.tolist(), v_px.tolist(), flux_e.tolist(), at_one_metre_e.tolist(),
-        np.where(ranged, radius_px, 0.0).tolist(), strict=True,
-    )  # fmt: skip
-    return [Candidate(*row) for row in rows]
+    rows = zip(blobs, light, at_one_metre_e.tolist(), np.where(ranged, radius_px, 0.0).tolist(), strict=True)
+    return [
+        Candidate(blob, clipped_px, u, v, flux, half_area_px, at_one_metre, radius)
+        for blob, (u, v, flux, clipped_px, half_area_px), at_one_metre, radius in rows
+    ]
 
 
 def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
@@ -119,11 +125,9 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
     """
     if candidate.is_clipped:
         return False
-    brightness = prepared.filtered_e[candidate.blob.box.slices][candidate.blob.pixels]
-    half_area = int(np.sum(brightness > 0.5 * brightness.max()))
     # Half maximum of a Gaussian filtered with itself lies at √(2 ln 2) · √2 σ = 1.67 σ.
     smooth_px = math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
-    return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
+    return candidate.half_area_px > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
 
 
 def brightest(found: Sequence[Candidate], most: int) -> list[Candidate]:
@@ -173,8 +177,8 @@ def clusters(members: Sequence[Candidate], prepared: PreparedFrame, apart: bool 
             nearest = np.argsort(apart_px, kind="stable")[: 1 + _CROWD_NEIGHBOURS]
             within = [int(k) for k in nearest if apart_px[k] < 0.5 * box.height]
             chosen.append(([group[k] for k in within], [within.index(at)]))
-    owner = np.zeros(prepared.lit.shape, dtype=np.int32)
-    owner[prepared.lit] = -1
+    owner = np.zeros(prepared.filtered_e.shape, dtype=np.int32)
+    owner.ravel()[prepared.lit_at] = -1
     for index, blob in enumerate(blobs):
         owner[blob.box.slices][blob.pixels] = index + 1
     return [_cluster([members[k] for k in group], group, wanted, owner, prepared) for group, wanted in chosen]
@@ -191,36 +195,23 @@ def _cluster(
     # In a crowd the window is that of the one that is wanted.
     about = members if len(wanted) == len(members) else [members[k] for k in wanted]
     box = _window_box(about, prepared)
-    rows = np.arange(box.top, box.top + box.height)
-    columns = np.arange(box.left, box.left + box.width)
-    height, width = prepared.image_e.shape
-    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
-    place = np.ix_(np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1))
-    owners = owner[place]
-    own = np.isin(owners, np.asarray(indices) + 1)
-    others = (owners > 0) & ~own
-    # Light that is no flare's is left out too, unless it touches: then it is what the flare stands on.
-    extended = owners < 0
-    if not (dilated(own, _TOUCHING_PX) & extended).any():
-        others |= extended
+    image_e, state = cut(
+        prepared.pixels, owner, prepared.bad, (box.top, box.left, box.height, box.width),
+        np.array(indices) + 1, prepared.clipped_dn, _TOUCHING_PX, _KEPT_PX,
+    )  # fmt: skip
     u_px, v_px = members[0].u_px, members[0].v_px
-    at = (int(np.clip(round(v_px), 0, height - 1)), int(np.clip(round(u_px), 0, width - 1)))
-    texture, structure = prepared.texture, None
-    sigma_e = 0.0 if texture is None else float(texture.sigma_e[at])
-    if texture is not None and sigma_e > 0.0 and box.height <= _SIDES_PX[-1]:
-        structure = structure_of(texture.autocorrelation, box.height, sigma_e)
+    structure, sigma_e = prepared.structure_at(u_px, v_px, box.height)
     window = Window(
         box=box,
-        image_e=prepared.image_e[place].astype(np.float64),
-        usable=inside & ~dilated(others, 2) & ~prepared.bad[place],
-        clipped=(frame.data_dn[place] >= prepared.clipped_dn) & ~prepared.bad[place],
+        image_e=image_e,
+        state=state,
         floor_e2=prepared.floor_e2,
         clip_e=clip_level_e(calibration, frame.black_level_dn, frame.gain),
         prnu=calibration.prnu,
         structure=structure,
         structure_e=sigma_e,
     )
-    return Cluster(members, wanted, window, float(prepared.background_e[at]))
+    return Cluster(members, wanted, window, prepared.background_e(u_px, v_px))
 
 
 def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
@@ -229,7 +220,7 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
     Of a clipped flare, and of one that the frame's edge cuts, the part seen may be a small part of the flux;
     but no source is larger than what is seen of it.
     """
-    height, width = prepared.image_e.shape
+    height, width = prepared.filtered_e.shape
     boxes = [member.blob.box for member in cluster.members]
     cut = any(
         b.top == 0 or b.left == 0 or b.top + b.height == height or b.left + b.width == width for b in boxes
@@ -272,17 +263,3 @@ def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
         return mask
     kernel = np.ones((2 * by_px + 1, 2 * by_px + 1), dtype=np.uint8)
     return np.asarray(cv2.dilate(mask.view(np.uint8), kernel), dtype=bool).reshape(mask.shape)
-
-
-def _moments(blob: Blob, prepared: PreparedFrame) -> tuple[float, float, float]:
-    """Centroid (u, v), weighted by what exceeds the background, and its sum in electrons."""
-    box = blob.box.slices
-    light_e = np.where(prepared.bad[box], 0.0, prepared.image_e[box] - prepared.background_e[box])
-    excess = light_e[blob.pixels].astype(np.float64)
-    weight = np.maximum(excess, 0.0)
-    if not weight.sum() > 0.0:
-        weight = np.ones_like(excess)
-    rows, columns = np.nonzero(blob.pixels)
-    u_px = blob.box.left + float(weight @ columns) / float(weight.sum())
-    v_px = blob.box.top + float(weight @ rows) / float(weight.sum())
-    return u_px, v_px, float(excess.sum())

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from perception.model.window import Camera
-from perception.robust.goodness import MODEL_ERROR, residual_sigmas
+from perception.robust.goodness import MODEL_ERROR
 from perception.robust.solve import Problem, Solution, Start, solve
 
 MOST_FLARES = 8
@@ -79,13 +79,10 @@ def asks_for_more(solution: Solution) -> bool:
     Where it lies beside the flares the residual shows it; within them, χ² over the pixels in which they stand
     out exceeds what a good fit leaves, n ± √(2n), by nearly that gain.
     """
-    window, variance = solution.window, solution.variance_e2(MODEL_ERROR)
-    core = window.usable & ~window.clipped & (solution.flares_e > np.sqrt(variance))
-    pixels = int(core.sum())
-    chi2 = float(np.sum(solution.residual_e[core] ** 2 / variance[core]))
-    if chi2 > pixels + LEAST_GAIN - 4.0 * math.sqrt(2.0 * pixels):
+    left = solution.left_over
+    if left.seen_chi2 > left.seen_pixels + LEAST_GAIN - 4.0 * math.sqrt(2.0 * left.seen_pixels):
         return True
-    return bool(residual_sigmas(solution).max() > RESIDUAL_SIGMAS)
+    return left.peak_sigmas > RESIDUAL_SIGMAS
 
 
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -110,10 +107,9 @@ def _gain(fewer: Solution, more: Solution) -> float:
 def _more(current: Solution) -> list[list[Start]]:
     """Return first guesses with one flare more."""
     box, flares = current.window.box, current.starts
-    sigmas = residual_sigmas(current)
-    row, column = np.unravel_index(int(np.argmax(sigmas)), sigmas.shape)
+    row, column = current.left_over.peak
     guesses = []
-    if sigmas[row, column] > RESIDUAL_SIGMAS:
+    if current.left_over.peak_sigmas > RESIDUAL_SIGMAS:
         near = current.residual_e[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
         brought = max(float(near.sum()), 3.0 * math.sqrt(current.window.floor_e2))
         place = (box.left + float(column), box.top + float(row))

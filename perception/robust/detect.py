@@ -6,10 +6,11 @@ import numpy as np
 
 from perception.model.bearing import bearing_body
 from perception.model.sensor import check_frame, gain_dn_per_e
-from perception.robust.blobs import Blob, components, split_at_peaks
 from perception.robust.clusters import brightest, candidates, clusters, is_extended
 from perception.robust.measure import Measurement, measure
-from perception.robust.prepare import PreparedFrame, prepare
+from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
+from perception.robust.search.frame import ring_level
+from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.types import Calibration, Detection, RawFrame
 
 CONTRAST_SIGMAS = 6.03
@@ -58,7 +59,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     prepared = prepare(frame, calibration)
     blobs = [
         blob
-        for component in components(prepared.lit)
+        for component in blobs_at(prepared.lit_at, calibration.width_px)
         for blob in _split(component, prepared)
         if _stands_above_surroundings(blob, prepared)
     ]
@@ -86,31 +87,26 @@ def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
     -------
     True also where the frame's edges leave too little of the ring.
     """
+    box = blob.box
     gap_px = math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1
-    inner, outer = blob.box.with_margin(gap_px), blob.box.with_margin(gap_px + _RING_PX)
-    rows, columns = prepared.filtered_e.shape
-    place = np.s_[
-        max(outer.top, 0) : min(outer.top + outer.height, rows),
-        max(outer.left, 0) : min(outer.left + outer.width, columns),
-    ]
-    ring = np.ones(prepared.filtered_e[place].shape, dtype=bool)
-    top, left = inner.top - max(outer.top, 0), inner.left - max(outer.left, 0)
-    ring[max(top, 0) : top + inner.height, max(left, 0) : left + inner.width] = False
-    if int(ring.sum()) < _FEWEST_RING_PIXELS:
+    level_e, count = ring_level(
+        prepared.filtered_e, (box.top, box.left, box.height, box.width), gap_px, _RING_PX
+    )
+    if count < _FEWEST_RING_PIXELS:
         return True
-    level_e = float(np.median(prepared.filtered_e[place][ring]))
-    around_e = max(level_e + float(np.median(prepared.background_e[place][ring])), 0.0)
-    noise_e = prepared.filtered_noise * math.sqrt(around_e + prepared.floor_e2)
-    peak_e = float(prepared.filtered_e[blob.box.slices][blob.pixels].max())
+    middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
+    noise_e = prepared.filtered_noise * math.sqrt(max(level_e + middle_e, 0.0) + prepared.floor_e2)
+    peak_e = float(prepared.filtered_e[box.slices][blob.pixels].max())
     return peak_e - level_e > CONTRAST_SIGMAS * noise_e
 
 
 def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
     """Divide a component at maxima that differ by more than their noise."""
-    box = component.box.slices
-    brightness_e = prepared.filtered_e[box]
-    expected_e = np.maximum(brightness_e + prepared.background_e[box], 0.0)
-    noise_e = prepared.filtered_noise * np.sqrt(expected_e + prepared.floor_e2)
+    box = component.box
+    brightness_e = prepared.filtered_e[box.slices]
+    middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
+    expected_e = np.maximum(brightness_e + np.float32(middle_e), np.float32(0.0))
+    noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
     return split_at_peaks(component, brightness_e, noise_e)
 
 

@@ -1,124 +1,232 @@
-"""How well flares explain what is seen of them."""
+"""How well flares explain what is seen of them: what a fit leaves over, in numbers."""
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.window import Structure
-from perception.robust.solve import Solution
+from perception.compiled import compiled
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE
+
+Array = NDArray[np.float64]
 
 MODEL_ERROR = 0.05
 """How far, relative to the flares' own light, point spread and source may be off before a fit is bad."""
 
 MISFIT_PROBABILITY = 1e-6
 
-_FEWEST_PIXELS = 16
+FEWEST_PIXELS = 16
+DISC_PX = 2
+REACHED_SIGMAS = 0.1
+LEAST_KNOWN = 1e-3
 
 
 @dataclass(frozen=True)
-class Goodness:
-    """χ² over `pixels` pixels, and the probability of one at least as large if the model holds.
+class LeftOver:
+    """What a fit leaves over, allowing for an imperfect model.
 
-    `share_left` is the root of Σ residual² / Σ flares² over these pixels.
+    Over the whole window a bad core drowns in good background; without ε, `MODEL_ERROR`, a bright flare shows
+    every per cent by which the real PSF, the pixels' gains or the source differ from the model. A clipped
+    pixel that should clip says nothing, and does not count.
+
+    Attributes
+    ----------
+    chi2, pixels
+        Sum of (x - λ)² / (λ + σ² + (ε F S)²) over the pixels where F·S exceeds their noise, and their number.
+    residual2_e2, flares2_e2
+        Σ residual² and Σ flares² over these pixels.
+    seen_chi2, seen_pixels
+        The same χ² where F·S exceeds noise and model error, over pixels that are not clipped.
+    peak_sigmas, peak
+        Greatest value of the residual matched to the image of a point, in units of its noise, model error
+        counted in, and the row and column of the window where it is.
+    around_chi2, around_pixels, around_excess_e2
+        χ² against noise alone over the pixels that the flares do not reach, their number, and the mean of
+        residual² - variance there.
     """
 
     chi2: float
     pixels: int
-    probability: float
-    share_left: float
+    residual2_e2: float
+    flares2_e2: float
+    seen_chi2: float
+    seen_pixels: int
+    peak_sigmas: float
+    peak: tuple[int, int]
+    around_chi2: float
+    around_pixels: int
+    around_excess_e2: float
+
+    @cached_property
+    def is_good(self) -> bool:
+        """Whether chance alone may leave so much on the flares."""
+        return self.pixels == 0 or _is_likely(self.pixels, self.chi2)
 
     @property
-    def is_good(self) -> bool:
-        """Whether chance alone may leave so much."""
-        return self.probability >= MISFIT_PROBABILITY
+    def share(self) -> float:
+        """Root of Σ residual² over Σ flares²."""
+        return math.sqrt(self.residual2_e2 / max(self.flares2_e2, 1e-300))
+
+    @cached_property
+    def structure_e(self) -> float:
+        """Standard deviation of what lies around the flares beside noise; 0 where that is noise alone.
+
+        By χ² of the pixels that the flares do not reach: noise passes once in a million.
+        """
+        if self.around_pixels < FEWEST_PIXELS or _is_likely(self.around_pixels, self.around_chi2):
+            return 0.0
+        return math.sqrt(max(self.around_excess_e2, 0.0))
 
 
-def core_goodness(solution: Solution, model_error: float = MODEL_ERROR) -> Goodness:
-    """Goodness of fit over the flares' own pixels, allowing for an imperfect model.
+def _is_likely(degrees: int, chi2: float) -> bool:
+    """Tell whether χ² is at least as large by chance more often than `MISFIT_PROBABILITY`."""
+    # Three standard deviations are passed more often than that by any χ².
+    if chi2 < degrees + 3.0 * math.sqrt(2.0 * degrees):
+        return True
+    from scipy.special import chdtrc
 
-    The sum of (x - λ)² / (λ + σ² + (ε F S)²) over the used pixels where F·S exceeds their noise. Over the
-    whole window a bad core drowns in good background; without ε a bright flare shows every per cent by
-    which the real PSF, the pixels' gains or the source differ from the model. A clipped pixel that should
-    clip says nothing, and does not count.
+    return bool(chdtrc(degrees, chi2) >= MISFIT_PROBABILITY)
+
+
+def left_over(
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array,
+    floor_e2: float, prnu: float, psf_sigma_px: float,
+) -> LeftOver:  # fmt: skip
+    """Reckon what a fit leaves over.
 
     Parameters
     ----------
-    solution
-        The fit to judge.
-    model_error
-        ε, standard deviation of the model relative to the flares' own light.
-
-    Returns
-    -------
-    Goodness
-        Probability 1 if no pixel stands out.
+    image_e, state, expected_e, flares_e
+        Of a window, shape (rows, columns): what is seen, what each pixel is (`model.layout`), λ, and the
+        flares' part of it.
+    floor_e2, prnu
+        Variance of a dark pixel, and relative spread of the pixels' responses.
+    psf_sigma_px
+        Width of the point spread.
     """
-    from scipy.special import chdtrc
-
-    window, residual = solution.window, solution.residual_e
-    says = window.usable & ~(window.clipped & (residual == 0.0))
-    core = says & (solution.flares_e > np.sqrt(solution.variance_e2(0.0)))
-    chi2 = float(np.sum(residual[core] ** 2 / solution.variance_e2(model_error)[core]))
-    pixels = int(core.sum())
-    left = float(np.sum(residual[core] ** 2)) / max(float(np.sum(solution.flares_e[core] ** 2)), 1e-300)
-    return Goodness(chi2, pixels, float(chdtrc(pixels, chi2)) if pixels else 1.0, math.sqrt(left))
+    smooth_px = math.hypot(psf_sigma_px, math.sqrt(1.0 / 12.0))
+    numbers = _reckoned(image_e, state, expected_e, flares_e, floor_e2, prnu, smooth_px)
+    return LeftOver(*numbers[:7], (numbers[7], numbers[8]), *numbers[9:])
 
 
-def residual_sigmas(solution: Solution) -> NDArray[np.float64]:
-    """Return what a fit leaves over, matched to the image of a point, in units of its noise, for each pixel.
+@compiled
+def residual_e(image_e: Array, state: NDArray[np.uint8], expected_e: Array) -> Array:
+    """Return what a fit leaves over in each pixel: 0 where unusable, or clipped as is expected."""
+    left = image_e - expected_e
+    for row in range(left.shape[0]):
+        for column in range(left.shape[1]):
+            if state[row, column] == UNUSABLE or (state[row, column] == CLIPPED and left[row, column] < 0.0):
+                left[row, column] = 0.0
+    return left
 
-    An error of the model counts as noise.
+
+@compiled
+def _reckoned(
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array,
+    floor_e2: float, prnu: float, smooth_px: float,
+) -> tuple[float, int, float, float, float, int, float, int, int, float, int, float]:  # fmt: skip
+    rows, columns = image_e.shape
+    residual, weight = residual_e(image_e, state, expected_e), np.zeros((rows, columns))
+    away = np.ones((rows, columns), dtype=np.bool_)
+    noise = np.empty((rows, columns))
+    chi2, pixels, residual2, flares2, seen_chi2, seen_pixels = 0.0, 0, 0.0, 0.0, 0.0, 0
+    for row in range(rows):
+        for column in range(columns):
+            lit, flare, left = max(expected_e[row, column], 0.0), flares_e[row, column], residual[row, column]
+            noise[row, column] = lit + (prnu * lit) ** 2 + floor_e2
+            variance = noise[row, column] + (MODEL_ERROR * flare) ** 2
+            if flare > REACHED_SIGMAS * math.sqrt(noise[row, column]):
+                for down in range(-DISC_PX, DISC_PX + 1):
+                    wide = DISC_PX - abs(down)
+                    if 0 <= row + down < rows:
+                        away[row + down, max(0, column - wide) : column + wide + 1] = False
+            if state[row, column] == UNUSABLE:
+                continue
+            weight[row, column] = 1.0 / variance
+            if (
+                flare * flare > noise[row, column]
+                and flare > 0.0
+                and not (state[row, column] == CLIPPED and left == 0.0)
+            ):
+                chi2 += left * left / variance
+                residual2 += left * left
+                flares2 += flare * flare
+                pixels += 1
+            if state[row, column] == SEEN and flare > 0.0 and flare * flare > variance:
+                seen_chi2 += left * left / variance
+                seen_pixels += 1
+    around_chi2, around_pixels, around_excess = 0.0, 0, 0.0
+    for row in range(rows):
+        for column in range(columns):
+            if away[row, column] and state[row, column] == SEEN:
+                left2 = residual[row, column] ** 2
+                around_chi2 += left2 / noise[row, column]
+                around_excess += left2 - noise[row, column]
+                around_pixels += 1
+    around_excess /= max(around_pixels, 1)
+    peak, at = _matched_peak(residual * weight, weight, smooth_px)
+    return (
+        chi2, pixels, residual2, flares2, seen_chi2, seen_pixels, peak, at // columns, at % columns,
+        around_chi2, around_pixels, around_excess,
+    )  # fmt: skip
+
+
+@compiled
+def _smoothed(image: Array, kernel: Array) -> Array:
+    """Correlate an image with a symmetric kernel along both axes, zero beyond its ends."""
+    rows, columns = image.shape
+    half = len(kernel) // 2
+    along, both = np.zeros((rows, columns)), np.zeros((rows, columns))
+    for row in range(rows):
+        for step in range(-half, half + 1):
+            for column in range(max(0, -step), min(columns, columns - step)):
+                along[row, column] += kernel[half + step] * image[row, column + step]
+    for row in range(rows):
+        for step in range(max(-half, -row), min(half + 1, rows - row)):
+            for column in range(columns):
+                both[row, column] += kernel[half + step] * along[row + step, column]
+    return both
+
+
+@compiled
+def _matched_peak(weighted: Array, weight: Array, smooth_px: float) -> tuple[float, int]:
+    """Return the greatest value of a weighted residual matched to a point's image over its noise, and where.
+
+    Where hardly any pixel counts nothing is known.
     """
-    weight = np.where(solution.window.usable, 1.0 / solution.variance_e2(MODEL_ERROR), 0.0)
-    spread = _gaussian(len(weight), math.hypot(solution.psf_sigma_px, math.sqrt(1.0 / 12.0)))
-    matched = spread @ (solution.residual_e * weight) @ spread
-    power = spread**2 @ weight @ spread**2
-    # Where hardly any pixel counts nothing is known.
-    known = power > 1e-3 * float(power.max())
-    return np.where(known, matched / np.sqrt(np.where(known, power, 1.0)), 0.0)
+    half = math.ceil(5.0 * smooth_px)
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / smooth_px) ** 2)
+    matched, power = _smoothed(weighted, kernel).ravel(), _smoothed(weight, kernel**2).ravel()
+    least = LEAST_KNOWN * power.max()
+    best, at = 0.0, 0
+    for pixel in range(len(matched)):
+        if power[pixel] > least and matched[pixel] > best * math.sqrt(power[pixel]):
+            best, at = matched[pixel] / math.sqrt(power[pixel]), pixel
+    return best, at
 
 
-@lru_cache(maxsize=64)
-def _gaussian(side_px: int, sigma_px: float) -> NDArray[np.float64]:
-    """Return the symmetric matrix that smooths a row of pixels by a Gaussian, zero beyond its ends."""
-    at = np.arange(side_px)
-    kernel = np.exp(-0.5 * ((at[:, None] - at) / sigma_px) ** 2)
-    return np.asarray(kernel / (math.sqrt(2.0 * math.pi) * sigma_px))
+@compiled
+def halo_sigmas(
+    residual_e: Array, state: NDArray[np.uint8], variance_e2: Array, place: tuple[float, float],
+    widths_px: tuple[float, ...],
+) -> float:  # fmt: skip
+    """Return by how many standard deviations, at least, light around a flare shows in what its fit leaves.
 
-
-def structure_left_e(solution: Solution) -> float:
-    """Return the standard deviation of what lies around the flares beside noise; 0 where that is noise alone.
-
-    By χ² of the pixels that the flares do not reach: noise passes once in a million.
+    Light that falls off as (1 + ρ²/w²)^(-3/2) from the flare's column and row in the window, `place`, for
+    each width w.
     """
-    from scipy.ndimage import binary_dilation
-    from scipy.special import chdtrc
-
-    variance = solution.variance_e2(0.0)
-    reached = binary_dilation(solution.flares_e > 0.1 * np.sqrt(variance), iterations=2)
-    around = solution.window.usable & ~solution.window.clipped & ~reached
-    residual2 = solution.residual_e[around] ** 2
-    if len(residual2) < _FEWEST_PIXELS:
-        return 0.0
-    if chdtrc(len(residual2), float(np.sum(residual2 / variance[around]))) >= MISFIT_PROBABILITY:
-        return 0.0
-    return math.sqrt(max(float(np.mean(residual2 - variance[around])), 0.0))
-
-
-def excess_e(solution: Solution) -> float:
-    """Return the root of the mean square of what a fit leaves over in its window, noise taken off."""
-    usable = solution.window.usable
-    excess_e2 = solution.residual_e[usable] ** 2 - solution.variance_e2(0.0)[usable]
-    return math.sqrt(max(float(np.mean(excess_e2)), 0.0)) if usable.any() else 0.0
-
-
-def halo_sigmas(solution: Solution, halo: Structure) -> float:
-    """Return by how many standard deviations, at least, a halo shows in what a lone flare's fit leaves."""
-    window = solution.window
-    weight = np.where(window.usable & ~window.clipped, 1.0 / solution.variance_e2(0.0), 0.0)
-    columns = halo.columns[0]
-    score = (columns * solution.residual_e * weight).sum(axis=(1, 2))
-    return float(np.max(score / np.sqrt((columns**2 * weight).sum(axis=(1, 2)) + 1e-300)))
+    most = -math.inf
+    for width in widths_px:
+        score, power = 0.0, 0.0
+        for row in range(len(residual_e)):
+            for column in range(residual_e.shape[1]):
+                if state[row, column] != SEEN:
+                    continue
+                spread = 1.0 + ((column - place[0]) ** 2 + (row - place[1]) ** 2) / width**2
+                profile = 1.0 / (spread * math.sqrt(spread))
+                score += profile * residual_e[row, column] / variance_e2[row, column]
+                power += profile**2 / variance_e2[row, column]
+        most = max(most, score / math.sqrt(power + 1e-300))
+    return most

@@ -7,24 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.layout import UNUSABLE
 from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux
-from perception.robust.blobs import Blob, divide
 from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guesses
 from perception.robust.deblend import RESIDUAL_SIGMAS, deblend, of_free_size
-from perception.robust.goodness import (
-    Goodness,
-    core_goodness,
-    excess_e,
-    halo_sigmas,
-    residual_sigmas,
-    structure_left_e,
-)
-from perception.robust.prepare import PreparedFrame
+from perception.robust.goodness import halo_sigmas
+from perception.robust.search.blobs import Blob, divide
+from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Problem, Solution, solve
-from perception.robust.structure import EDGES, halo_of, joined, structure_of
+from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
 from perception.robust.verdict import LEAST_RANGE_M, is_no_large_disc, is_one_pixel, is_other_size
 
 CLIPPED_RANGE_SIGMA = 0.125
@@ -139,16 +133,16 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     if prepared.frame.line_time_s == 0.0:
         parted = _parted([None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)], camera)
     _retry_without_spill(best, parted, camera)
-    uneven_e = [0.0 if one is None else structure_left_e(one) for one in best]
+    uneven_e = [0.0 if one is None else one.left_over.structure_e for one in best]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
     spread_e = {
-        index: excess_e(one)
+        index: one.excess_e
         for index, more in parted.items()
         if (one := best[index]) is not None and more.count > one.count + 1
     }
     for index in _retry_with_halo(best, camera):
         one = best[index]
-        uneven_e[index] = 0.0 if one is None else structure_left_e(one)
+        uneven_e[index] = 0.0 if one is None else one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     _retry_on_uneven_ground(best, uneven_e, camera)
     for index, more in parted.items():
@@ -165,7 +159,7 @@ def _parted(plain: Sequence[Solution | None], camera: Camera) -> dict[int, Solut
     return {
         index: several
         for (index, one), several in zip(tried, more, strict=True)
-        if several is not one and core_goodness(several).is_good and structure_left_e(several) == 0.0
+        if several is not one and several.left_over.is_good and several.left_over.structure_e == 0.0
     }
 
 
@@ -182,9 +176,16 @@ def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
         u_px, v_px, _ = solution.starts[0]
         radius_px, flux_e = float(solution.image_radius_px[0]), float(solution.flux_e[0])
         window = solution.window
-        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e)
-        if halo_sigmas(solution, halo) < HALO_SEEMS_SIGMAS:
+        seems = halo_sigmas(
+            solution.residual_e,
+            window.state,
+            solution.variance_e2(0.0),
+            (u_px - window.box.left, v_px - window.box.top),
+            halo_widths_px(radius_px),
+        )
+        if seems < HALO_SEEMS_SIGMAS:
             continue
+        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e)
         tried.append((index, solution))
         problems.append(solution.again(replace(window, structure=joined(window.structure, halo))))
     having = []
@@ -205,7 +206,7 @@ def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[floa
         for index, solution in enumerate(best):
             if solution is None or uneven_e[index] == 0.0:
                 continue
-            window, left_e = solution.window, structure_left_e(solution) if is_noise else 0.0
+            window, left_e = solution.window, solution.left_over.structure_e if is_noise else 0.0
             if left_e > 0.0:
                 window = replace(window, floor_e2=window.floor_e2 + left_e**2)
             elif not is_noise:
@@ -228,33 +229,31 @@ def _retry_without_spill(best: list[Solution | None], parted: Container[int], ca
         if solution is not None
         and index not in parted
         and solution.window.clipped.any()
-        and not core_goodness(solution).is_good
+        and not solution.left_over.is_good
     ]
     problems = []
     for _, solution in tried:
         window = solution.window
         spilled = window.clipped.any(axis=0)
-        dry = replace(window, usable=window.usable & ~spilled)
+        dry = replace(window, state=np.where(spilled, UNUSABLE, window.state).astype(np.uint8))
         problems.append(solution.again(dry))
     for (index, _), again in zip(tried, solve(problems, camera), strict=True):
-        if again is not None and core_goodness(again).share_left < MOST_LEFT:
+        if again is not None and again.left_over.share < MOST_LEFT:
             best[index] = again
 
 
 def _is_odd(solution: Solution) -> bool:
     """Tell whether a lone flare fits so badly that its size has to be looked at."""
-    return solution.count == 1 and not core_goodness(solution).is_good
+    return solution.count == 1 and not solution.left_over.is_good
 
 
 def _judged(cluster: Cluster, solution: Solution, prepared: PreparedFrame) -> list[tuple[Blob, Measurement]]:
     """Turn a solution into measurements, if it is one of sources."""
-    good = core_goodness(solution)
-    misfit = not good.is_good or (
-        solution.count == 1 and bool(residual_sigmas(solution).max() > RESIDUAL_SIGMAS)
-    )
+    left = solution.left_over
+    misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
     doubted = misfit or cluster.is_clipped
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
-    if doubted and good.share_left > most_left:
+    if doubted and left.share > most_left:
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
@@ -262,25 +261,24 @@ def _judged(cluster: Cluster, solution: Solution, prepared: PreparedFrame) -> li
     if solution.count != len(blobs):
         blobs = divide(blobs, solution.u_px, solution.v_px)
     wanted = cluster.wanted if solution.count == len(cluster.members) else range(solution.count)
-    return [(blobs[k], _measurement(solution, k, blobs[k], good, misfit, prepared)) for k in wanted]
+    return [(blobs[k], _measurement(solution, k, blobs[k], misfit, prepared)) for k in wanted]
 
 
 def _measurement(
-    solution: Solution, index: int, blob: Blob, good: Goodness, misfit: bool, prepared: PreparedFrame
+    solution: Solution, index: int, blob: Blob, misfit: bool, prepared: PreparedFrame
 ) -> Measurement:
     """Turn one flare of a solution into a measurement, its sigmas wider where the fit is bad."""
-    widening = math.sqrt(max(good.chi2 / max(good.pixels, 1), 1.0)) if misfit else 1.0
+    left = solution.left_over
+    widening = math.sqrt(max(left.chi2 / max(left.pixels, 1), 1.0)) if misfit else 1.0
     u_px, v_px = float(solution.u_px[index]), float(solution.v_px[index])
     flux_e = float(solution.flux_e[index])
     flux_sigma_e = float(solution.flux_sigma_e[index]) * widening
     log_sigma = float(solution.log_range_sigma[index]) * widening
-    frame, calibration = prepared.frame, prepared.calibration
-    gain = gain_dn_per_e(frame, calibration)
-    ranged = range_from_flux(flux_e * gain, math.nan, u_px, v_px, frame.exposure_s, frame.gain, calibration)
     # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.
     range_m = math.nan
-    if math.isfinite(ranged.range_m):
+    if solution.ranged[index]:
         range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * (flux_sigma_e / flux_e) ** 2)
+    frame = prepared.frame
     light = blob.pixels & ~prepared.bad[blob.box.slices]
     saturated = bool((frame.data_dn[blob.box.slices][light] >= prepared.clipped_dn).any())
     bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
@@ -367,7 +365,10 @@ def _centroid_sigmas(member: Candidate, flux_e: float, prepared: PreparedFrame) 
     if not flux_e > 0.0:
         return math.nan, math.nan
     blob = member.blob
-    variance = np.maximum(prepared.image_e[blob.box.slices][blob.pixels], 0.0) + prepared.floor_e2
+    light_e = prepared.excess_e[blob.box.slices][blob.pixels] + prepared.background_e(
+        member.u_px, member.v_px
+    )
+    variance = np.maximum(light_e, 0.0) + prepared.floor_e2
     rows, columns = np.nonzero(blob.pixels)
     return (
         math.sqrt(float(np.sum((blob.box.left + columns - member.u_px) ** 2 * variance))) / flux_e,

@@ -1,7 +1,10 @@
-"""Windows with any number of flares each, fitted in as few batches as their sizes and numbers allow."""
+"""Flares are fitted to windows: the maximum-likelihood fit of any number of them in each.
+
+What is maximised is the likelihood of `model.pixels`, with the λ and the priors of `model.window`. Images are
+laid out for all windows at once, and anew where a size has moved far from the one they were laid out for.
+"""
 
 import math
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,14 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.likelihood import Windows
+from perception.model.layout import CLIPPED, UNUSABLE, Layout, Sources, Structure, View, even
+from perception.model.pixels import maximise
 from perception.model.sensor import pixel_variance_e2
-from perception.model.window import Camera, Structure
-from perception.robust.fit import Fits, Starts, fit_flares
+from perception.model.window import Camera, lay_out
+from perception.robust.goodness import LeftOver, left_over, residual_e
 
 Array = NDArray[np.float64]
 
-_MOST_NUMBERS = 4_000_000  # in the largest array of a batch
+_MOST_LAYOUTS = 7
+# How far the range by size may move before images are laid out anew: their shape changes with its square.
+_LAYOUT_KEPT = 0.02
+_LAYOUT_KEPT_PX = 0.05
 _PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
 
 Start = tuple[float, float, float]
@@ -32,8 +39,8 @@ class Window:
     ----------
     box
         Where it is; it may reach beyond the frame.
-    image_e, usable, clipped
-        Shape (height, width); `usable` says which pixels count, clipped ones too.
+    image_e, state
+        Shape (height, width); the state of a pixel is one of `model.layout`'s.
     floor_e2, clip_e, prnu
         Variance of a dark pixel, electrons at which one clips, relative spread of the pixels' responses.
     structure, structure_e
@@ -44,14 +51,23 @@ class Window:
 
     box: PixelBox
     image_e: Array
-    usable: NDArray[np.bool_]
-    clipped: NDArray[np.bool_]
+    state: NDArray[np.uint8]
     floor_e2: float
     clip_e: float
     prnu: float
     structure: Structure | None = None
     structure_e: float = 0.0
     on_edges: bool = False
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Which pixels count, clipped ones too."""
+        return np.not_equal(self.state, UNUSABLE)
+
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """Which of them are clipped."""
+        return np.equal(self.state, CLIPPED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +157,23 @@ class Solution:
     @cached_property
     def residual_e(self) -> Array:
         """What the fit leaves over: 0 where unusable, or clipped as is expected."""
-        left = self.window.image_e - self.expected_e
-        left = np.where(self.window.clipped, np.maximum(left, 0.0), left)
-        return np.where(self.window.usable, left, 0.0)
+        return residual_e(self.window.image_e, self.window.state, self.expected_e)
+
+    @cached_property
+    def left_over(self) -> LeftOver:
+        """What that amounts to."""
+        window = self.window
+        return left_over(
+            window.image_e, window.state, self.expected_e, self.flares_e,
+            window.floor_e2, window.prnu, self.psf_sigma_px,
+        )  # fmt: skip
+
+    @property
+    def excess_e(self) -> float:
+        """Root of the mean square of what the fit leaves over in its window, noise taken off."""
+        usable = self.window.usable
+        excess_e2 = self.residual_e[usable] ** 2 - self.variance_e2(0.0)[usable]
+        return math.sqrt(max(float(np.mean(excess_e2)), 0.0)) if usable.any() else 0.0
 
     def variance_e2(self, model_error: float) -> Array:
         """Variance of pixels, an error of the model relative to the flares' own light counted in."""
@@ -159,100 +189,122 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     -------
     A solution for each, None where the fit did not converge.
     """
-    batches: defaultdict[tuple[int, ...], list[int]] = defaultdict(list)
-    for index, problem in enumerate(problems):
-        structure = problem.window.structure
-        columns = 0 if structure is None else structure.columns.shape[1]
-        size = _size(problem, camera)
-        batches[len(problem.starts), *problem.window.image_e.shape, columns, size].append(index)
     solutions: list[Solution | None] = [None] * len(problems)
-    for (count, rows, columns, more, _), members in batches.items():
-        at_once = max(1, _MOST_NUMBERS // ((4 * count + 2 + more) * rows * columns))
-        for first in range(0, len(members), at_once):
-            part = members[first : first + at_once]
-            for index, solution in zip(part, _solve_alike([problems[k] for k in part], camera), strict=True):
-                solutions[index] = solution
+    fits = [_Fit.begun(problem, camera) for problem in problems]
+    going = list(range(len(problems)))
+    for _ in range(_MOST_LAYOUTS):
+        if not going:
+            break
+        own = np.concatenate([fits[index].places for index in going])
+        laid, imaged = lay_out(camera, *np.ascontiguousarray(own.T))
+        reach_px, end, moved = laid.reach_px, 0, []
+        for index in going:
+            fit, first = fits[index], end
+            end = first + fit.layout.sources
+            solutions[index] = None
+            if imaged[first:end].all() and fit.climb(laid.part(first, end)):
+                solutions[index] = fit.solution(reach_px[first:end])
+                if fit.has_moved(reach_px[first:end]):
+                    moved.append(index)
+        going = moved
     return solutions
 
 
-def _size(problem: Problem, camera: Camera) -> int:
-    """Return a class of how large images are: the largest sets how many nodes all of a batch have."""
-    nearest_m = math.exp(min(log_range for _, _, log_range in problem.starts))
-    calibration = camera.calibration
-    radius_px = calibration.fx_px * calibration.source_radius_m / max(nearest_m, 1e-3)
-    return max(0, math.ceil(math.log2(max(radius_px, 1e-3) / calibration.psf_sigma_px)))
+class _Fit:
+    """The fit of one window, on its way."""
 
+    def __init__(self, problem: Problem, camera: Camera, layout: Layout, values: Array) -> None:
+        window = problem.window
+        self.window, self.camera, self.layout, self.values = window, camera, layout, values
+        self.known = camera.known(window.clip_e)
+        self.structure = even(window.image_e.size) if window.structure is None else window.structure
+        self.view = View(window.box.top, window.box.left, window.image_e, window.state, window.floor_e2)
+        self.prior = layout.prior(self.structure)
+        self.covariance = np.empty((layout.size, layout.size))
+        self.expected_e = np.empty(window.image_e.size)
+        self.deviance = self.log_information = math.inf
+        self.sources: Sources | None = None
 
-def _solve_alike(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
-    """Solve problems of one size and one number of flares."""
-    windows = [problem.window for problem in problems]
-    first = windows[0]
-    starts = np.array([problem.starts for problem in problems], dtype=np.float64)
-    structures = [window.structure for window in windows if window.structure is not None]
-    structure = None
-    if structures:
-        structure = Structure(
-            np.concatenate([each.columns for each in structures]),
-            np.concatenate([each.precision for each in structures]),
-        )
-    fits = fit_flares(
-        Windows(
-            top=np.array([window.box.top for window in windows]),
-            left=np.array([window.box.left for window in windows]),
-            image_e=np.stack([window.image_e for window in windows]),
-            usable=np.stack([window.usable for window in windows]),
-            clipped=np.stack([window.clipped for window in windows]),
-            floor_e2=np.array([window.floor_e2 for window in windows]),
-            clip_e=first.clip_e,
-            prnu=first.prnu,
-        ),
-        camera,
-        Starts(
-            u_px=starts[..., 0],
-            v_px=starts[..., 1],
-            log_range=starts[..., 2],
-            background_e=np.array([problem.background_e for problem in problems]),
-        ),
-        structure,
-    )
-    return _solutions(fits, windows)
+    @classmethod
+    def begun(cls, problem: Problem, camera: Camera) -> "_Fit":
+        """Return the fit at its first guesses."""
+        structure = problem.window.structure
+        waves = 0 if structure is None else len(structure.columns)
+        layout = camera.known(problem.window.clip_e).layout(len(problem.starts), waves)
+        values = np.zeros(layout.size)
+        own = values[: layout.width].reshape(layout.sources, layout.per_source)
+        own[:, :3] = problem.starts
+        values[layout.background] = problem.background_e
+        return cls(problem, camera, layout, values)
 
+    @property
+    def own(self) -> Array:
+        """The sources' unknowns, a view of shape (sources, unknowns of each)."""
+        return self.values[: self.layout.width].reshape(self.layout.sources, self.layout.per_source)
 
-def _solutions(fits: Fits, windows: Sequence[Window]) -> list[Solution | None]:
-    count = fits.model.layout.sources
-    own = [np.sqrt(np.einsum("gii->gi", fits.of_source(k))) for k in range(count)]
-    sigmas = np.stack(own, axis=1)
-    ranges = [fits.log_range(k) for k in range(count)]
-    log_range = np.stack([value for value, _ in ranges], axis=1)
-    log_sigma = np.stack([sigma for _, sigma in ranges], axis=1)
-    radius_px = fits.image_radius_px()
-    flux_e, flares_e = fits.flux_e, fits.flares_e()
-    log_information = np.full(len(windows), np.inf)
-    log_information[fits.converged] = -np.linalg.slogdet(fits.covariance[fits.converged])[1]
-    if (structure := fits.model.structure) is not None:
-        log_information -= np.linalg.slogdet(structure.precision)[1]
-    return [
-        Solution(
+    @property
+    def log_range_by_size(self) -> Array:
+        """Logarithm of the range that each source's size stands for."""
+        if not self.layout.has_slack:
+            return self.own[:, 2]
+        return np.asarray(self.own[:, 2] - self.known.tie_spread * self.own[:, 3])
+
+    @property
+    def places(self) -> Array:
+        """Where images are to be laid out: u, v and ln range by size, shape (sources, 3)."""
+        return np.column_stack([self.own[:, :2], self.log_range_by_size])
+
+    def climb(self, sources: Sources) -> bool:
+        """Go on to the greatest likelihood with images as laid out, and tell whether it was reached."""
+        self.sources = sources
+        self.deviance, self.log_information = maximise(
+            self.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
+            self.values, self.covariance, self.expected_e,
+        )  # fmt: skip
+        return math.isfinite(self.deviance)
+
+    def has_moved(self, reach_px: Array) -> bool:
+        """Tell whether a size has changed so much that images should be laid out anew."""
+        assert self.sources is not None
+        change = self.sources.log_range_at - self.log_range_by_size
+        stale = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
+        return bool(stale.any())
+
+    def solution(self, reach_px: Array) -> Solution:
+        """Return what has been found."""
+        assert self.sources is not None
+        layout, window, own = self.layout, self.window, self.own
+        step, shape = layout.per_source, window.image_e.shape
+        sigmas = np.sqrt(np.diagonal(self.covariance)[: layout.width]).reshape(own.shape)
+        # Of (l, a), or of l alone.
+        at = np.arange(2, layout.width, step)[:, None] + np.arange(step - 2)
+        tied = self.covariance[at[:, :, None], at[:, None, :]]
+        slack = own[:, 3] if layout.has_slack else None
+        log_range, log_range_sigma = self.camera.log_range(own[:, 2], slack, tied)
+        flux_e = np.exp(self.sources.log_flux_at_1_m - 2.0 * own[:, 2])
+        background_e = float(self.values[layout.background])
+        flares_e = self.expected_e - background_e
+        log_information = self.log_information
+        if layout.structure:
+            flares_e -= self.values[-layout.structure :] @ self.structure.columns
+            log_information -= self.structure.log_determinant
+        return Solution(
             window=window,
-            u_px=fits.places_px[g, :, 0],
-            v_px=fits.places_px[g, :, 1],
-            flux_e=flux_e[g],
-            log_photometric_range=fits.log_photometric_range[g],
-            u_sigma_px=sigmas[g, :, 0],
-            v_sigma_px=sigmas[g, :, 1],
-            flux_sigma_e=2.0 * sigmas[g, :, 2] * flux_e[g],
-            log_range=log_range[g],
-            log_range_sigma=log_sigma[g],
-            ranged=fits.model.log_flux_at_1_m[g] != 0.0,
-            image_radius_px=radius_px[g],
-            background_e=float(fits.background_e[g]),
-            expected_e=fits.expected_e[g],
-            flares_e=flares_e[g],
-            deviance=float(fits.deviance[g]),
-            psf_sigma_px=fits.model.camera.calibration.psf_sigma_px,
-            log_information=float(log_information[g]),
+            u_px=own[:, 0].copy(),
+            v_px=own[:, 1].copy(),
+            flux_e=flux_e,
+            log_photometric_range=own[:, 2].copy(),
+            u_sigma_px=sigmas[:, 0],
+            v_sigma_px=sigmas[:, 1],
+            flux_sigma_e=2.0 * sigmas[:, 2] * flux_e,
+            log_range=np.array(log_range),
+            log_range_sigma=log_range_sigma,
+            ranged=self.sources.log_flux_at_1_m != 0.0,
+            image_radius_px=reach_px * np.exp(self.sources.log_range_at - self.log_range_by_size),
+            background_e=background_e,
+            expected_e=self.expected_e.reshape(shape).copy(),
+            flares_e=flares_e.reshape(shape),
+            deviance=self.deviance,
+            psf_sigma_px=self.known.psf_sigma_px,
+            log_information=log_information,
         )
-        if fits.converged[g]
-        else None
-        for g, window in enumerate(windows)
-    ]

@@ -2,18 +2,17 @@
 
 Structure is told from noise by its scatter: where the filtered image scatters by more than the noise model
 says, the rest is structure. Its autocorrelation, measured in the frame, makes of it a Gaussian process; in a
-window that is a handful of cosines whose amplitudes have a prior (`model.window.Structure`), so that a fit
+window that is a handful of cosines whose amplitudes have a prior (`model.layout.Structure`), so that a fit
 knows which backgrounds are likely under a flare, and its sigmas know that it does not see them.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.window import Structure
+from perception.model.layout import Structure
 
 Array = NDArray[np.float64]
 
@@ -24,12 +23,6 @@ _MOST_HALO_SHARE = 0.5
 EDGES = tuple(np.exp(-np.arange(16) / 4.0).round(3).tolist())
 """Autocorrelation of what has edges, as shadows and panels do: it falls at once, and its spectrum slowly."""
 
-LEAST_RATIO = 1.06
-"""Parts of a frame whose scatter exceeds noise by less count as even: so exactly it is measured."""
-
-LEAST_RATIO_AROUND = 1.04
-"""As much the mean over 5 × 5 parts must have: of nine even frames of 1280 × 960 one has it, in one part."""
-
 _LAGS = 48
 _LINES = 96
 _CLIP_SIGMAS = 4.0
@@ -37,35 +30,10 @@ _MOST_WAVES = 6
 _LEAST_EIGENVALUE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Texture:
-    """Structure of a frame's background.
-
-    Attributes
-    ----------
-    sigma_e
-        Its standard deviation, per pixel, shape of the frame; 0 where it is even.
-    autocorrelation
-        At distances of 0, 1, 2, ... px, averaged over directions; 1 at 0, and 0 beyond the last.
-    """
-
-    sigma_e: NDArray[np.float32]
-    autocorrelation: tuple[float, ...]
-
-
 def structure_of(correlation: tuple[float, ...], side_px: int, sigma_e: float) -> Structure:
     """Return the structure of one square window, of an autocorrelation and a standard deviation."""
-    columns, covariance = _cosines(correlation, side_px)
-    precision = np.asarray(np.linalg.inv(covariance), dtype=np.float64) / sigma_e**2
-    return Structure(columns[None], precision[None])
-
-
-def scatter(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the scatter of samples, shape (..., samples), blind to their outer thirds, where flares are."""
-    count = samples.shape[-1]
-    low, high = round(0.1587 * (count - 1)), round(0.8413 * (count - 1))
-    parted = np.partition(samples, (low, high), axis=-1)
-    return np.asarray(0.5 * (parted[..., high] - parted[..., low]), dtype=np.float32)
+    columns, precision = _cosines(correlation, side_px)
+    return Structure(columns, precision / sigma_e**2)
 
 
 def autocorrelation(
@@ -112,7 +80,7 @@ def autocorrelation(
 
 @lru_cache(maxsize=128)
 def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array]:
-    """Return cosines over a square window, and the covariance of their amplitudes at variance 1.
+    """Return cosines over a square window, and the precision of their amplitudes at variance 1.
 
     As many as structure of this correlation needs; the constant is left out, as the background has it.
     """
@@ -131,8 +99,14 @@ def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array
     covariance = covariance[np.ix_(order, order)]
     values, vectors = np.linalg.eigh(covariance)
     values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
-    basis = np.einsum("nr,mc->nmrc", waves, waves).reshape(number, side_px, side_px)[order]
-    return basis, (vectors * values) @ vectors.T
+    basis = np.einsum("nr,mc->nmrc", waves, waves).reshape(number, side_px**2)[order]
+    return basis, np.asarray((vectors / values) @ vectors.T)
+
+
+def halo_widths_px(image_radius_px: float) -> tuple[float, ...]:
+    """Return how wide the light may be that a wall close behind a source throws back around its flare."""
+    narrowest_px = max(_LEAST_HALO_PX, 1.5 * image_radius_px)
+    return tuple(narrowest_px * factor for factor in HALO_WIDTHS)
 
 
 def halo_of(box: PixelBox, u_px: float, v_px: float, image_radius_px: float, flux_e: float) -> Structure:
@@ -152,17 +126,19 @@ def halo_of(box: PixelBox, u_px: float, v_px: float, image_radius_px: float, flu
     """
     rows, columns = np.ogrid[box.top : box.top + box.height, box.left : box.left + box.width]
     distance2 = (columns - u_px) ** 2 + (rows - v_px) ** 2
-    narrowest_px = max(_LEAST_HALO_PX, 1.5 * image_radius_px)
-    widths2 = [(narrowest_px * factor) ** 2 for factor in HALO_WIDTHS]
-    profiles = np.stack([(1.0 + distance2 / w2) ** -1.5 / (2.0 * np.pi * w2) for w2 in widths2])
-    return Structure(profiles[None], np.eye(len(widths2))[None] / (_MOST_HALO_SHARE * flux_e) ** 2)
+    widths2 = [width_px**2 for width_px in halo_widths_px(image_radius_px)]
+    profiles = [(1.0 + distance2 / w2) ** -1.5 / (2.0 * np.pi * w2) for w2 in widths2]
+    return Structure(
+        np.stack([profile.ravel() for profile in profiles]),
+        np.eye(len(widths2)) / (_MOST_HALO_SHARE * flux_e) ** 2,
+    )
 
 
 def joined(one: Structure | None, other: Structure) -> Structure:
     """Return two structures on top of each other."""
     if one is None:
         return other
-    count, more = one.precision.shape[1], other.precision.shape[1]
-    precision = np.zeros((len(one.precision), count + more, count + more))
-    precision[:, :count, :count], precision[:, count:, count:] = one.precision, other.precision
-    return Structure(np.concatenate([one.columns, other.columns], axis=1), precision)
+    count, more = len(one.columns), len(other.columns)
+    precision = np.zeros((count + more, count + more))
+    precision[:count, :count], precision[count:, count:] = one.precision, other.precision
+    return Structure(np.concatenate([one.columns, other.columns]), precision)

@@ -3,16 +3,21 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from perception.compiled import compiled
+from perception.model.layout import CLIPPED, UNUSABLE
 from perception.robust.clusters import Candidate
 from perception.robust.goodness import MODEL_ERROR
-from perception.robust.prepare import PreparedFrame
+from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
+
+Array = NDArray[np.float64]
 
 LEAST_RANGE_M = 0.03
 """Nothing is taken for a source that would stand nearer to the lens."""
 
-_REACH_PX = 2
+REACH_PX, REACHED_SHARE = 2, 0.02
 _DISC_FILLS = (0.88, 1.12)
 _MOST_ASPECT = 1.5
 _MOST_BRIGHTNESS_FACTOR = 2.0
@@ -26,17 +31,37 @@ def is_one_pixel(solution: Solution) -> bool:
     background with one pixel free, and of the flare. (Bright ones `sensor.bad_pixels` has found before.)
     """
     window = solution.window
-    reached = window.usable & (solution.flares_e > 0.02 * solution.flares_e.max())
-    row, column = np.unravel_index(int(np.argmax(np.where(reached, window.image_e, -np.inf))), reached.shape)
-    near = np.s_[
-        max(row - _REACH_PX, 0) : row + _REACH_PX + 1, max(column - _REACH_PX, 0) : column + _REACH_PX + 1
-    ]
-    others = window.usable.copy()
-    others[row, column] = False
-    background_e = solution.expected_e - solution.flares_e
-    of_pixel = (window.image_e - background_e) ** 2 / (np.maximum(background_e, 0.0) + window.floor_e2)
-    of_flare = solution.residual_e**2 / solution.variance_e2(MODEL_ERROR)
-    return float(of_pixel[near][others[near]].sum()) < float(of_flare[near][window.usable[near]].sum())
+    return _is_one_pixel(
+        window.image_e, window.state, solution.expected_e, solution.flares_e, window.floor_e2, window.prnu
+    )
+
+
+@compiled
+def _is_one_pixel(
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float, prnu: float
+) -> bool:
+    rows, columns = image_e.shape
+    brightest, at_row, at = -math.inf, 0, 0
+    least = REACHED_SHARE * flares_e.max()
+    for row in range(rows):
+        for column in range(columns):
+            reached = state[row, column] != UNUSABLE and flares_e[row, column] > least
+            if reached and image_e[row, column] > brightest:
+                brightest, at_row, at = image_e[row, column], row, column
+    of_pixel, of_flare = 0.0, 0.0
+    for row in range(max(0, at_row - REACH_PX), min(rows, at_row + REACH_PX + 1)):
+        for column in range(max(0, at - REACH_PX), min(columns, at + REACH_PX + 1)):
+            if state[row, column] == UNUSABLE:
+                continue
+            lit, ground = max(expected_e[row, column], 0.0), expected_e[row, column] - flares_e[row, column]
+            if row != at_row or column != at:
+                of_pixel += (image_e[row, column] - ground) ** 2 / (max(ground, 0.0) + floor_e2)
+            left = image_e[row, column] - expected_e[row, column]
+            if state[row, column] == CLIPPED:
+                left = max(left, 0.0)
+            model = MODEL_ERROR * flares_e[row, column]
+            of_flare += left * left / (lit + (prnu * lit) ** 2 + floor_e2 + model * model)
+    return of_pixel < of_flare
 
 
 def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) -> bool:
@@ -64,7 +89,7 @@ def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     metre over the area of its image there.
     """
     box, calibration = member.blob.box, prepared.calibration
-    rows, columns = prepared.lit.shape
+    rows, columns = prepared.filtered_e.shape
     cut = box.top == 0 or box.left == 0 or box.top + box.height == rows or box.left + box.width == columns
     fill = member.blob.area_px / (0.25 * math.pi * box.height * box.width)
     aspect = max(box.height, box.width) / min(box.height, box.width)
@@ -77,11 +102,7 @@ def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     if not member.at_one_metre_e > 0.0:
         return False
     disc_e = member.at_one_metre_e / (math.pi * (calibration.fx_px * calibration.source_radius_m) ** 2)
-    pixels_e = (
-        prepared.image_e[box.slices][member.blob.pixels]
-        - prepared.background_e[box.slices][member.blob.pixels]
-    )
-    seen_e = float(np.median(pixels_e))
+    seen_e = float(np.median(prepared.excess_e[box.slices][member.blob.pixels]))
     if disc_e > seen_e:
         return not member.is_clipped and disc_e > _MOST_BRIGHTNESS_FACTOR * seen_e
     return seen_e > _MOST_BRIGHTNESS_FACTOR * disc_e

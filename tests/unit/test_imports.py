@@ -34,9 +34,10 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.calibration": (),
     "perception.estimators": (),
     "perception.paper": (),
-    "perception.robust": (),
+    "perception.robust": ("search",),
     "perception.files": (),
     "perception.model": (),
+    "perception.compiled": (),
     "perception.types": (),
     "perception.picture": (),
 }

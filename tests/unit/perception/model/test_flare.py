@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perception.model import flare as flare_model
+from perception.model import nodes
 from perception.model.flare import PixelBox, flare_image, image_radius_px
 from perception.model.ranging import angular_radius_rad
 from tests.unit.perception.simulation import calibration, expected_e
@@ -51,11 +51,11 @@ def test_three_times_the_nodes_change_nothing(range_m: float, monkeypatch: pytes
         1100.3, 800.7, float(image_radius_px(1100.3, 800.7, radius, camera)) + 6.0, camera
     )
     image = flare_image(1100.3, 800.7, radius, window, camera).fraction
-    flare_model._cap_rule.cache_clear()
+    nodes._cap_rule.cache_clear()
     for name in ("_RINGS_BASE", "_RINGS_SLOPE", "_AROUND_BASE", "_AROUND_SLOPE"):
-        monkeypatch.setattr(flare_model, name, 3.0 * getattr(flare_model, name))
+        monkeypatch.setattr(nodes, name, 3.0 * getattr(nodes, name))
     dense = flare_image(1100.3, 800.7, radius, window, camera).fraction
-    flare_model._cap_rule.cache_clear()
+    nodes._cap_rule.cache_clear()
     assert float(np.abs(image - dense).max() / dense.max()) < 1e-4
 
 

@@ -2,17 +2,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.robust.blobs import Blob, components, split_at_peaks
+from perception.robust.search.blobs import Blob, components, split_at_peaks
 
 
-def hill(*tops: tuple[float, float, float], width: int = 30) -> NDArray[np.float64]:
+def hill(*tops: tuple[float, float, float], width: int = 30) -> NDArray[np.float32]:
     rows, columns = np.indices((20, width))
-    return np.asarray(
-        np.sum([h * np.exp(-0.5 * ((rows - v) ** 2 + (columns - u) ** 2)) for u, v, h in tops], axis=0)
-    )
+    tops_apart = [h * np.exp(-0.5 * ((rows - v) ** 2 + (columns - u) ** 2)) for u, v, h in tops]
+    return np.asarray(np.sum(tops_apart, axis=0), dtype=np.float32)
 
 
-def whole(image: NDArray[np.float64]) -> Blob:
+def whole(image: NDArray[np.float32]) -> Blob:
     return Blob(PixelBox(100, 200, *image.shape), np.asarray(image > 1.0))
 
 
@@ -30,7 +29,7 @@ def test_components_touch_at_corners_and_obey_the_area() -> None:
 
 def test_two_hills_are_parted() -> None:
     image = hill((8.0, 10.0, 1000.0), (13.0, 10.0, 400.0))
-    one, two = split_at_peaks(whole(image), image, np.sqrt(image + 1.0))
+    one, two = split_at_peaks(whole(image), image, np.sqrt(image + 1))
     assert one.box.left <= 208 < one.box.left + one.box.width
     assert two.box.left <= 213 < two.box.left + two.box.width
     assert one.area_px + two.area_px == whole(image).area_px
@@ -38,11 +37,13 @@ def test_two_hills_are_parted() -> None:
 
 def test_a_dip_within_the_noise_parts_nothing() -> None:
     image = hill((8.0, 10.0, 1000.0), (13.0, 10.0, 400.0))
-    assert len(split_at_peaks(whole(image), image, np.full(image.shape, 100.0))) == 1
+    assert len(split_at_peaks(whole(image), image, np.full(image.shape, 100.0, np.float32))) == 1
 
 
 def test_a_plateau_with_ripples_is_one() -> None:
     rows, columns = np.indices((20, 30))
-    image = 1000.0 * ((rows - 10) ** 2 + (columns - 15) ** 2 < 50) + 10.0 * ((rows + columns) % 3)
+    image = np.float32(1000.0) * ((rows - 10) ** 2 + (columns - 15) ** 2 < 50) + 10 * (
+        (rows + columns) % 3
+    ).astype(np.float32)
     blob = Blob(PixelBox(0, 0, 20, 30), np.asarray(image > 500.0))
-    assert split_at_peaks(blob, image, np.sqrt(image + 1.0)) == [blob]
+    assert split_at_peaks(blob, image, np.sqrt(image + 1)) == [blob]

@@ -7,8 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import perception
-from perception.model.sensor import bad_pixels
-from perception.robust.prepare import point_kernel
+from perception.robust.search.frame import Pixels
+from perception.robust.search.limit import point_kernel
+from perception.robust.search.prepare import bad_pixels
 from perception.robust.structure import autocorrelation, structure_of
 from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, frame_of, textured
 from tests.unit.perception.simulation import random
@@ -73,8 +74,9 @@ def test_bad_pixels_are_told_from_the_sharpest_flare() -> None:
     image_e[45 - half : 46 + half, 15 - half : 16 + half] += (
         2000.0 * np.outer(kernel, kernel) / kernel[half] ** 2
     ).astype(np.float32)
-    found = bad_pixels(image_e - 3.0, image_e, np.ones(image_e.shape, dtype=bool), 24.0, kernel)
-    assert np.argwhere(found).tolist() == [[10, 10], [30, 30], [30, 31]]
+    pixels = Pixels(image_e.astype(np.uint16), 0.0, 1.0, np.full((1, 60), 3.0, dtype=np.float32))
+    found = bad_pixels(pixels, np.arange(image_e.size), 24.0, kernel)
+    assert [divmod(place, 60) for place in found.tolist()] == [(10, 10), (30, 30), (30, 31)]
 
 
 def test_the_autocorrelation_of_texture_is_that_of_its_making() -> None:
@@ -91,8 +93,8 @@ def test_cosines_carry_the_variance_of_the_texture() -> None:
     """Amplitudes drawn from their prior make a texture of that variance but for its mean over the window."""
     correlation = tuple(np.exp(-(np.arange(40.0) ** 2) / 64.0).tolist())
     structure = structure_of(correlation, 21, 3.0)
-    covariance = np.linalg.inv(structure.precision[0])
-    columns = structure.columns[0].reshape(len(covariance), -1)
+    covariance = np.linalg.inv(structure.precision)
+    columns = structure.columns
     made = float(np.einsum("ip,ij,jp->p", columns, covariance, columns).mean())
     at = np.arange(21)
     rows, across = (each.ravel() for each in np.meshgrid(at, at, indexing="ij"))

@@ -9,10 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from perception.model.fisher import flare_limit
-from perception.model.likelihood import Windows
+from perception.model.flare import PixelBox
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE
 from perception.model.sensor import clip_level_e, noise_floor_e2
 from perception.model.window import Camera
-from perception.robust.fit import Fits, Starts, fit_flares
+from perception.robust.solve import Problem, Solution, Window, solve
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, random
 
@@ -78,7 +79,23 @@ def bound(case: Case) -> Array:
     return np.asarray(scale * np.sqrt(np.diagonal(np.linalg.inv(information * np.outer(scale, scale)))))[:3]
 
 
-def fits_of(case: Case, trials: int, *key: int) -> Fits:
+def windows_of(case: Case, images_e: Array, clipped: NDArray[np.bool_], camera: Calibration) -> list[Window]:
+    """Windows of a case that show some images."""
+    top, left, side = case.corner_px
+    return [
+        Window(
+            box=PixelBox(top, left, side, side),
+            image_e=image_e,
+            state=np.where(cut, CLIPPED, SEEN).astype(np.uint8),
+            floor_e2=noise_floor_e2(camera),
+            clip_e=clip_level_e(camera, camera.black_level_dn),
+            prnu=camera.prnu,
+        )
+        for image_e, cut in zip(images_e, clipped, strict=True)
+    ]
+
+
+def fits_of(case: Case, trials: int, *key: int) -> list[Solution]:
     """Fit so many exposures of a case, from starts that are half a pixel and a quarter of the range off."""
     camera, random_number = (
         case.camera,
@@ -89,32 +106,24 @@ def fits_of(case: Case, trials: int, *key: int) -> Fits:
     electrons = random_number.poisson(mean) + random_number.normal(0.0, camera.read_noise_e, mean.shape)
     gain = camera.system_gain_dn_per_e
     counts = np.minimum(np.rint(gain * electrons + camera.black_level_dn), camera.saturation_dn)
-    top, left, _ = case.corner_px
-    return fit_flares(
-        Windows(
-            top=np.full(trials, top),
-            left=np.full(trials, left),
-            image_e=(counts - camera.black_level_dn) / gain,
-            usable=np.ones(mean.shape, dtype=bool),
-            clipped=counts >= camera.saturation_dn,
-            floor_e2=np.full(trials, noise_floor_e2(camera)),
-            clip_e=clip_level_e(camera, camera.black_level_dn),
-            prnu=camera.prnu,
-        ),
-        Camera(case.known, case.exposure_s, 1.0),
-        Starts(
-            u_px=np.full((trials, 1), PLACE_PX[0] + 0.5),
-            v_px=np.full((trials, 1), PLACE_PX[1] - 0.4),
-            log_range=np.full((trials, 1), math.log(case.range_m) + 0.25),
-            background_e=np.zeros(trials),
-        ),
+    start = (PLACE_PX[0] + 0.5, PLACE_PX[1] - 0.4, math.log(case.range_m) + 0.25)
+    windows = windows_of(
+        case, (counts - camera.black_level_dn) / gain, counts >= camera.saturation_dn, camera
     )
+    problems = [Problem(window, [start], 0.0) for window in windows]
+    return solved(problems, Camera(case.known, case.exposure_s, 1.0))
 
 
-def starts_at(range_m: float, trials: int) -> Starts:
-    """First guesses at a range, without background."""
-    u_px, v_px, log_range = (np.full((trials, 1), value) for value in (*PLACE_PX, math.log(range_m)))
-    return Starts(u_px, v_px, log_range, np.zeros(trials))
+def solved(problems: list[Problem], camera: Camera) -> list[Solution]:
+    """Solutions of problems that all have one."""
+    solutions = [each for each in solve(problems, camera) if each is not None]
+    assert len(solutions) == len(problems)
+    return solutions
+
+
+def found(solutions: list[Solution], name: str) -> Array:
+    """What solutions say of their only flares."""
+    return np.array([getattr(each, name)[0] for each in solutions])
 
 
 CASES = {
@@ -140,15 +149,14 @@ def test_errors_are_those_that_light_allows(name: str) -> None:
     case = CASES[name]
     trials = TRIALS if case.range_m >= 1.0 else 100
     fits = fits_of(case, trials)
-    assert fits.converged.all()
-    log_range, log_sigma = (
-        each - shift for each, shift in zip(fits.log_range(0), (math.log(case.range_m), 0.0), strict=True)
+    log_range = found(fits, "log_range") - math.log(case.range_m)
+    errors = np.column_stack(
+        [found(fits, "u_px") - PLACE_PX[0], found(fits, "v_px") - PLACE_PX[1], log_range]
     )
-    errors = np.column_stack([fits.places_px[:, 0] - PLACE_PX, log_range])
     # Of what light allows at a clip level some is told by the pixels just below it that the bound leaves out.
     tolerance = 4.0 * math.sqrt(2.0 / trials) + (0.1 if "clipped" in name else 0.02)
     assert np.mean((errors / bound(case)) ** 2, axis=0) == pytest.approx(np.ones(3), abs=tolerance)
-    claims = np.column_stack([*(np.sqrt(fits.of_source(0)[:, k, k]) for k in (0, 1)), log_sigma])
+    claims = np.column_stack([found(fits, name) for name in ("u_sigma_px", "v_sigma_px", "log_range_sigma")])
     assert np.mean((errors / claims) ** 2, axis=0) == pytest.approx(np.ones(3), abs=tolerance)
     # The simulator samples a disc's rim at 1/16 px: to 10⁻⁴ of its range.
     grid = np.array([0.0, 0.0, 1e-4])
@@ -169,8 +177,8 @@ def test_light_one_per_cent_too_strong_is_seen() -> None:
     stronger = replace(
         case, camera=replace(SMALL, range_constant_dn_m2_per_s=1.01 * SMALL.range_constant_dn_m2_per_s)
     )
-    log_range, _ = fits_of(case, TRIALS, 1).log_range(0)
-    log_stronger, _ = fits_of(stronger, TRIALS, 1).log_range(0)
+    log_range = found(fits_of(case, TRIALS, 1), "log_range")
+    log_stronger = found(fits_of(stronger, TRIALS, 1), "log_range")
     # The stronger lamp's own calibration knows of it; by the other's, its range would be so much nearer.
     assert np.mean(log_range) == pytest.approx(math.log(10.0), abs=4.0 * 0.004 / math.sqrt(TRIALS))
     assert np.mean(log_stronger) - np.mean(log_range) == pytest.approx(
@@ -196,26 +204,12 @@ def test_the_claim_holds_over_fixed_patterns(exposure_s: float, background_e: fl
     charge_e = random_number.poisson(mean * (1.0 + random_number.normal(0.0, 0.02, mean.shape)))
     read_e = charge_e + random_number.normal(0.0, math.hypot(6.0, 2.0), mean.shape)
     image_e = (np.rint(read_e * gain + 64.0) - 64.0) / gain
-    top, left, _ = case.corner_px
     pulls = []
     for camera in (aware, point):
-        fits = fit_flares(
-            Windows(
-                top=np.full(trials, top),
-                left=np.full(trials, left),
-                image_e=image_e,
-                usable=np.ones(mean.shape, dtype=bool),
-                clipped=np.zeros(mean.shape, dtype=bool),
-                floor_e2=np.full(trials, noise_floor_e2(camera)),
-                clip_e=1e9,
-                prnu=camera.prnu,
-            ),
-            Camera(camera, exposure_s, 1.0),
-            starts_at(5.0, trials),
-        )
-        assert fits.converged.all()
-        log_range, log_sigma = fits.log_range(0)
-        pulls.append(float(np.std(log_range) / np.mean(log_sigma)))
+        windows = windows_of(case, image_e, np.zeros(mean.shape, dtype=bool), camera)
+        problems = [Problem(window, [(*PLACE_PX, math.log(5.0))], 0.0) for window in windows]
+        fits = solved(problems, Camera(camera, exposure_s, 1.0))
+        pulls.append(float(np.std(found(fits, "log_range")) / np.mean(found(fits, "log_range_sigma"))))
     tolerance = 4.0 / math.sqrt(2 * trials)
     assert pulls[0] == pytest.approx(1.0, abs=tolerance)
     assert pulls[1] > 1.0 + tolerance
@@ -225,19 +219,15 @@ def test_a_fit_that_nothing_determines() -> None:
     """No pixel counts; or all are clipped: not converged, and no exception."""
     case = CASES["10 m"]
     top, left, side = case.corner_px
-    for usable, clipped in ((False, False), (True, True)):
-        fits = fit_flares(
-            Windows(
-                top=np.array([top]),
-                left=np.array([left]),
-                image_e=np.full((1, side, side), 5447.0),
-                usable=np.full((1, side, side), usable),
-                clipped=np.full((1, side, side), clipped),
-                floor_e2=np.array([100.0]),
-                clip_e=5447.0,
-                prnu=0.0,
-            ),
-            Camera(SMALL, 1e-3, 1.0),
-            starts_at(5.0, 1),
+    for state in (UNUSABLE, CLIPPED):
+        window = Window(
+            box=PixelBox(top, left, side, side),
+            image_e=np.full((side, side), 5447.0),
+            state=np.full((side, side), state, dtype=np.uint8),
+            floor_e2=100.0,
+            clip_e=5447.0,
+            prnu=0.0,
         )
-        assert not fits.converged[0] or not fits.log_range(0)[1][0] < 1.0
+        problem = Problem(window, [(*PLACE_PX, math.log(5.0))], 0.0)
+        (solution,) = solve([problem], Camera(SMALL, 1e-3, 1.0))
+        assert solution is None or not solution.log_range_sigma[0] < 1.0

@@ -2,16 +2,13 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 from scipy.stats import norm, poisson
 
-from perception.robust.prepare import (
-    FALSE_ALARMS_PER_PIXEL,
-    background_mesh_e,
-    detection_limit_e,
-    matched_filter,
-    point_kernel,
-    spread_mesh,
-)
+from perception.robust.search.background import background_mesh_e, cell_means, cell_scatter, spread_mesh
+from perception.robust.search.frame import Pixels, above, filtered
+from perception.robust.search.limit import FALSE_ALARMS_PER_PIXEL, detection_limit_e, point_kernel
 from tests.unit.perception.simulation import calibration, expose, random
 
 
@@ -93,17 +90,70 @@ def test_tail_of_filtered_noise(background_e: float, read_e: float) -> None:
     rng = random(31, int(10 * read_e))
     noise = rng.poisson(background_e, (2000, 2000)) - background_e + rng.normal(0, read_e, (2000, 2000))
     limit = detection_limit_e(np.array([background_e]), read_e**2, kernel, 1e-4)[0]
-    passed = int((matched_filter(noise.astype(np.float32), kernel) > limit).sum())
+    passed = int((correlate(noise, kernel) > limit).sum())
     # Neighbours pass together, about three at a time.
     assert abs(passed - 400) < 5.0 * np.sqrt(3.0 * 400)
 
 
+def correlate(image: NDArray[np.floating], kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correlate along both axes, zero beyond the border: scipy's."""
+    once = correlate1d(image, kernel, axis=0, mode="constant")
+    return np.asarray(correlate1d(once, kernel, axis=1, mode="constant"))
+
+
+def test_filtered_electrons_are_those_of_another_library() -> None:
+    """On a slope of background between mesh points, up to the borders: within 10⁻⁴ e of scipy's and OpenCV's."""
+    camera = calibration(width_px=150, height_px=90)
+    counts = random(25).integers(60, 4000, (90, 150)).astype(np.uint16)
+    mesh_e = np.array([[3.0, 9.0, 4.0], [20.0, 50.0, 2.0]], dtype=np.float32)
+    wide_e = np.array(
+        [np.interp(np.arange(150), [24.5, 74.5, 124.5], line) for line in mesh_e], dtype=np.float32
+    )
+    kernel = point_kernel(0.9)
+    found = filtered(Pixels(counts, 64.0, 1.0 / 0.74, wide_e), kernel.astype(np.float32))
+    expected = correlate((counts - 64.0) / 0.74 - spread_mesh(mesh_e, camera), kernel)
+    np.testing.assert_allclose(found, expected, atol=1e-2, rtol=1e-5)
+
+
+def test_what_exceeds_the_limit_is_found_in_order() -> None:
+    image = random(26).normal(size=(37, 41)).astype(np.float32)
+    limit = np.array([[0.5], [1.5]], dtype=np.float32).repeat(41, axis=1)
+    rows = np.interp(np.arange(37), [8.75, 27.25], [0.5, 1.5])
+    assert above(image, limit).tolist() == np.flatnonzero(image > rows[:, None]).tolist()
+
+
+def test_scatter_of_cells_against_sorting() -> None:
+    """Narrow, as noise, and 20 times as wide, beyond the histogram: within its step of the sorted samples'."""
+    rows, columns = np.arange(256).reshape(1, 256)[:, ::4], np.arange(400).reshape(2, 200)[:, ::5]
+    for width in (1.0, 20.0):
+        image = random(27, int(width)).normal(0.0, 3.0 * width, (256, 400)).astype(np.float32)
+        found = cell_scatter(image, np.full((1, 2), 3.0, dtype=np.float32), rows, columns)
+        for cell in (0, 1):
+            samples = np.sort(image[np.ix_(rows[0], columns[cell])].ravel())
+            low, high = round(0.1587 * (samples.size - 1)), round(0.8413 * (samples.size - 1))
+            assert found[0, cell] == pytest.approx((samples[high] - samples[low]) / 6.0, abs=0.01)
+
+
+def test_means_of_cells_against_sorting() -> None:
+    """A fifth of a cell lies in bright light: the clipped mean is that of samples sorted and cut in three rounds."""
+    counts = random(28).poisson(30.0, (64, 64)).astype(np.uint16) + np.uint16(64)
+    counts[:, :13] += np.uint16(40)
+    at = np.arange(64).reshape(1, 64)
+    seen = np.sort(counts.ravel()).astype(np.float64)
+    kept = seen
+    for _ in range(3):
+        median = kept[(kept.size - 1) // 2]
+        kept = seen[abs(seen - median) <= 3.0 * np.sqrt(max(median - 64.0, 0.0) + 4.0)]
+    assert cell_means(counts, at, at, 64.0, 1.0, 4.0)[0, 0] == pytest.approx(kept.mean(), rel=1e-12)
+
+
 def test_filter_keeps_the_place_and_is_quiet_at_the_border() -> None:
-    image = np.zeros((20, 30), np.float32)
-    image[7, 11] = 1.0
-    kernel = point_kernel(0.7)
-    filtered = matched_filter(image, kernel)
-    assert filtered.argmax() == 7 * 30 + 11
-    assert filtered.max() == pytest.approx(kernel.max() ** 2, rel=1e-6)
-    ones = matched_filter(np.ones((20, 30), np.float32), kernel)
+    image = np.zeros((20, 30), np.uint16)
+    image[7, 11] = 1000
+    kernel = point_kernel(0.7).astype(np.float32)
+    ground = np.zeros((1, 30), np.float32)
+    response = filtered(Pixels(image, 0.0, 1e-3, ground), kernel)
+    assert response.argmax() == 7 * 30 + 11
+    assert response.max() == pytest.approx(kernel.max() ** 2, rel=1e-6)
+    ones = filtered(Pixels(np.full((20, 30), 1000, np.uint16), 0.0, 1e-3, ground), kernel)
     assert ones[0, 0] < 0.7 < ones[10, 10] == pytest.approx(1.0, rel=1e-6)

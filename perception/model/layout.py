@@ -1,0 +1,160 @@
+"""What a window of a frame is handed to compiled loops as, and where each of its unknowns stands."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+UNUSABLE, SEEN, CLIPPED = 0, 1, 2
+"""What a pixel may be."""
+
+_MOST_STEP = (1.0, 1.0, 0.5, 3.0)  # px, px, ln range, σ
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each unknown of a window stands in its vector.
+
+    For each source u, v, l, and its slack if it has one; then w if the width is not exact, B, and c.
+    """
+
+    sources: int
+    has_slack: bool
+    has_width: bool
+    structure: int
+
+    @property
+    def per_source(self) -> int:
+        """Unknowns of each source."""
+        return 4 if self.has_slack else 3
+
+    @property
+    def width(self) -> int:
+        """Index of w."""
+        return self.sources * self.per_source
+
+    @property
+    def background(self) -> int:
+        """Index of B."""
+        return self.width + self.has_width
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.background + 1 + self.structure
+
+    @property
+    def most_step(self) -> Array:
+        """How far each unknown may move in one step of a fit that trusts its slopes, shape (unknowns,)."""
+        most = np.full(self.size, np.inf)
+        most[: self.width] = _MOST_STEP[: self.per_source] * self.sources
+        if self.has_width:
+            most[self.width] = _MOST_STEP[3]
+        return most
+
+    def prior(self, structure: "Structure") -> Array:
+        """Return the prior precision of the unknowns, shape (unknowns, unknowns)."""
+        precision = np.zeros((self.size, self.size))
+        if self.has_slack:
+            slack = np.arange(3, self.width, 4)
+            precision[slack, slack] = 1.0
+        if self.has_width:
+            precision[self.width, self.width] = 1.0
+        precision[self.background + 1 :, self.background + 1 :] = structure.precision
+        return precision
+
+
+class Known(NamedTuple):
+    """What is known of a camera; which unknowns a window has follows from it.
+
+    `tie_spread` and `width_spread` are those of `window.Camera`: where they are 0 no source has a slack, and
+    no window a width. `clip_e` may be infinite.
+    """
+
+    psf_sigma_px: float
+    tie_spread: float
+    width_spread: float
+    clip_e: float
+    prnu: float
+
+    def layout(self, sources: int, structure: int) -> Layout:
+        """Return where the unknowns of so many sources and amplitudes stand."""
+        return Layout(sources, self.tie_spread > 0.0, self.width_spread > 0.0, structure)
+
+
+class Sources(NamedTuple):
+    """The sources of a window, laid out as quadrature nodes.
+
+    Attributes
+    ----------
+    first_node
+        Index of the first node of each, and the number of all, shape (sources + 1,).
+    node_u_px, node_v_px, weight
+        Where nodes are, relative to the source's place, and their share of its light, shape (nodes,).
+        Infinite where there is no image: that light falls on no pixel.
+    log_range_at
+        ln of the range for whose size they are laid out, shape (sources,).
+    log_flux_at_1_m
+        ln F₁ in electrons, shape (sources,); 0 where no range can be had.
+    """
+
+    first_node: NDArray[np.int64]
+    node_u_px: Array
+    node_v_px: Array
+    weight: Array
+    log_range_at: Array
+    log_flux_at_1_m: Array
+
+    def part(self, first: int, end: int) -> "Sources":
+        """Return some of the sources."""
+        nodes = slice(int(self.first_node[first]), int(self.first_node[end]))
+        return Sources(
+            self.first_node[first : end + 1] - nodes.start,
+            self.node_u_px[nodes],
+            self.node_v_px[nodes],
+            self.weight[nodes],
+            self.log_range_at[first:end],
+            self.log_flux_at_1_m[first:end],
+        )
+
+    @property
+    def reach_px(self) -> Array:
+        """Radius of each source's image before the point spread, as laid out."""
+        reach_px = np.hypot(self.node_u_px, self.node_v_px)
+        return np.maximum.reduceat(np.where(np.isfinite(reach_px), reach_px, 0.0), self.first_node[:-1])
+
+
+class View(NamedTuple):
+    """A window of a frame: its corner, its pixels in electrons, what each is, and the dark variance.
+
+    `image_e` and `state` have the shape (rows, columns), `state` one of `UNUSABLE`, `SEEN` and `CLIPPED`.
+    """
+
+    top: int
+    left: int
+    image_e: Array
+    state: NDArray[np.uint8]
+    floor_e2: float
+
+
+class Structure(NamedTuple):
+    """What may lie on an even background: columns φ, and the precision of their amplitudes c.
+
+    `columns` has shape (amplitudes, pixels), `precision` (amplitudes, amplitudes).
+    """
+
+    columns: Array
+    precision: Array
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the precision."""
+        return float(np.linalg.slogdet(self.precision)[1]) if len(self.columns) else 0.0
+
+
+def even(pixels: int) -> Structure:
+    """Return the structure of a background that has none."""
+    return Structure(np.empty((0, pixels)), np.empty((0, 0)))

@@ -1,0 +1,126 @@
+"""Quadrature over the image of a source: a uniform sphere, seen through a lens.
+
+A sphere of radius r at distance d fills the cap of directions within asin(r / d) of its centre, at uniform
+radiance. Each direction ω of the cap gives light in proportion to cos θ · response(θ) · dΩ, θ the field
+angle, and falls on the image where the lens projects it.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.lens import project, stretch
+from perception.types import Calibration
+
+Array = NDArray[np.float64]
+
+# Quadrature nodes per ratio of image radius to smoothing: the smallest numbers, found by comparison with
+# three times as many, that keep the error below 1e-4 of the peak for radii from 0 to 130 px.
+_RINGS_BASE, _RINGS_SLOPE = 0.85, 1.2
+_AROUND_BASE, _AROUND_SLOPE = 5.0, 4.5
+
+
+@dataclass(frozen=True, eq=False)
+class DiscNodes:
+    """Quadrature nodes of the images of some sources, one source's after another's.
+
+    Attributes
+    ----------
+    first
+        Index of the first node of each source, and the number of all, shape (sources + 1,).
+    u_px, v_px
+        Where they are, relative to the source's place, shape (nodes,); infinite beyond the lens's fold.
+    weight
+        Share of the light, sum 1 for each source, same shape.
+    """
+
+    first: NDArray[np.int64]
+    u_px: Array
+    v_px: Array
+    weight: Array
+
+
+def disc_nodes(
+    u_px: Array, v_px: Array, direction: Array, angular_radius_rad: Array, calibration: Calibration
+) -> DiscNodes:
+    """Return quadrature nodes over the caps of spheres, as many for each as its image needs.
+
+    Parameters
+    ----------
+    u_px, v_px, direction, angular_radius_rad
+        Places, unit directions in camera axes, and sizes, shape (sources,) or (sources, 3); spheres that have
+        an image (`flare.has_image`).
+    calibration
+        Intrinsics, PSF and response.
+    """
+    # The pixel smooths like a box of variance 1/12 px², on top of the PSF.
+    smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
+    radius_px = stretch(direction, calibration) * np.tan(angular_radius_rad)
+    rules = [_cap_rule(fineness) for fineness in np.ceil(2.0 * radius_px / smooth_px).astype(int).tolist()]
+    first = np.cumsum([0, *(rule.shape[1] for rule in rules)])
+    omega, weight = _over_caps(
+        first,
+        np.concatenate(rules, axis=1),
+        direction,
+        angular_radius_rad,
+        calibration.response_angle_rad,
+        calibration.response_relative,
+    )
+    # What lies beyond the lens's fold has no image: its light counts, and falls on no pixel.
+    at_px = np.nan_to_num(project(omega, calibration), nan=np.inf)
+    of = np.repeat(np.arange(len(rules)), np.diff(first))
+    return DiscNodes(first, at_px[:, 0] - u_px[of], at_px[:, 1] - v_px[of], weight)
+
+
+@compiled
+def _over_caps(
+    first: NDArray[np.int64], rules: Array, direction: Array, angular_radius_rad: Array,
+    response_angle_rad: Array, response_relative: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return the directions of nodes, shape (nodes, 3), and their share of each cap's light."""
+    omega, weight = np.empty((rules.shape[1], 3)), np.empty(rules.shape[1])
+    for cap in range(len(direction)):
+        x, y, z = direction[cap]
+        # Two unit vectors that complete the direction, which is not along x, to an orthonormal frame.
+        norm = math.hypot(y, z)
+        down_y, down_z = z / norm, -y / norm
+        across_x, across_y, across_z = down_y * z - down_z * y, down_z * x, -down_y * x
+        height, total = 2.0 * math.sin(0.5 * angular_radius_rad[cap]) ** 2, 0.0
+        for node in range(first[cap], first[cap + 1]):
+            # dΩ = dh dφ with h = 1 - cos α: uniform in h.
+            h = rules[0, node] * height
+            sine = math.sqrt(h * (2.0 - h))
+            to_across, to_down = sine * rules[1, node], sine * rules[2, node]
+            one = omega[node]
+            one[0] = (1.0 - h) * x + to_across * across_x
+            one[1] = (1.0 - h) * y + to_across * across_y + to_down * down_y
+            one[2] = (1.0 - h) * z + to_across * across_z + to_down * down_z
+            theta = math.atan2(math.hypot(one[0], one[1]), one[2])
+            response = np.interp(theta, response_angle_rad, response_relative)
+            weight[node] = rules[3, node] * one[2] * response  # cos θ · response(θ) · dΩ
+            total += weight[node]
+        weight[first[cap] : first[cap + 1]] /= total
+    return omega, weight
+
+
+@lru_cache(maxsize=256)
+def _cap_rule(twice_fineness: int) -> Array:
+    """Return nodes over a cap: shares of its height, cosines and sines of the angle around, and weights.
+
+    Shape (4, nodes); the weights have the sum 1. For images of up to half that many times the width of what
+    smooths them.
+    """
+    fineness = 0.5 * twice_fineness
+    rings = math.ceil(_RINGS_BASE + _RINGS_SLOPE * fineness)
+    node, ring_weight = np.polynomial.legendre.leggauss(rings)
+    share_h = 0.5 * (node + 1.0)
+    around = np.ceil(_AROUND_BASE + _AROUND_SLOPE * fineness * np.sqrt(share_h)).astype(int)
+    ring = np.repeat(np.arange(rings), around)
+    step = np.arange(len(ring)) - np.repeat(np.cumsum(around) - around, around)
+    # The golden angle turns each ring against the last, so that their errors do not line up.
+    phi = 2.0 * math.pi * (step / around[ring]) + ring * 2.399963
+    return np.stack([share_h[ring], np.cos(phi), np.sin(phi), (0.5 * ring_weight / around)[ring]])

@@ -1,0 +1,397 @@
+"""What the pixels of a window expect of its sources, how likely is what they show, and where it is likeliest.
+
+Each pixel counts as x + σ² ~ Poisson(λ + σ²), σ² the variance of a dark pixel (Snyder et al., J. Opt. Soc.
+Am. A 12, 272, 1995), widened by the spread of the pixels' responses; its score is (x - λ) / variance. A
+clipped pixel says only that x is c or more: its score is φ(z) / (σ Q(z)), z = (c - λ) / σ. Variances come
+from the model, not from the data: weights from the data would favour pixels that came out low.
+
+All that is here is compiled, one window at a time; `model.window` says what the unknowns are.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
+from perception.model.normal import NORMAL, REACH_SIGMAS, STEP
+
+Array = NDArray[np.float64]
+
+MOST_STEPS = 50
+SETTLED_SIGMAS = 0.01
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
+LEAST_PIVOT = 1e-10
+LOG_RANGE_BOUND = 12.0
+
+_SQRT_HALF = math.sqrt(0.5)
+_LOG_SQRT_2_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+@compiled
+def shares(at_px: float, count: int, sigma_px: float, into: Array) -> tuple[int, int]:
+    """Spread a point along a row of pixels.
+
+    Writes each pixel's share of a Gaussian, its derivative by place and that by ln σ, into rows 0, 1 and 2 of
+    `into`, shape (3, count), and returns the first pixel reached and the one after the last.
+    """
+    reach_px = REACH_SIGMAS * sigma_px
+    if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):
+        return 0, 0
+    first = max(0, math.ceil(at_px - reach_px - 0.5))
+    end = min(count, math.floor(at_px + reach_px + 0.5) + 1)
+    below, density, moment = 0.0, 0.0, 0.0
+    for edge in range(first, end + 1):
+        away = min(max((edge - 0.5 - at_px) / sigma_px, -REACH_SIGMAS), REACH_SIGMAS)
+        place = (away + (REACH_SIGMAS + 2.0 * STEP)) / STEP
+        step = int(place)
+        cubic, t = NORMAL[step], place - step
+        next_below = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
+        next_density = (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7]))) / sigma_px
+        next_moment = sigma_px * away * next_density
+        if edge > first:
+            into[0, edge - 1] = next_below - below
+            into[1, edge - 1] = density - next_density
+            into[2, edge - 1] = moment - next_moment
+        below, density, moment = next_below, next_density, next_moment
+    return first, end
+
+
+@compiled
+def spread_nodes(
+    sources: Sources, source: int, place: tuple[float, float], growth: float, sigma_px: float, image: Array
+) -> None:
+    """Integrate one source's image over the pixels of a window.
+
+    Parameters
+    ----------
+    sources, source
+        Which one.
+    place
+        Column and row of it in the window.
+    growth
+        Factor on the size for which it is laid out.
+    sigma_px
+        Width of the point spread.
+    image
+        Zeros of shape (5, rows, columns): the share of its flux in each pixel is added, and that share's
+        derivatives by column, row, ln size and ln width of the point spread.
+    """
+    _, rows, columns = image.shape
+    across, down = np.empty((3, columns)), np.empty((3, rows))
+    for node in range(sources.first_node[source], sources.first_node[source + 1]):
+        out_u, out_v = growth * sources.node_u_px[node], growth * sources.node_v_px[node]
+        if not (math.isfinite(out_u) and math.isfinite(out_v)):
+            continue
+        left, right = shares(place[0] + out_u, columns, sigma_px, across)
+        top, bottom = shares(place[1] + out_v, rows, sigma_px, down)
+        weight = sources.weight[node]
+        in_u, by_u, wider_u = across[0, left:right], across[1, left:right], across[2, left:right]
+        for row in range(top, bottom):
+            in_v, by_v, wider_v = weight * down[0, row], weight * down[1, row], weight * down[2, row]
+            line = image[:, row, left:right]
+            for column in range(right - left):
+                by_u_here, by_v_here = in_v * by_u[column], by_v * in_u[column]
+                line[0, column] += in_v * in_u[column]
+                line[1, column] += by_u_here
+                line[2, column] += by_v_here
+                line[3, column] += out_u * by_u_here + out_v * by_v_here
+                line[4, column] += in_v * wider_u[column] + wider_v * in_u[column]
+
+
+@compiled
+def expectation(
+    values: Array, view: View, sources: Sources, structure: Structure, known: Known, expected: Array,
+    jacobian: Array, variance: Array,
+) -> None:  # fmt: skip
+    """Compute λ, its derivatives, and the variance of pixels.
+
+    Parameters
+    ----------
+    values
+        Unknowns, in the order of `layout.Layout`.
+    view, sources, structure, known
+        The window, of which the place, the shape and the dark variance count, and what is in it.
+    expected, jacobian, variance
+        Shape (pixels,), (unknowns, pixels) and (pixels,): written; the last as `sensor.pixel_variance_e2`.
+    """
+    count, step = len(sources.log_range_at), 4 if known.tie_spread > 0.0 else 3
+    width = count * step
+    background = width + (1 if known.width_spread > 0.0 else 0)
+    sigma_px = known.psf_sigma_px
+    if known.width_spread > 0.0:
+        sigma_px *= math.exp(known.width_spread * values[width])
+        jacobian[width] = 0.0
+    expected[:] = values[background]
+    jacobian[background] = 1.0
+    for wave in range(len(structure.columns)):
+        amplitude = values[background + 1 + wave]
+        for pixel in range(len(expected)):
+            expected[pixel] += amplitude * structure.columns[wave, pixel]
+            jacobian[background + 1 + wave, pixel] = structure.columns[wave, pixel]
+    image = np.empty((5, *view.image_e.shape))
+    flat = image.reshape(5, -1)
+    for source in range(count):
+        at = source * step
+        by_size = values[at + 2]
+        if step == 4:
+            by_size -= known.tie_spread * values[at + 3]
+        image[:] = 0.0
+        place = (values[at] - view.left, values[at + 1] - view.top)
+        growth = math.exp(sources.log_range_at[source] - by_size)
+        spread_nodes(sources, source, place, growth, sigma_px, image)
+        flux = math.exp(sources.log_flux_at_1_m[source] - 2.0 * values[at + 2])
+        for pixel in range(len(expected)):
+            expected[pixel] += flux * flat[0, pixel]
+            jacobian[at, pixel] = flux * flat[1, pixel]
+            jacobian[at + 1, pixel] = flux * flat[2, pixel]
+            jacobian[at + 2, pixel] = -flux * (2.0 * flat[0, pixel] + flat[3, pixel])
+        if step == 4:
+            for pixel in range(len(expected)):
+                jacobian[at + 3, pixel] = known.tie_spread * flux * flat[3, pixel]
+        if known.width_spread > 0.0:
+            for pixel in range(len(expected)):
+                jacobian[width, pixel] += known.width_spread * flux * flat[4, pixel]
+    for pixel in range(len(expected)):
+        lit_e = max(expected[pixel], 0.0)
+        variance[pixel] = lit_e + (known.prnu * lit_e) ** 2 + view.floor_e2
+
+
+@compiled
+def log_upper_tail(z: float) -> float:
+    """Return ln Q(z) of the normal distribution: to 10⁻¹² beyond z = 36, where Q itself is too small."""
+    if z < 0.0:
+        return math.log1p(-0.5 * math.erfc(-z * _SQRT_HALF))
+    if z < 36.0:
+        return math.log(0.5 * math.erfc(z * _SQRT_HALF))
+    z2 = z * z
+    return -0.5 * z2 - _LOG_SQRT_2_PI - math.log(z) + math.log1p(-(1.0 - 3.0 / z2) / z2)
+
+
+@compiled
+def _of_clipped(z: float) -> tuple[float, float, float]:
+    """Return φ/Q, the curvature of ln Q, and the share of its information that such a pixel keeps."""
+    z = min(max(z, -38.0), 1e4)
+    log_tail = log_upper_tail(z)
+    mills = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI - log_tail)
+    curvature = min(max(mills * (mills - z), 0.0), 1.0)
+    density = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI)
+    kept = 1.0 - math.exp(log_tail) - z * density + density * mills
+    return mills, curvature, min(max(kept, 0.0), 1.0)
+
+
+@compiled
+def _information(jacobian: Array, weight: Array, into: Array) -> None:
+    """Add J W Jᵀ."""
+    size, pixels = jacobian.shape
+    weighted = np.empty(pixels)
+    for one in range(size):
+        for pixel in range(pixels):
+            weighted[pixel] = jacobian[one, pixel] * weight[pixel]
+        for other in range(one + 1):
+            # Four sums side by side: the processor adds them at once, in an order that is always the same.
+            a, b, c, d = 0.0, 0.0, 0.0, 0.0
+            whole = pixels - pixels % 4
+            for pixel in range(0, whole, 4):
+                a += weighted[pixel] * jacobian[other, pixel]
+                b += weighted[pixel + 1] * jacobian[other, pixel + 1]
+                c += weighted[pixel + 2] * jacobian[other, pixel + 2]
+                d += weighted[pixel + 3] * jacobian[other, pixel + 3]
+            for pixel in range(whole, pixels):
+                a += weighted[pixel] * jacobian[other, pixel]
+            total = (a + b) + (c + d)
+            into[one, other] += total
+            if other != one:
+                into[other, one] += total
+
+
+@compiled
+def _slopes(
+    view: View, values: Array, expected: Array, jacobian: Array, variance: Array,
+    precision: Array, clip_e: float, of_average: bool, gradient: Array, information: Array,
+) -> None:  # fmt: skip
+    """Write the gradient of ln L and the information, priors included.
+
+    The information is what these very pixels give, or, `of_average`, what such pixels give on average.
+    """
+    image, state = view.image_e.ravel(), view.state.ravel()
+    pull, weight = np.zeros(len(expected)), np.zeros(len(expected))
+    for pixel in range(len(expected)):
+        if state[pixel] == UNUSABLE:
+            continue
+        weight[pixel] = 1.0 / variance[pixel]
+        if state[pixel] == SEEN and not of_average:
+            pull[pixel] = (image[pixel] - expected[pixel]) / variance[pixel]
+        elif math.isfinite(clip_e):
+            sigma = math.sqrt(variance[pixel])
+            mills, curvature, kept = _of_clipped((clip_e - expected[pixel]) / sigma)
+            pull[pixel] = mills / sigma
+            weight[pixel] *= kept if of_average else curvature
+    information[:] = precision
+    _information(jacobian, weight, information)
+    for one in range(len(values)):
+        total = 0.0
+        for pixel in range(len(expected)):
+            total += jacobian[one, pixel] * pull[pixel]
+        for other in range(len(values)):
+            total -= precision[one, other] * values[other]
+        gradient[one] = total
+
+
+@compiled
+def _objective(
+    view: View, values: Array, expected: Array, variance: Array, precision: Array, clip_e: float
+) -> tuple[float, float]:
+    """Return −2 ln L of an expectation with given variances, priors included, without Σ ln variance, and that."""
+    image, state = view.image_e.ravel(), view.state.ravel()
+    total, logs = 0.0, 0.0
+    for pixel in range(len(expected)):
+        if state[pixel] == SEEN:
+            total += (image[pixel] - expected[pixel]) ** 2 / variance[pixel]
+            logs += math.log(variance[pixel])
+        elif state[pixel] == CLIPPED:
+            z = (clip_e - expected[pixel]) / math.sqrt(variance[pixel])
+            total -= 2.0 * log_upper_tail(min(max(z, -38.0), 1e4))
+    for one in range(len(values)):
+        for other in range(len(values)):
+            total += values[one] * precision[one, other] * values[other]
+    return total, logs
+
+
+@compiled
+def inverted(matrix: Array, inverse: Array) -> float:
+    """Write the inverse of a symmetric matrix, by Cholesky's method at a unit diagonal.
+
+    Returns ln of its determinant; NaN where it is singular or not finite, and then writes nothing.
+    """
+    size = len(matrix)
+    scale, lower, log_det = np.empty(size), np.zeros((size, size)), 0.0
+    for one in range(size):
+        if not (0.0 < matrix[one, one] < math.inf):
+            return math.nan
+        scale[one] = 1.0 / math.sqrt(matrix[one, one])
+        log_det += math.log(matrix[one, one])
+    for one in range(size):
+        for other in range(one + 1):
+            total = matrix[one, other] * scale[one] * scale[other]
+            for k in range(other):
+                total -= lower[one, k] * lower[other, k]
+            if one != other:
+                lower[one, other] = total / lower[other, other]
+                continue
+            if not total > LEAST_PIVOT:
+                return math.nan
+            lower[one, one] = math.sqrt(total)
+            log_det += math.log(total)
+    # L⁻¹, in place, and its product with itself.
+    for one in range(size):
+        lower[one, one] = 1.0 / lower[one, one]
+        for other in range(one):
+            total = 0.0
+            for k in range(other, one):
+                total -= lower[one, k] * lower[k, other]
+            lower[one, other] = total * lower[one, one]
+    for one in range(size):
+        for other in range(one + 1):
+            total = 0.0
+            for k in range(one, size):
+                total += lower[k, one] * lower[k, other]
+            inverse[one, other] = inverse[other, one] = total * scale[one] * scale[other]
+    return log_det
+
+
+@compiled
+def _is_inside(values: Array, view: View, count: int, step: int) -> bool:
+    """Tell whether all sources are on the window's pixels, at ranges that can be."""
+    rows, columns = view.image_e.shape
+    for at in range(0, count * step, step):
+        column, row = values[at] - view.left, values[at + 1] - view.top
+        if not (-0.5 < column < columns - 0.5 and -0.5 < row < rows - 0.5):
+            return False
+        if not abs(values[at + 2]) < LOG_RANGE_BOUND:
+            return False
+    return bool(np.isfinite(values).all())
+
+
+@compiled
+def maximise(
+    view: View, sources: Sources, structure: Structure, known: Known, precision: Array, most_step: Array,
+    values: Array, covariance: Array, expected: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """Find the unknowns that make what a window shows likeliest, by Fisher scoring with Levenberg's damping.
+
+    Parameters
+    ----------
+    view, sources, structure, known
+        The window, and what is in it.
+    precision, most_step
+        Of the unknowns: a priori, shape (unknowns, unknowns), and how far they may move at once, shape
+        (unknowns,) (`layout.Layout`).
+    values
+        First values, shape (unknowns,); the estimates are written there.
+    covariance, expected
+        Shape (unknowns, unknowns) and (pixels,): the inverse of information and priors, and λ, are written.
+
+    Returns
+    -------
+    −2 ln L, priors included, but for a constant of the data, and ln of the determinant of information and
+    priors; both infinite where no step below a hundredth of a standard deviation was reached.
+    """
+    size, pixels, count = len(values), len(expected), len(sources.log_range_at)
+    step = 4 if known.tie_spread > 0.0 else 3
+    jacobian, new_jacobian = np.empty((size, pixels)), np.empty((size, pixels))
+    new_expected, variance, new_variance = np.empty(pixels), np.empty(pixels), np.empty(pixels)
+    gradient, trial, clip_e = np.empty(size), np.empty(size), known.clip_e
+    fisher, inverse, damped = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
+    damping, is_new, log_det = FIRST_DAMPING, True, 0.0
+    expectation(values, view, sources, structure, known, expected, jacobian, variance)
+    for _ in range(MOST_STEPS):
+        if is_new:
+            _slopes(view, values, expected, jacobian, variance, precision, clip_e, False, gradient, fisher)
+            log_det = inverted(fisher, inverse)
+            if math.isnan(log_det):
+                return math.inf, math.inf
+            settled = True
+            for one in range(count * step):
+                free_step = 0.0
+                for other in range(size):
+                    free_step += inverse[one, other] * gradient[other]
+                settled &= abs(free_step) <= SETTLED_SIGMAS * math.sqrt(inverse[one, one])
+            if settled:
+                break
+        for one in range(size):
+            damped[one] = fisher[one]
+            damped[one, one] *= 1.0 + damping
+        if math.isnan(inverted(damped, damped)):
+            return math.inf, math.inf
+        for one in range(size):
+            shift = 0.0
+            for other in range(size):
+                shift += damped[one, other] * gradient[other]
+            trial[one] = values[one] + min(max(shift, -most_step[one]), most_step[one])
+        is_new = False
+        if _is_inside(trial, view, count, step):
+            expectation(trial, view, sources, structure, known, new_expected, new_jacobian, new_variance)
+            before, _ = _objective(view, values, expected, variance, precision, clip_e)
+            after, _ = _objective(view, trial, new_expected, variance, precision, clip_e)
+            is_new = after <= before + 1e-9 * abs(before) + 1e-9
+        if is_new:
+            values[:], expected[:] = trial, new_expected
+            jacobian, new_jacobian = new_jacobian, jacobian
+            variance, new_variance = new_variance, variance
+            damping = max(0.1 * damping, LEAST_DAMPING)
+        else:
+            damping *= 10.0
+            if not damping < MOST_DAMPING:
+                return math.inf, math.inf
+    else:
+        return math.inf, math.inf
+    if (view.state == CLIPPED).any():
+        _slopes(view, values, expected, jacobian, variance, precision, clip_e, True, gradient, fisher)
+        log_det = inverted(fisher, inverse)
+        if math.isnan(log_det):
+            return math.inf, math.inf
+    covariance[:] = inverse
+    chi2, logs = _objective(view, values, expected, variance, precision, clip_e)
+    return chi2 + logs, log_det

@@ -1,0 +1,200 @@
+"""What lies beneath: a smooth background, and how much a frame scatters about it beside noise, in cells."""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.sensor import gain_dn_per_e, noise_floor_e2
+from perception.types import Calibration, RawFrame
+
+CELL_PX = 64
+CLIP_SIGMA = 3.0
+CLIP_ROUNDS = 3
+STEPS_PER_NOISE, MOST_NOISES = 128, 8
+
+LEAST_RATIO = 1.06
+"""Parts of a frame whose scatter exceeds noise by less count as even: so exactly it is measured."""
+
+LEAST_RATIO_AROUND = 1.04
+"""As much the mean over 5 × 5 parts must have: of nine even frames of 1280 × 960 one has it, in one part."""
+
+_SAMPLES_PER_AXIS = 24
+_SCATTER_SAMPLES_PER_AXIS = 16
+
+
+def background_mesh_e(frame: RawFrame, calibration: Calibration) -> NDArray[np.float32]:
+    """Background in electrons per pixel on a mesh of cells of about 64 px.
+
+    In each cell the mean of what lies within 3 σ of the median, σ from the noise model at that median; the
+    median of what is kept decides the next round. Then a median over 3 × 3 cells removes cells that a large
+    flare fills. A cell is sampled at 24 × 24 of its pixels: the error is σ/24, of which a detection notices
+    nothing.
+
+    Parameters
+    ----------
+    frame
+        A raw frame that matches its calibration.
+    calibration
+        Noise model.
+
+    Returns
+    -------
+    Mesh, float32, shape (cells down, cells across); cells divide the frame evenly.
+    """
+    import cv2
+
+    gain = gain_dn_per_e(frame, calibration)
+    rows, columns = (_sample_places(length, _SAMPLES_PER_AXIS) for length in frame.data_dn.shape)
+    mean_dn = cell_means(
+        frame.data_dn,
+        rows,
+        columns,
+        float(frame.black_level_dn),
+        gain,
+        noise_floor_e2(calibration, frame.gain),
+    )
+    mesh = ((mean_dn - frame.black_level_dn) / gain).astype(np.float32)
+    return np.asarray(cv2.medianBlur(mesh, 3), dtype=np.float32).reshape(mesh.shape)
+
+
+def spread_mesh(mesh: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
+    """Interpolate a mesh to every pixel of the frame, bilinearly between the cells' middles."""
+    return resized(mesh, calibration.width_px, calibration.height_px)
+
+
+def as_wide(mesh: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
+    """Interpolate a mesh along its rows alone: shape (cells down, columns of the frame)."""
+    return resized(mesh, calibration.width_px, len(mesh))
+
+
+def resized(mesh: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """Interpolate between the cells' middles."""
+    import cv2
+
+    full = cv2.resize(mesh, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(full, dtype=np.float32).reshape(height, width)
+
+
+@lru_cache(maxsize=64)
+def _sample_places(length: int, per_axis: int) -> NDArray[np.int64]:
+    """Divide an axis into cells: the pixels sampled, evenly in each, shape (cells, samples)."""
+    cells = max(1, round(length / CELL_PX))
+    per_cell = min(per_axis, math.floor(length / cells))
+    place = (np.arange(cells * per_cell) + 0.5) * (length / (cells * per_cell))
+    return place.astype(np.int64).reshape(cells, per_cell)
+
+
+def scatter_ratio(
+    image_e: NDArray[np.float32], noise_mesh_e: NDArray[np.float32], cells: Sequence[slice] | None = None
+) -> NDArray[np.float32]:
+    """Scatter of a filtered image in each cell relative to that of noise; 1 where it is no larger.
+
+    Of all cells, or of those alone that two slices mark, to which `noise_mesh_e` belongs.
+    """
+    import cv2
+
+    rows, columns = (_sample_places(length, _SCATTER_SAMPLES_PER_AXIS) for length in image_e.shape)
+    if cells is not None:
+        rows, columns = rows[cells[0]], columns[cells[1]]
+    ratio = cell_scatter(image_e, noise_mesh_e, rows, columns)
+    smooth = np.asarray(cv2.medianBlur(ratio, 3), dtype=np.float32).reshape(ratio.shape)
+    # A cell's ratio is known to 6 % only: those around must have some structure too.
+    around = np.asarray(cv2.blur(ratio, (5, 5)), dtype=np.float32).reshape(ratio.shape)
+    structured = (smooth > LEAST_RATIO) & (around > LEAST_RATIO_AROUND)
+    return np.where(structured, smooth, np.float32(1.0))
+
+
+@compiled
+def cell_means(
+    data_dn: NDArray[np.uint16], rows: NDArray[np.int64], columns: NDArray[np.int64],
+    black_dn: float, gain_dn_per_e: float, floor_e2: float,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Return the mean count of each cell within 3 σ of the median, σ from the noise model at that median.
+
+    By a histogram of counts: counts that many pixels share are looked at once. `rows` and `columns` say
+    which pixels of each cell are looked at, shape (cells, samples).
+    """
+    means = np.empty((len(rows), len(columns)))
+    count_of = np.zeros(1 << 16, dtype=np.int64)
+    for down in range(len(rows)):
+        for across in range(len(columns)):
+            lowest, highest = 1 << 16, 0
+            for row in rows[down]:
+                for column in columns[across]:
+                    count = int(data_dn[row, column])
+                    count_of[count] += 1
+                    lowest, highest = min(lowest, count), max(highest, count)
+            low, high = lowest, highest
+            kept = rows.shape[1] * columns.shape[1]
+            for clipping in range(CLIP_ROUNDS + 1):
+                # The lower median is itself a sample, so at least it is always kept.
+                median, before = low, int(count_of[low])
+                while before < (kept - 1) // 2 + 1:
+                    median += 1
+                    before += int(count_of[median])
+                if clipping == CLIP_ROUNDS:
+                    break
+                sigma = gain_dn_per_e * math.sqrt(max((median - black_dn) / gain_dn_per_e, 0.0) + floor_e2)
+                low = max(lowest, math.ceil(median - CLIP_SIGMA * sigma))
+                high = min(highest, math.floor(median + CLIP_SIGMA * sigma))
+                kept = 0
+                for count in range(low, high + 1):
+                    kept += int(count_of[count])
+            total = 0
+            for count in range(low, high + 1):
+                total += count * int(count_of[count])
+            means[down, across] = total / kept
+            for row in rows[down]:
+                for column in columns[across]:
+                    count_of[data_dn[row, column]] = 0
+    return means
+
+
+@compiled
+def cell_scatter(
+    image: NDArray[np.float32],
+    noise_mesh: NDArray[np.float32],
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+) -> NDArray[np.float32]:
+    """Return an image's scatter in each cell over its noise, blind to its outer thirds, where flares are.
+
+    By a histogram, to less than a hundredth of the noise; where it scatters too far for that, by sorting.
+    `rows` and `columns` are as for `cell_means`.
+    """
+    scatter = np.empty(noise_mesh.shape, dtype=np.float32)
+    number = rows.shape[1] * columns.shape[1]
+    low, high = round(0.1587 * (number - 1)), round(0.8413 * (number - 1))
+    last = 2 * STEPS_PER_NOISE * MOST_NOISES + 1
+    count_of = np.empty(last + 1, dtype=np.int32)
+    for down in range(len(rows)):
+        for across in range(len(columns)):
+            count_of[:] = 0
+            per_unit = np.float32(STEPS_PER_NOISE) / noise_mesh[down, across]
+            for row in rows[down]:
+                for column in columns[across]:
+                    place = image[row, column] * per_unit + np.float32(0.5 * last)
+                    count_of[int(min(max(place, np.float32(0.0)), np.float32(last)))] += 1
+            step, up_to = 0, count_of[0]
+            while up_to <= low:
+                step += 1
+                up_to += count_of[step]
+            first = step
+            while up_to <= high:
+                step += 1
+                up_to += count_of[step]
+            if first > 0 and step < last:
+                scatter[down, across] = 0.5 * (step - first) / STEPS_PER_NOISE
+                continue
+            samples, at = np.empty(number, dtype=np.float32), 0
+            for row in rows[down]:
+                for column in columns[across]:
+                    samples[at] = image[row, column]
+                    at += 1
+            samples.sort()
+            scatter[down, across] = 0.5 * (samples[high] - samples[low]) / noise_mesh[down, across]
+    return scatter

@@ -1,0 +1,227 @@
+"""From a mask to blobs: connected components, and where one of them holds several flares."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.flare import PixelBox
+
+_MAX_PEAKS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Blob:
+    """One flare's pixels: a box, and which pixels of it belong, shape (box.height, box.width)."""
+
+    box: PixelBox
+    pixels: NDArray[np.bool_]
+
+    @property
+    def area_px(self) -> int:
+        """Number of pixels."""
+        return int(self.pixels.sum())
+
+
+def components(mask: NDArray[np.bool_], min_area_px: int = 1) -> list[Blob]:
+    """Find connected components (8 neighbours) of at least a given area, by their first row."""
+    found = blobs_at(np.flatnonzero(mask), mask.shape[1])
+    return [blob for blob in found if blob.area_px >= min_area_px]
+
+
+def blobs_at(places: NDArray[np.int64], width: int) -> list[Blob]:
+    """Find connected components (8 neighbours) of pixels, given as their indices in a frame, in order.
+
+    Only what is marked is looked at: in most frames that is next to nothing.
+    """
+    labels, boxes = _labelled(places, width)
+    order = np.argsort(labels, kind="stable")
+    ends = np.cumsum(np.bincount(labels, minlength=len(boxes)))
+    rows, columns = np.divmod(places[order], width)
+    blobs, first = [], 0
+    for end, (top, left, bottom, right) in zip(ends.tolist(), boxes.tolist(), strict=True):
+        pixels = np.zeros((bottom - top, right - left), dtype=bool)
+        pixels[rows[first:end] - top, columns[first:end] - left] = True
+        blobs.append(Blob(PixelBox(top, left, *pixels.shape), pixels))
+        first = end
+    return blobs
+
+
+@compiled
+def _labelled(places: NDArray[np.int64], width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Give numbers to the connected components of pixels, from the first on.
+
+    Returns the number of each pixel, and each component's first and end row and column, as (top, left,
+    bottom, right), shape (components, 4).
+    """
+    leader = np.arange(len(places))
+    above = 0
+    for at in range(len(places)):
+        place = places[at]
+        column = place % width
+        if at > 0 and places[at - 1] == place - 1 and column > 0:
+            _join(leader, at - 1, at)
+        # Those of the row above that touch: from the one to the left to the one to the right.
+        while places[above] < place - width - 1:
+            above += 1
+        near = above
+        while near < at and places[near] <= place - width + 1:
+            if abs(places[near] % width - column) <= 1:
+                _join(leader, near, at)
+            near += 1
+    labels, count = np.empty(len(places), dtype=np.int64), 0
+    for at in range(len(places)):
+        first = _leader(leader, at)
+        if first == at:
+            labels[at] = count
+            count += 1
+        else:
+            labels[at] = labels[first]
+    boxes = np.empty((count, 4), dtype=np.int64)
+    boxes[:, :2], boxes[:, 2:] = np.iinfo(np.int64).max, 0
+    for at in range(len(places)):
+        row, column, box = places[at] // width, places[at] % width, boxes[labels[at]]
+        box[0], box[1] = min(box[0], row), min(box[1], column)
+        box[2], box[3] = max(box[2], row + 1), max(box[3], column + 1)
+    return labels, boxes
+
+
+@compiled
+def _leader(leader: NDArray[np.int64], at: int) -> int:
+    """Return the first pixel of the component that a pixel has been joined to."""
+    while leader[at] != at:
+        leader[at] = leader[leader[at]]
+        at = leader[at]
+    return at
+
+
+@compiled
+def _join(leader: NDArray[np.int64], one: int, other: int) -> None:
+    """Join the components of two pixels; the pixel that comes first leads."""
+    one, other = _leader(leader, one), _leader(leader, other)
+    leader[max(one, other)] = min(one, other)
+
+
+def split_at_peaks(
+    blob: Blob, brightness: NDArray[np.float32], noise: NDArray[np.float32], dip: float = 0.05
+) -> list[Blob]:
+    """Divide a blob among its distinct local maxima.
+
+    Two maxima are distinct if the lowest saddle between them lies below the fainter one by more than 5 σ of
+    noise and a fraction `dip` of its brightness: the plateau of a resolved or clipped disc has many maxima
+    but no such saddle. Each pixel goes to the nearest maximum.
+
+    Parameters
+    ----------
+    blob
+        A connected component.
+    brightness
+        The filtered image within the blob's box, shape (box.height, box.width).
+    noise
+        Standard deviation of `brightness`, same shape.
+    dip
+        Least relative depth of a saddle.
+
+    Returns
+    -------
+    The blob itself, or one blob for each maximum, brightest first.
+    """
+    peaks = _peaks(blob.pixels, brightness, noise, dip)
+    if len(peaks) == 1:
+        return [blob]
+    peaks = peaks[np.argsort(-brightness[peaks[:, 0], peaks[:, 1]], kind="stable")][:_MAX_PEAKS]
+    rows, columns = np.indices(blob.pixels.shape)
+    distance2 = (rows - peaks[:, :1, None]) ** 2 + (columns - peaks[:, 1:, None]) ** 2
+    nearest = distance2.argmin(axis=0)
+    return [_trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
+
+
+@compiled
+def _peaks(
+    mask: NDArray[np.bool_], brightness: NDArray[np.float32], noise: NDArray[np.float32], dip: float
+) -> NDArray[np.int64]:
+    """Return the distinct maxima of a blob, (row, column) each.
+
+    Pixels are looked at from the brightest down, as if water fell: where two hills meet, the lower one is
+    one of its own if it rises high enough above the saddle, and else a part of the higher one.
+    """
+    height, width = mask.shape
+    inside = np.flatnonzero(mask)
+    light, spread = brightness.ravel()[inside], noise.ravel()[inside]
+    order = np.argsort(-light, kind="mergesort")
+    number = np.full(height * width, -1, dtype=np.int64)  # of each pixel, from the brightest on
+    leader = np.arange(len(inside))
+    peaks = np.empty((len(inside), 2), dtype=np.int64)
+    count = 0
+    for rank in range(len(inside)):
+        place = inside[order[rank]]
+        row, column = place // width, place % width
+        number[place] = rank
+        for near_row in range(max(0, row - 1), min(height, row + 2)):
+            for near in range(max(0, column - 1), min(width, column + 2)):
+                beside = number[near_row * width + near]
+                if beside < 0:
+                    continue
+                one, other = _leader(leader, beside), _leader(leader, rank)
+                high, low = min(one, other), max(one, other)
+                if high == low:
+                    continue
+                top = light[order[low]]
+                depth = top - light[order[rank]]
+                if low != rank and depth > max(5.0 * spread[order[low]], dip * top):
+                    at = inside[order[low]]
+                    peaks[count, 0], peaks[count, 1] = at // width, at % width
+                    count += 1
+                leader[low] = high
+    first = inside[order[0]]
+    peaks[count, 0], peaks[count, 1] = first // width, first % width
+    return peaks[: count + 1]
+
+
+def near_groups(blobs: Sequence[Blob], within_px: int) -> list[list[int]]:
+    """Group blobs whose boxes come as near as that to each other, directly or by others between them.
+
+    Returns
+    -------
+    Indices of each group's blobs, groups and blobs in the order given.
+    """
+    if not blobs:
+        return []
+    edges = np.array(
+        [(b.box.top, b.box.left, b.box.top + b.box.height, b.box.left + b.box.width) for b in blobs]
+    )
+    low, high = edges[:, :2], edges[:, 2:]
+    gap_px = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(axis=-1)
+    leader = np.arange(len(blobs))
+    for first, second in np.argwhere(np.triu(gap_px <= within_px, 1)).tolist():
+        one, other = sorted((int(leader[first]), int(leader[second])))
+        leader[leader == other] = one
+    return [np.flatnonzero(leader == each).tolist() for each in np.unique(leader)]
+
+
+def divide(blobs: Sequence[Blob], u_px: NDArray[np.float64], v_px: NDArray[np.float64]) -> list[Blob]:
+    """Divide the pixels of blobs among places, each to the nearest; a place that gets none has its own."""
+    places = np.concatenate([np.argwhere(b.pixels) + np.array([b.box.top, b.box.left]) for b in blobs])
+    nearest = np.argmin((places[:, :1] - v_px) ** 2 + (places[:, 1:] - u_px) ** 2, axis=1)
+    divided = []
+    for index in range(len(u_px)):
+        mine = places[nearest == index]
+        if not len(mine):
+            mine = np.array([[round(float(v_px[index])), round(float(u_px[index]))]])
+        top, left = mine.min(axis=0).tolist()
+        height, width = (mine.max(axis=0) - (top, left) + 1).tolist()
+        pixels = np.zeros((height, width), dtype=bool)
+        pixels[mine[:, 0] - top, mine[:, 1] - left] = True
+        divided.append(Blob(PixelBox(top, left, height, width), pixels))
+    return divided
+
+
+def _trimmed(blob: Blob, pixels: NDArray[np.bool_]) -> Blob:
+    """Cut out the part of a blob that `pixels` marks, in a box of its own."""
+    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
+    top, left = int(rows[0]), int(columns[0])
+    height, width = int(rows[-1]) - top + 1, int(columns[-1]) - left + 1
+    box = PixelBox(blob.box.top + top, blob.box.left + left, height, width)
+    return Blob(box, pixels[top : top + height, left : left + width])

@@ -1,0 +1,271 @@
+"""From a raw frame to what the robust detector looks at: background, filtered image, bad and lit pixels."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.flare import PixelBox
+from perception.model.layout import Structure
+from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2, saturation_dn
+from perception.robust.search.background import (
+    as_wide,
+    background_mesh_e,
+    resized,
+    scatter_ratio,
+    spread_mesh,
+)
+from perception.robust.search.frame import Pixels, above, filtered, ground_at, neighbours, without
+from perception.robust.search.limit import limit_mesh_of, point_kernel
+from perception.robust.structure import autocorrelation, structure_of
+from perception.types import Calibration, RawFrame
+
+MOST_STRUCTURED_PX = 129
+"""Larger windows are fitted on an even background."""
+
+_BAD_SIGMAS = 5.0
+_SMOOTHING_REACH = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFrame:
+    """A frame with all that is found out about it as a whole.
+
+    Attributes
+    ----------
+    frame, calibration
+        Where it comes from.
+    pixels
+        Counts and background, for loops over pixels.
+    mesh_e
+        Smooth local background in cells.
+    filtered_e
+        Matched filter of what exceeds the background, the frame's shape.
+    filtered_noise
+        Noise of `filtered_e` relative to that of a pixel, √Σh².
+    lit_at
+        Pixels above the detection limit, as indices in the frame, in order.
+    floor_e2
+        Variance of a dark pixel.
+    texture_e
+        Standard deviation of the background's structure, on the mesh's rows as `pixels.ground_e`; 0 where the
+        background is even, None where it is so everywhere.
+    bad_at
+        Pixels that are stuck or hot, as indices; `filtered_e` has them as dark as the background.
+    """
+
+    frame: RawFrame
+    calibration: Calibration
+    pixels: Pixels
+    mesh_e: NDArray[np.float32]
+    filtered_e: NDArray[np.float32]
+    filtered_noise: float
+    lit_at: NDArray[np.int64]
+    floor_e2: float
+    texture_e: NDArray[np.float32] | None
+    bad_at: NDArray[np.int64]
+
+    @property
+    def clipped_dn(self) -> int:
+        """Count from which on a pixel is clipped."""
+        return saturation_dn(self.calibration, self.frame.gain)
+
+    @cached_property
+    def lit(self) -> NDArray[np.bool_]:
+        """Mask of the pixels above the detection limit."""
+        return _mask(self.lit_at, self.filtered_e.shape)
+
+    @cached_property
+    def bad(self) -> NDArray[np.bool_]:
+        """Mask of the pixels that are stuck or hot."""
+        return _mask(self.bad_at, self.filtered_e.shape)
+
+    @cached_property
+    def excess_e(self) -> NDArray[np.float32]:
+        """Electrons above the background; none where a pixel is bad."""
+        excess_e = electrons(self.frame, self.calibration) - spread_mesh(self.mesh_e, self.calibration)
+        excess_e.ravel()[self.bad_at] = 0.0
+        return excess_e
+
+    def background_e(self, u_px: float, v_px: float) -> float:
+        """Return the background at the pixel nearest to a place."""
+        return ground_at(self.pixels, *self._nearest(u_px, v_px))
+
+    def structure_at(self, u_px: float, v_px: float, side_px: int) -> tuple[Structure | None, float]:
+        """Return what may lie on the background of a window around a place, and its standard deviation."""
+        if self.texture_e is None:
+            return None, 0.0
+        sigma_e = ground_at(self.pixels._replace(ground_e=self.texture_e), *self._nearest(u_px, v_px))
+        if sigma_e == 0.0 or side_px > MOST_STRUCTURED_PX:
+            return None, sigma_e
+        return structure_of(self._autocorrelation, side_px, sigma_e), sigma_e
+
+    @cached_property
+    def _autocorrelation(self) -> tuple[float, ...]:
+        assert self.texture_e is not None
+        noise_e = np.sqrt(np.maximum(self.mesh_e, 0.0) + np.float32(self.floor_e2))
+        size = (self.calibration.width_px, self.calibration.height_px)
+        return autocorrelation(
+            self.excess_e, resized(self.texture_e, *size), spread_mesh(noise_e, self.calibration)
+        )
+
+    def _nearest(self, u_px: float, v_px: float) -> tuple[int, int]:
+        rows, columns = self.filtered_e.shape
+        return min(max(round(v_px), 0), rows - 1), min(max(round(u_px), 0), columns - 1)
+
+    def lit_in(self, box: PixelBox) -> NDArray[np.bool_]:
+        """Return `lit` in a box that may reach beyond the frame."""
+        rows, columns = self.lit.shape
+        inside = np.zeros((box.height, box.width), dtype=bool)
+        top, left = max(0, -box.top), max(0, -box.left)
+        part = self.lit[
+            max(box.top, 0) : min(box.top + box.height, rows),
+            max(box.left, 0) : min(box.left + box.width, columns),
+        ]
+        inside[top : top + part.shape[0], left : left + part.shape[1]] = part
+        return inside
+
+
+def _mask(places: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    mask = np.zeros(shape, dtype=bool)
+    mask.ravel()[places] = True
+    return mask
+
+
+def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
+    """Filter a frame and mark what is no noise.
+
+    Parameters
+    ----------
+    frame
+        A raw frame that matches its calibration.
+    calibration
+        Its camera's calibration.
+
+    Returns
+    -------
+    PreparedFrame
+    """
+    floor_e2 = noise_floor_e2(calibration, frame.gain)
+    kernel = point_kernel(calibration.psf_sigma_px)
+    narrow = kernel.astype(np.float32)
+    filtered_noise = float(np.sum(kernel**2))
+    mesh_e = background_mesh_e(frame, calibration)
+    pixels = Pixels(
+        np.ascontiguousarray(frame.data_dn),
+        float(frame.black_level_dn),
+        1.0 / gain_dn_per_e(frame, calibration),
+        as_wide(mesh_e, calibration),
+    )
+    filtered_e = filtered(pixels, narrow)
+    noise_mesh_e = filtered_noise * np.sqrt(np.maximum(mesh_e, 0.0) + floor_e2).astype(np.float32)
+    limit_mesh_e = limit_mesh_of(mesh_e, floor_e2, kernel)
+    ratio = scatter_ratio(filtered_e, noise_mesh_e)
+    limit_e = as_wide(limit_mesh_e * ratio, calibration)
+    lit_at = above(filtered_e, limit_e)
+    bad_at = bad_pixels(pixels, lit_at, floor_e2, kernel, along_rows=frame.line_time_s > 0.0)
+    if len(bad_at):
+        without(filtered_e, pixels, narrow, bad_at)
+        lit_at = above(filtered_e, limit_e)
+    prepared = PreparedFrame(
+        frame=frame,
+        calibration=calibration,
+        pixels=pixels,
+        mesh_e=mesh_e,
+        filtered_e=filtered_e,
+        filtered_noise=filtered_noise,
+        lit_at=lit_at,
+        floor_e2=floor_e2,
+        texture_e=None,
+        bad_at=bad_at,
+    )
+    if not (ratio > 1.0).any():
+        return prepared
+    standing_out = _local_contrast(filtered_e, limit_mesh_e, noise_mesh_e, ratio, kernel, calibration)
+    sigma_mesh_e = noise_mesh_e * np.sqrt(ratio**2 - np.float32(1.0))
+    return replace(
+        prepared, lit_at=np.union1d(lit_at, standing_out), texture_e=as_wide(sigma_mesh_e, calibration)
+    )
+
+
+def bad_pixels(
+    pixels: Pixels,
+    places: NDArray[np.int64],
+    floor_e2: float,
+    kernel: NDArray[np.float64],
+    *,
+    along_rows: bool = False,
+) -> NDArray[np.int64]:
+    """Find pixels that are stuck or hot: far brighter, beside their neighbours, than light could make them.
+
+    Around a point in the middle of a pixel its eight neighbours hold `least` times its light together, around
+    any other image more. A pixel whose neighbours hold less than half of that, and by 5 σ, is none of light,
+    whether it stands alone or beside another.
+
+    Parameters
+    ----------
+    pixels
+        The frame.
+    places
+        Where to look, as indices in the frame.
+    floor_e2
+        Variance of a dark pixel.
+    kernel
+        Image of a point along one axis, of odd length.
+    along_rows
+        Look at the neighbours in the same row alone: behind a rolling shutter the rows of a flare may be lit
+        at different times.
+
+    Returns
+    -------
+    Those that are.
+    """
+    middle = len(kernel) // 2
+    in_line = float(kernel[middle - 1 : middle + 2].sum() / kernel[middle])
+    least = in_line - 1.0 if along_rows else in_line**2 - 1.0
+    own, around, variance = neighbours(pixels, places, floor_e2, along_rows)
+    is_bad = around + _BAD_SIGMAS * np.sqrt(variance) < 0.5 * least * own
+    return np.asarray(places[is_bad], dtype=np.int64)
+
+
+def _local_contrast(
+    filtered_e: NDArray[np.float32],
+    limit_mesh_e: NDArray[np.float32],
+    noise_mesh_e: NDArray[np.float32],
+    ratio: NDArray[np.float32],
+    kernel: NDArray[np.float64],
+    calibration: Calibration,
+) -> NDArray[np.int64]:
+    """Find what stands out of its close surroundings where the background has structure.
+
+    A point on a hill that is wider than the point spread does so though the hill is as bright as the point.
+    """
+    import cv2
+
+    side = 2 * len(kernel) - 1
+    widened = cv2.dilate((ratio > 1.0).astype(np.uint8), np.ones((3, 3), np.uint8))
+    structured = np.asarray(widened).reshape(ratio.shape) > 0
+    # Only where it matters, and as far around as the scatter's smoothing reaches.
+    cells = [
+        slice(max(0, int(at.min()) - _SMOOTHING_REACH), int(at.max()) + _SMOOTHING_REACH + 1)
+        for at in np.nonzero(structured)
+    ]
+    near = tuple(
+        slice(
+            max(0, part.start * length // count - side), min(length, part.stop * length // count + 1 + side)
+        )
+        for part, length, count in zip(cells, filtered_e.shape, ratio.shape, strict=True)
+    )
+    contrast_e = np.zeros(filtered_e.shape, dtype=np.float32)
+    contrast_e[near] = filtered_e[near] - cv2.blur(filtered_e[near], (side, side))
+    padded = np.pad(kernel, side // 2)
+    mean = np.convolve(kernel, np.full(side, 1.0 / side))
+    of_noise = math.sqrt(float(np.sum((np.outer(padded, padded) - np.outer(mean, mean)) ** 2)))
+    share = np.float32(of_noise / float(np.sum(kernel**2)))
+    more = np.ones_like(ratio)
+    more[tuple(cells)] = scatter_ratio(contrast_e, noise_mesh_e[tuple(cells)] * share, cells)
+    # Cells of even ground have no limit here.
+    limit_e = np.where(structured, limit_mesh_e * share * more, np.float32(1e9))
+    return above(contrast_e, as_wide(limit_e, calibration))
