@@ -31,6 +31,7 @@ from perception.estimators import (
     EstimatorError,
     OwnEstimator,
     detect,
+    detect_frames,
     load_estimator,
 )
 from perception.files.calibration import calibration_document, parse_calibration_document
@@ -68,6 +69,7 @@ __all__ = [
     "calibrate_rail",
     "calibration_document",
     "detect",
+    "detect_frames",
     "detection_record",
     "encode_png16",
     "encode_ranges",

@@ -8,10 +8,12 @@ import dataclasses
 import importlib.util
 import math
 import operator
+import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,6 +82,46 @@ def detect(
             )
         estimator = ESTIMATORS[estimator]
     return list(estimator(frame, calibration))
+
+
+def detect_frames(
+    frames: Sequence[RawFrame],
+    calibrations: Mapping[str, Calibration],
+    estimator: str | Estimator = "robust",
+) -> list[list[Detection]]:
+    """Find the flares of several frames, such as those of a robot's cameras, side by side on all cores.
+
+    Parameters
+    ----------
+    frames
+        Raw frames, of one camera or of several.
+    calibrations
+        Of each camera, by its name.
+    estimator
+        As for `detect`.
+
+    Returns
+    -------
+    What `detect` finds in each frame, in the order of the frames.
+
+    Raises
+    ------
+    ValueError
+        As for `detect`, or if a frame's camera has no calibration.
+    """
+    unknown = sorted({frame.camera for frame in frames} - set(calibrations))
+    if unknown:
+        raise ValueError(
+            f"no calibration for {', '.join(unknown)}; there are some for {', '.join(calibrations) or 'none'}"
+        )
+
+    def found(frame: RawFrame) -> list[Detection]:
+        return detect(frame, calibrations[frame.camera], estimator)
+
+    if len(frames) < 2:
+        return [found(frame) for frame in frames]
+    with ThreadPoolExecutor(min(len(frames), os.cpu_count() or 1)) as threads:
+        return list(threads.map(found, frames))
 
 
 class EstimatorError(ValueError):

@@ -71,7 +71,8 @@ def disc_nodes(
         calibration.response_relative,
     )
     # What lies beyond the lens's fold has no image: its light counts, and falls on no pixel.
-    at_px = np.nan_to_num(project(omega, calibration), nan=np.inf)
+    at_px = project(omega, calibration)
+    at_px[np.isnan(at_px)] = np.inf
     of = np.repeat(np.arange(len(rules)), np.diff(first))
     return DiscNodes(first, at_px[:, 0] - u_px[of], at_px[:, 1] - v_px[of], weight)
 
@@ -82,7 +83,7 @@ def _over_caps(
     response_angle_rad: Array, response_relative: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return the directions of nodes, shape (nodes, 3), and their share of each cap's light."""
-    omega, weight = np.empty((rules.shape[1], 3)), np.empty(rules.shape[1])
+    omega, weight, at = np.empty((rules.shape[1], 3)), np.empty(rules.shape[1]), 0
     for cap in range(len(direction)):
         x, y, z = direction[cap]
         # Two unit vectors that complete the direction, which is not along x, to an orthonormal frame.
@@ -100,7 +101,16 @@ def _over_caps(
             one[1] = (1.0 - h) * y + to_across * across_y + to_down * down_y
             one[2] = (1.0 - h) * z + to_across * across_z + to_down * down_z
             theta = math.atan2(math.hypot(one[0], one[1]), one[2])
-            response = np.interp(theta, response_angle_rad, response_relative)
+            # Of a table that is held beyond its ends; the next node lies in the same part of it, or beside.
+            while at + 2 < len(response_angle_rad) and theta > response_angle_rad[at + 1]:
+                at += 1
+            while at > 0 and theta < response_angle_rad[at]:
+                at -= 1
+            response = response_relative[at]
+            if len(response_angle_rad) > 1:
+                step = response_angle_rad[at + 1] - response_angle_rad[at]
+                share = min(max((theta - response_angle_rad[at]) / step, 0.0), 1.0)
+                response += share * (response_relative[at + 1] - response_relative[at])
             weight[node] = rules[3, node] * one[2] * response  # cos θ · response(θ) · dΩ
             total += weight[node]
         weight[first[cap] : first[cap + 1]] /= total

@@ -243,7 +243,7 @@ def _slopes(
 def _objective(
     view: View, values: Array, expected: Array, variance: Array, precision: Array, clip_e: float
 ) -> tuple[float, float]:
-    """Return −2 ln L of an expectation with given variances, priors included, without Σ ln variance, and that."""
+    """Return −2 ln L of an expectation with given variances, priors included, without Σ ln variance; that."""
     image, state = view.image_e.ravel(), view.state.ravel()
     total, logs = 0.0, 0.0
     for pixel in range(len(expected)):

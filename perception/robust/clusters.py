@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.flare import PixelBox, image_radius_px
-from perception.model.ranging import angular_radius_rad, flux_at_one_metre_e
+from perception.model.bearing import direction_camera
+from perception.model.flare import PixelBox
+from perception.model.lens import stretch
+from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
 from perception.model.sensor import clip_level_e
 from perception.robust.search.blobs import Blob, near_groups
 from perception.robust.search.frame import cut, light_of
@@ -97,18 +99,19 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
     frame, calibration = prepared.frame, prepared.calibration
     light = [
         light_of(
-            prepared.pixels, prepared.filtered_e, prepared.bad, blob.pixels,
+            prepared.pixels, prepared.filtered_e, prepared.bad_at, blob.pixels,
             (blob.box.top, blob.box.left), prepared.clipped_dn,
         )
         for blob in blobs
     ]  # fmt: skip
     u_px, v_px, flux_e = np.array([each[:3] for each in light]).T
-    at_one_metre_e = flux_at_one_metre_e(u_px, v_px, frame.exposure_s, frame.gain, calibration)
+    direction = direction_camera(np.column_stack([u_px, v_px]), calibration)
+    exposed_s = exposure_towards(direction, frame.exposure_s, frame.gain, calibration)
+    at_one_metre_e = flux_e_of(exposed_s, frame.gain, calibration)
     ranged = (at_one_metre_e > 0.0) & (flux_e > 0.0)
     range_m = np.sqrt(np.where(ranged, at_one_metre_e / np.where(flux_e > 0.0, flux_e, 1.0), 1.0))
-    radius_px = image_radius_px(
-        u_px, v_px, angular_radius_rad(range_m, calibration.source_radius_m), calibration
-    )
+    angle_rad = angular_radius_rad(range_m, calibration.source_radius_m)
+    radius_px = stretch(direction, calibration) * np.tan(angle_rad)
     rows = zip(blobs, light, at_one_metre_e.tolist(), np.where(ranged, radius_px, 0.0).tolist(), strict=True)
     return [
         Candidate(blob, clipped_px, u, v, flux, half_area_px, at_one_metre, radius)
@@ -177,10 +180,9 @@ def clusters(members: Sequence[Candidate], prepared: PreparedFrame, apart: bool 
             nearest = np.argsort(apart_px, kind="stable")[: 1 + _CROWD_NEIGHBOURS]
             within = [int(k) for k in nearest if apart_px[k] < 0.5 * box.height]
             chosen.append(([group[k] for k in within], [within.index(at)]))
-    owner = np.zeros(prepared.filtered_e.shape, dtype=np.int32)
-    owner.ravel()[prepared.lit_at] = -1
+    owner = np.full(len(prepared.lit_at), -1)
     for index, blob in enumerate(blobs):
-        owner[blob.box.slices][blob.pixels] = index + 1
+        owner[np.searchsorted(prepared.lit_at, blob.places(prepared.calibration.width_px))] = index
     return [_cluster([members[k] for k in group], group, wanted, owner, prepared) for group, wanted in chosen]
 
 
@@ -188,7 +190,7 @@ def _cluster(
     members: Sequence[Candidate],
     indices: Sequence[int],
     wanted: Sequence[int],
-    owner: NDArray[np.int32],
+    owner: NDArray[np.int64],
     prepared: PreparedFrame,
 ) -> Cluster:
     frame, calibration = prepared.frame, prepared.calibration
@@ -196,8 +198,8 @@ def _cluster(
     about = members if len(wanted) == len(members) else [members[k] for k in wanted]
     box = _window_box(about, prepared)
     image_e, state = cut(
-        prepared.pixels, owner, prepared.bad, (box.top, box.left, box.height, box.width),
-        np.array(indices) + 1, prepared.clipped_dn, _TOUCHING_PX, _KEPT_PX,
+        prepared.pixels, prepared.lit_at, owner, prepared.bad_at, (box.top, box.left, box.height, box.width),
+        np.array(indices), prepared.clipped_dn, _TOUCHING_PX, _KEPT_PX,
     )  # fmt: skip
     u_px, v_px = members[0].u_px, members[0].v_px
     structure, sigma_e = prepared.structure_at(u_px, v_px, box.height)

@@ -66,7 +66,14 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
     measured = measure(clusters(brightest(flares, MOST_FLARES), prepared), prepared)
     measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
-    return [_detection(blob, found, frame, calibration) for blob, found in measured if found.stands_out]
+    reported = [(blob, found) for blob, found in measured if found.stands_out]
+    if not reported:
+        return []
+    bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
+    return [
+        _detection(blob, found, (x, y, z), frame, calibration)
+        for (blob, found), (x, y, z) in zip(reported, bearings, strict=True)
+    ]
 
 
 def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
@@ -110,9 +117,14 @@ def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
     return split_at_peaks(component, brightness_e, noise_e)
 
 
-def _detection(blob: Blob, measured: Measurement, frame: RawFrame, calibration: Calibration) -> Detection:
+def _detection(
+    blob: Blob,
+    measured: Measurement,
+    bearing: tuple[float, float, float],
+    frame: RawFrame,
+    calibration: Calibration,
+) -> Detection:
     gain = gain_dn_per_e(frame, calibration)
-    x, y, z = bearing_body([[measured.u_px, measured.v_px]], calibration)[0].tolist()
     return Detection(
         camera=frame.camera,
         index=frame.index,
@@ -130,5 +142,5 @@ def _detection(blob: Blob, measured: Measurement, frame: RawFrame, calibration: 
         ghost=False,
         range_m=measured.range_m,
         range_sigma_m=measured.range_sigma_m,
-        bearing_body=(x, y, z),
+        bearing_body=bearing,
     )

@@ -209,24 +209,26 @@ def _matched_peak(weighted: Array, weight: Array, smooth_px: float) -> tuple[flo
 
 @compiled
 def halo_sigmas(
-    residual_e: Array, state: NDArray[np.uint8], variance_e2: Array, place: tuple[float, float],
-    widths_px: tuple[float, ...],
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, floor_e2: float, prnu: float,
+    place: tuple[float, float], widths_px: tuple[float, ...],
 ) -> float:  # fmt: skip
     """Return by how many standard deviations, at least, light around a flare shows in what its fit leaves.
 
     Light that falls off as (1 + ρ²/w²)^(-3/2) from the flare's column and row in the window, `place`, for
-    each width w.
+    each width w. The rest is as for `left_over`.
     """
     most = -math.inf
     for width in widths_px:
         score, power = 0.0, 0.0
-        for row in range(len(residual_e)):
-            for column in range(residual_e.shape[1]):
+        for row in range(len(image_e)):
+            for column in range(image_e.shape[1]):
                 if state[row, column] != SEEN:
                     continue
+                lit = max(expected_e[row, column], 0.0)
+                variance = lit + (prnu * lit) ** 2 + floor_e2
                 spread = 1.0 + ((column - place[0]) ** 2 + (row - place[1]) ** 2) / width**2
                 profile = 1.0 / (spread * math.sqrt(spread))
-                score += profile * residual_e[row, column] / variance_e2[row, column]
-                power += profile**2 / variance_e2[row, column]
+                score += profile * (image_e[row, column] - expected_e[row, column]) / variance
+                power += profile**2 / variance
         most = max(most, score / math.sqrt(power + 1e-300))
     return most

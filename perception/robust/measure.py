@@ -177,12 +177,9 @@ def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
         radius_px, flux_e = float(solution.image_radius_px[0]), float(solution.flux_e[0])
         window = solution.window
         seems = halo_sigmas(
-            solution.residual_e,
-            window.state,
-            solution.variance_e2(0.0),
-            (u_px - window.box.left, v_px - window.box.top),
-            halo_widths_px(radius_px),
-        )
+            window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
+            (u_px - window.box.left, v_px - window.box.top), halo_widths_px(radius_px),
+        )  # fmt: skip
         if seems < HALO_SEEMS_SIGMAS:
             continue
         halo = halo_of(window.box, u_px, v_px, radius_px, flux_e)
@@ -279,8 +276,10 @@ def _measurement(
     if solution.ranged[index]:
         range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * (flux_sigma_e / flux_e) ** 2)
     frame = prepared.frame
-    light = blob.pixels & ~prepared.bad[blob.box.slices]
-    saturated = bool((frame.data_dn[blob.box.slices][light] >= prepared.clipped_dn).any())
+    clips = blob.pixels & (frame.data_dn[blob.box.slices] >= prepared.clipped_dn)
+    if clips.any() and len(prepared.bad_at):
+        clips &= ~prepared.bad[blob.box.slices]
+    saturated = bool(clips.any())
     bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
     unknown = math.nan
     return Measurement(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.layout import CLIPPED, UNUSABLE, Layout, Sources, Structure, View, even
+from perception.model.layout import CLIPPED, UNUSABLE, Sources, Structure, View, even
 from perception.model.pixels import maximise
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
@@ -189,53 +189,32 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     -------
     A solution for each, None where the fit did not converge.
     """
-    solutions: list[Solution | None] = [None] * len(problems)
-    fits = [_Fit.begun(problem, camera) for problem in problems]
-    going = list(range(len(problems)))
+    fits = [_Fit(problem, camera) for problem in problems]
+    going = fits
     for _ in range(_MOST_LAYOUTS):
         if not going:
             break
-        own = np.concatenate([fits[index].places for index in going])
-        laid, imaged = lay_out(camera, *np.ascontiguousarray(own.T))
-        reach_px, end, moved = laid.reach_px, 0, []
-        for index in going:
-            fit, first = fits[index], end
-            end = first + fit.layout.sources
-            solutions[index] = None
-            if imaged[first:end].all() and fit.climb(laid.part(first, end)):
-                solutions[index] = fit.solution(reach_px[first:end])
-                if fit.has_moved(reach_px[first:end]):
-                    moved.append(index)
-        going = moved
-    return solutions
+        going = _climbed(going, camera)
+    solutions = iter(_solutions([fit for fit in fits if fit.converged], camera))
+    return [next(solutions) if fit.converged else None for fit in fits]
 
 
 class _Fit:
-    """The fit of one window, on its way."""
+    """The fit of one window, on its way from first guesses."""
 
-    def __init__(self, problem: Problem, camera: Camera, layout: Layout, values: Array) -> None:
+    def __init__(self, problem: Problem, camera: Camera) -> None:
         window = problem.window
-        self.window, self.camera, self.layout, self.values = window, camera, layout, values
-        self.known = camera.known(window.clip_e)
+        self.window, self.known = window, camera.known(window.clip_e)
         self.structure = even(window.image_e.size) if window.structure is None else window.structure
-        self.view = View(window.box.top, window.box.left, window.image_e, window.state, window.floor_e2)
-        self.prior = layout.prior(self.structure)
-        self.covariance = np.empty((layout.size, layout.size))
-        self.expected_e = np.empty(window.image_e.size)
+        self.layout = self.known.layout(len(problem.starts), len(self.structure.columns))
+        self.values = np.zeros(self.layout.size)
+        self.own[:, :3] = problem.starts
+        self.values[self.layout.background] = problem.background_e
+        self.covariance = np.empty((self.layout.size, self.layout.size))
+        self.expected_e = np.empty(window.image_e.shape)
         self.deviance = self.log_information = math.inf
+        self.converged = False
         self.sources: Sources | None = None
-
-    @classmethod
-    def begun(cls, problem: Problem, camera: Camera) -> "_Fit":
-        """Return the fit at its first guesses."""
-        structure = problem.window.structure
-        waves = 0 if structure is None else len(structure.columns)
-        layout = camera.known(problem.window.clip_e).layout(len(problem.starts), waves)
-        values = np.zeros(layout.size)
-        own = values[: layout.width].reshape(layout.sources, layout.per_source)
-        own[:, :3] = problem.starts
-        values[layout.background] = problem.background_e
-        return cls(problem, camera, layout, values)
 
     @property
     def own(self) -> Array:
@@ -243,68 +222,96 @@ class _Fit:
         return self.values[: self.layout.width].reshape(self.layout.sources, self.layout.per_source)
 
     @property
-    def log_range_by_size(self) -> Array:
-        """Logarithm of the range that each source's size stands for."""
-        if not self.layout.has_slack:
-            return self.own[:, 2]
-        return np.asarray(self.own[:, 2] - self.known.tie_spread * self.own[:, 3])
+    def of_sources(self) -> Array:
+        """Their covariances, shape (sources, unknowns of each, unknowns of each)."""
+        step = self.layout.per_source
+        return np.array(
+            [self.covariance[at : at + step, at : at + step] for at in range(0, self.layout.width, step)]
+        )
 
-    @property
-    def places(self) -> Array:
-        """Where images are to be laid out: u, v and ln range by size, shape (sources, 3)."""
-        return np.column_stack([self.own[:, :2], self.log_range_by_size])
-
-    def climb(self, sources: Sources) -> bool:
-        """Go on to the greatest likelihood with images as laid out, and tell whether it was reached."""
+    def climb(self, sources: Sources) -> None:
+        """Go on to the greatest likelihood, with images as laid out."""
+        box, layout = self.window.box, self.layout
+        view = View(box.top, box.left, self.window.image_e, self.window.state, self.window.floor_e2)
         self.sources = sources
         self.deviance, self.log_information = maximise(
-            self.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
-            self.values, self.covariance, self.expected_e,
+            view, sources, self.structure, self.known, layout.prior(self.structure), layout.most_step,
+            self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
-        return math.isfinite(self.deviance)
+        self.converged = math.isfinite(self.deviance)
 
-    def has_moved(self, reach_px: Array) -> bool:
-        """Tell whether a size has changed so much that images should be laid out anew."""
-        assert self.sources is not None
-        change = self.sources.log_range_at - self.log_range_by_size
-        stale = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
-        return bool(stale.any())
 
-    def solution(self, reach_px: Array) -> Solution:
-        """Return what has been found."""
-        assert self.sources is not None
-        layout, window, own = self.layout, self.window, self.own
-        step, shape = layout.per_source, window.image_e.shape
-        sigmas = np.sqrt(np.diagonal(self.covariance)[: layout.width]).reshape(own.shape)
-        # Of (l, a), or of l alone.
-        at = np.arange(2, layout.width, step)[:, None] + np.arange(step - 2)
-        tied = self.covariance[at[:, :, None], at[:, None, :]]
-        slack = own[:, 3] if layout.has_slack else None
-        log_range, log_range_sigma = self.camera.log_range(own[:, 2], slack, tied)
-        flux_e = np.exp(self.sources.log_flux_at_1_m - 2.0 * own[:, 2])
-        background_e = float(self.values[layout.background])
-        flares_e = self.expected_e - background_e
-        log_information = self.log_information
-        if layout.structure:
-            flares_e -= self.values[-layout.structure :] @ self.structure.columns
-            log_information -= self.structure.log_determinant
-        return Solution(
-            window=window,
-            u_px=own[:, 0].copy(),
-            v_px=own[:, 1].copy(),
-            flux_e=flux_e,
-            log_photometric_range=own[:, 2].copy(),
-            u_sigma_px=sigmas[:, 0],
-            v_sigma_px=sigmas[:, 1],
-            flux_sigma_e=2.0 * sigmas[:, 2] * flux_e,
-            log_range=np.array(log_range),
-            log_range_sigma=log_range_sigma,
-            ranged=self.sources.log_flux_at_1_m != 0.0,
-            image_radius_px=reach_px * np.exp(self.sources.log_range_at - self.log_range_by_size),
-            background_e=background_e,
-            expected_e=self.expected_e.reshape(shape).copy(),
-            flares_e=flares_e.reshape(shape),
-            deviance=self.deviance,
-            psf_sigma_px=self.known.psf_sigma_px,
-            log_information=log_information,
+def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
+    """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
+    own = np.concatenate([fit.own for fit in fits])
+    laid, imaged = lay_out(camera, *np.ascontiguousarray(own[:, :2].T), _log_range_by_size(own, fits[0]))
+    ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
+    for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
+        fit.converged = False
+        if imaged[first:end].all():
+            fit.climb(laid.part(first, end))
+    change = laid.log_range_at - _log_range_by_size(np.concatenate([fit.own for fit in fits]), fits[0])
+    moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * laid.reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
+    if not moved.any():
+        return []
+    return [
+        fit
+        for fit, first, end in zip(fits, [0, *ends], ends, strict=False)
+        if fit.converged and moved[first:end].any()
+    ]
+
+
+def _log_range_by_size(own: Array, fit: _Fit) -> Array:
+    """Return the logarithm of the range that each source's size stands for."""
+    return np.asarray(own[:, 2] - fit.known.tie_spread * own[:, 3]) if fit.layout.has_slack else own[:, 2]
+
+
+def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
+    """Return what has been found, reckoned for all sources at once."""
+    if not fits:
+        return []
+    own, covariance = (
+        np.concatenate([fit.own for fit in fits]),
+        np.concatenate([fit.of_sources for fit in fits]),
+    )
+    laid = [fit.sources for fit in fits if fit.sources is not None]
+    log_flux_at_1_m = np.concatenate([each.log_flux_at_1_m for each in laid])
+    growth = np.exp(np.concatenate([each.log_range_at for each in laid]) - _log_range_by_size(own, fits[0]))
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    slack = own[:, 3] if fits[0].layout.has_slack else None
+    log_range, log_range_sigma = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
+    flux_e = np.exp(log_flux_at_1_m - 2.0 * own[:, 2])
+    flux_sigma_e, ranged = 2.0 * sigma[:, 2] * flux_e, log_flux_at_1_m != 0.0
+    radius_px = np.concatenate([each.reach_px for each in laid]) * growth
+    solutions, first = [], 0
+    for fit in fits:
+        these = slice(first, first + fit.layout.sources)
+        first = these.stop
+        background_e = float(fit.values[fit.layout.background])
+        flares_e, log_information = fit.expected_e - background_e, fit.log_information
+        if waves := fit.layout.structure:
+            flares_e -= (fit.values[-waves:] @ fit.structure.columns).reshape(flares_e.shape)
+            log_information -= fit.structure.log_determinant
+        solutions.append(
+            Solution(
+                window=fit.window,
+                u_px=own[these, 0],
+                v_px=own[these, 1],
+                flux_e=flux_e[these],
+                log_photometric_range=own[these, 2],
+                u_sigma_px=sigma[these, 0],
+                v_sigma_px=sigma[these, 1],
+                flux_sigma_e=flux_sigma_e[these],
+                log_range=log_range[these],
+                log_range_sigma=log_range_sigma[these],
+                ranged=ranged[these],
+                image_radius_px=radius_px[these],
+                background_e=background_e,
+                expected_e=fit.expected_e,
+                flares_e=flares_e,
+                deviance=fit.deviance,
+                psf_sigma_px=fit.known.psf_sigma_px,
+                log_information=log_information,
+            )
         )
+    return solutions

@@ -22,7 +22,12 @@ class Blob:
     @property
     def area_px(self) -> int:
         """Number of pixels."""
-        return int(self.pixels.sum())
+        return int(np.count_nonzero(self.pixels))
+
+    def places(self, width: int) -> NDArray[np.int64]:
+        """Return its pixels as indices in a frame of so many columns, in order."""
+        rows, columns = np.nonzero(self.pixels)
+        return np.asarray((self.box.top + rows) * width + self.box.left + columns)
 
 
 def components(mask: NDArray[np.bool_], min_area_px: int = 1) -> list[Blob]:
@@ -189,16 +194,27 @@ def near_groups(blobs: Sequence[Blob], within_px: int) -> list[list[int]]:
     """
     if not blobs:
         return []
-    edges = np.array(
-        [(b.box.top, b.box.left, b.box.top + b.box.height, b.box.left + b.box.width) for b in blobs]
-    )
-    low, high = edges[:, :2], edges[:, 2:]
-    gap_px = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(axis=-1)
-    leader = np.arange(len(blobs))
-    for first, second in np.argwhere(np.triu(gap_px <= within_px, 1)).tolist():
-        one, other = sorted((int(leader[first]), int(leader[second])))
-        leader[leader == other] = one
-    return [np.flatnonzero(leader == each).tolist() for each in np.unique(leader)]
+    boxes = np.array([(each.box.top, each.box.left, each.box.height, each.box.width) for each in blobs])
+    groups: dict[int, list[int]] = {}
+    for index, leader in enumerate(_grouped(boxes, within_px).tolist()):
+        groups.setdefault(leader, []).append(index)
+    return list(groups.values())
+
+
+@compiled
+def _grouped(boxes: NDArray[np.int64], within_px: int) -> NDArray[np.int64]:
+    """Return the first of the group that each of some boxes (top, left, height, width) belongs to."""
+    leader = np.arange(len(boxes))
+    for one in range(len(boxes)):
+        top, left, height, width = boxes[one]
+        for other in range(one):
+            down = max(top - boxes[other, 0] - boxes[other, 2], boxes[other, 0] - top - height)
+            across = max(left - boxes[other, 1] - boxes[other, 3], boxes[other, 1] - left - width)
+            if max(down, across) <= within_px:
+                _join(leader, one, other)
+    for one in range(len(boxes)):
+        leader[one] = _leader(leader, one)
+    return leader
 
 
 def divide(blobs: Sequence[Blob], u_px: NDArray[np.float64], v_px: NDArray[np.float64]) -> list[Blob]:

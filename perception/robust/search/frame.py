@@ -16,6 +16,9 @@ from perception.model.layout import CLIPPED, SEEN, UNUSABLE
 Float32 = NDArray[np.float32]
 Array = NDArray[np.float64]
 
+OWN, OTHERS, STRAY = 1, 2, 3
+"""Whose the light of a lit pixel is: that of a window's flares, of others, or of what is no flare."""
+
 
 class Pixels(NamedTuple):
     """A frame's counts, how they become electrons, and the background beneath.
@@ -224,8 +227,15 @@ def ring_level(
 
 
 @compiled
+def _is_among(places: NDArray[np.int64], place: int) -> bool:
+    """Tell whether a place is one of some, which are in order."""
+    at = np.searchsorted(places, place)
+    return bool(at < len(places) and places[at] == place)
+
+
+@compiled
 def light_of(
-    pixels: Pixels, filtered_e: Float32, bad: NDArray[np.bool_], mask: NDArray[np.bool_],
+    pixels: Pixels, filtered_e: Float32, bad_at: NDArray[np.int64], mask: NDArray[np.bool_],
     corner: tuple[int, int], clipped_dn: int,
 ) -> tuple[float, float, float, int, int]:  # fmt: skip
     """Look at a blob: centroid (u, v), flux in electrons, clipped pixels, and its half area.
@@ -243,7 +253,7 @@ def light_of(
             even_u += column
             even_v += row
             peak = max(peak, filtered_e[row, column])
-            if bad[row, column]:
+            if len(bad_at) and _is_among(bad_at, row * pixels.data_dn.shape[1] + column):
                 continue
             light = electrons_at(pixels, row, column) - ground_at(pixels, row, column)
             clipped += pixels.data_dn[row, column] >= clipped_dn
@@ -263,17 +273,20 @@ def light_of(
 
 @compiled
 def cut(
-    pixels: Pixels, owner: NDArray[np.int32], bad: NDArray[np.bool_], box: tuple[int, int, int, int],
-    own: NDArray[np.int64], clipped_dn: int, touching_px: int, kept_px: int,
+    pixels: Pixels, lit_at: NDArray[np.int64], owner: NDArray[np.int64], bad_at: NDArray[np.int64],
+    box: tuple[int, int, int, int], own: NDArray[np.int64], clipped_dn: int, touching_px: int, kept_px: int,
 ) -> tuple[Array, NDArray[np.uint8]]:  # fmt: skip
     """Cut a window out of a frame: its electrons, and what each of its pixels is.
 
     Parameters
     ----------
-    pixels, bad
-        The frame, and which of its pixels are bad.
-    owner
-        The number of the flare that each pixel belongs to, 0 for none, -1 for light that is no flare's.
+    pixels
+        The frame.
+    lit_at, owner
+        Its lit pixels, as indices in order, and the number of the flare that each belongs to; -1 for light
+        that is no flare's.
+    bad_at
+        Its bad pixels, in order.
     box
         Top, left, height and width; it may reach beyond the frame.
     own
@@ -292,31 +305,39 @@ def cut(
     top, left, height, width = box
     rows, columns = pixels.data_dn.shape
     image, state = np.zeros((height, width)), np.full((height, width), SEEN, dtype=np.uint8)
-    mine, others = np.zeros((height, width), dtype=np.bool_), np.zeros((height, width), dtype=np.bool_)
+    whose = np.zeros((height, width), dtype=np.int8)
     stray = False
     for row in range(height):
+        at_row = min(max(top + row, 0), rows - 1)
         for column in range(width):
-            at_row, at = min(max(top + row, 0), rows - 1), min(max(left + column, 0), columns - 1)
+            at = min(max(left + column, 0), columns - 1)
             image[row, column] = electrons_at(pixels, at_row, at)
-            outside = at_row != top + row or at != left + column
-            if bad[at_row, at] or outside:
+            if at_row != top + row or at != left + column:
                 state[row, column] = UNUSABLE
             elif pixels.data_dn[at_row, at] >= clipped_dn:
                 state[row, column] = CLIPPED
-            number = owner[at_row, at]
-            stray |= number < 0
-            if number > 0:
+        if at_row != top + row:
+            continue
+        lit = np.searchsorted(lit_at, at_row * columns + max(left, 0))
+        while lit < len(lit_at) and lit_at[lit] < at_row * columns + min(left + width, columns):
+            column = lit_at[lit] - at_row * columns - left
+            if owner[lit] < 0:
+                whose[row, column] = STRAY
+                stray = True
+            else:
+                whose[row, column] = OTHERS
                 for one in own:
-                    mine[row, column] |= number == one
-                others[row, column] = not mine[row, column]
-    if stray and not _comes_near(mine, owner, top, left, touching_px):
-        for row in range(height):
-            for column in range(width):
-                at_row, at = min(max(top + row, 0), rows - 1), min(max(left + column, 0), columns - 1)
-                others[row, column] |= owner[at_row, at] < 0
+                    if owner[lit] == one:
+                        whose[row, column] = OWN
+            lit += 1
+    for place in bad_at:
+        row, column = place // columns - top, place % columns - left
+        if 0 <= row < height and 0 <= column < width:
+            state[row, column] = UNUSABLE
+    touching = stray and _comes_near(whose, touching_px)
     for row in range(height):
         for column in range(width):
-            if others[row, column]:
+            if whose[row, column] == OTHERS or (whose[row, column] == STRAY and not touching):
                 state[
                     max(0, row - kept_px) : row + kept_px + 1, max(0, column - kept_px) : column + kept_px + 1
                 ] = UNUSABLE
@@ -324,19 +345,17 @@ def cut(
 
 
 @compiled
-def _comes_near(
-    mine: NDArray[np.bool_], owner: NDArray[np.int32], top: int, left: int, within_px: int
-) -> bool:
+def _comes_near(whose: NDArray[np.int8], within_px: int) -> bool:
     """Tell whether light that is no flare's comes near to the flares of a window, inside it."""
-    height, width = mine.shape
-    rows, columns = owner.shape
+    height, width = whose.shape
     for row in range(height):
         for column in range(width):
-            if not mine[row, column]:
+            if whose[row, column] != OWN:
                 continue
-            for near_row in range(max(0, row - within_px), min(height, row + within_px + 1)):
-                for near in range(max(0, column - within_px), min(width, column + within_px + 1)):
-                    at_row, at = min(max(top + near_row, 0), rows - 1), min(max(left + near, 0), columns - 1)
-                    if owner[at_row, at] < 0:
-                        return True
+            near = whose[
+                max(0, row - within_px) : row + within_px + 1,
+                max(0, column - within_px) : column + within_px + 1,
+            ]
+            if (near == STRAY).any():
+                return True
     return False
