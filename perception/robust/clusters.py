@@ -54,8 +54,6 @@ class Candidate:
         Sum of what exceeds the background in the blob.
     at_one_metre_e
         Flux of a source one metre away in that direction; NaN where no range can be had.
-    half_area_px
-        How many pixels of the filtered image exceed half of its maximum.
     image_radius_px
         Radius that the image of a source of this flux would have; 0 where no range can be had.
     """
@@ -65,7 +63,6 @@ class Candidate:
     u_px: float
     v_px: float
     flux_e: float
-    half_area_px: int
     at_one_metre_e: float
     image_radius_px: float
 
@@ -97,13 +94,10 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
     if not blobs:
         return []
     frame, calibration = prepared.frame, prepared.calibration
+    width = prepared.shape[1]
     light = [
-        light_of(
-            prepared.pixels, prepared.filtered_e, prepared.bad_at, blob.pixels,
-            (blob.box.top, blob.box.left), prepared.clipped_dn,
-        )
-        for blob in blobs
-    ]  # fmt: skip
+        light_of(prepared.pixels, prepared.bad_at, blob.places(width), prepared.clipped_dn) for blob in blobs
+    ]
     u_px, v_px, flux_e = np.array([each[:3] for each in light]).T
     direction = direction_camera(np.column_stack([u_px, v_px]), calibration)
     exposed_s = exposure_towards(direction, frame.exposure_s, frame.gain, calibration)
@@ -114,8 +108,8 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
     radius_px = stretch(direction, calibration) * np.tan(angle_rad)
     rows = zip(blobs, light, at_one_metre_e.tolist(), np.where(ranged, radius_px, 0.0).tolist(), strict=True)
     return [
-        Candidate(blob, clipped_px, u, v, flux, half_area_px, at_one_metre, radius)
-        for blob, (u, v, flux, clipped_px, half_area_px), at_one_metre, radius in rows
+        Candidate(blob, clipped_px, u, v, flux, at_one_metre, radius)
+        for blob, (u, v, flux, clipped_px), at_one_metre, radius in rows
     ]
 
 
@@ -128,9 +122,11 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
     """
     if candidate.is_clipped:
         return False
+    brightness_e = prepared.filtered_in(candidate.blob)
+    half_area = int(np.count_nonzero(brightness_e > 0.5 * brightness_e.max()))
     # Half maximum of a Gaussian filtered with itself lies at √(2 ln 2) · √2 σ = 1.67 σ.
     smooth_px = math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
-    return candidate.half_area_px > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
+    return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
 
 
 def brightest(found: Sequence[Candidate], most: int) -> list[Candidate]:
@@ -222,7 +218,7 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
     Of a clipped flare, and of one that the frame's edge cuts, the part seen may be a small part of the flux;
     but no source is larger than what is seen of it.
     """
-    height, width = prepared.filtered_e.shape
+    height, width = prepared.shape
     boxes = [member.blob.box for member in cluster.members]
     cut = any(
         b.top == 0 or b.left == 0 or b.top + b.height == height or b.left + b.width == width for b in boxes

@@ -97,20 +97,24 @@ def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
     box = blob.box
     gap_px = math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1
     level_e, count = ring_level(
-        prepared.filtered_e, (box.top, box.left, box.height, box.width), gap_px, _RING_PX
+        prepared.pixels,
+        prepared.kernel,
+        prepared.bad_at,
+        (box.top, box.left, box.height, box.width),
+        gap_px,
+        _RING_PX,
     )
     if count < _FEWEST_RING_PIXELS:
         return True
     middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
     noise_e = prepared.filtered_noise * math.sqrt(max(level_e + middle_e, 0.0) + prepared.floor_e2)
-    peak_e = float(prepared.filtered_e[box.slices][blob.pixels].max())
-    return peak_e - level_e > CONTRAST_SIGMAS * noise_e
+    return float(prepared.filtered_in(blob).max()) - level_e > CONTRAST_SIGMAS * noise_e
 
 
 def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
     """Divide a component at maxima that differ by more than their noise."""
     box = component.box
-    brightness_e = prepared.filtered_e[box.slices]
+    brightness_e = prepared.filtered_in(component)
     middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
     expected_e = np.maximum(brightness_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)

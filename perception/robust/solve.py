@@ -244,7 +244,7 @@ class _Fit:
 def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
-    laid, imaged = lay_out(camera, *np.ascontiguousarray(own[:, :2].T), _log_range_by_size(own, fits[0]))
+    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]))
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
         fit.converged = False

@@ -89,7 +89,7 @@ def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     metre over the area of its image there.
     """
     box, calibration = member.blob.box, prepared.calibration
-    rows, columns = prepared.filtered_e.shape
+    rows, columns = prepared.shape
     cut = box.top == 0 or box.left == 0 or box.top + box.height == rows or box.left + box.width == columns
     fill = member.blob.area_px / (0.25 * math.pi * box.height * box.width)
     aspect = max(box.height, box.width) / min(box.height, box.width)

@@ -1,7 +1,6 @@
 """What lies beneath: a smooth background, and how much a frame scatters about it beside noise, in cells."""
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -88,19 +87,20 @@ def _sample_places(length: int, per_axis: int) -> NDArray[np.int64]:
     return place.astype(np.int64).reshape(cells, per_cell)
 
 
-def scatter_ratio(
-    image_e: NDArray[np.float32], noise_mesh_e: NDArray[np.float32], cells: Sequence[slice] | None = None
-) -> NDArray[np.float32]:
+def scatter_places(shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows and columns of each cell where scatter is sampled, shape (cells, samples) each."""
+    rows, columns = (_sample_places(length, _SCATTER_SAMPLES_PER_AXIS) for length in shape)
+    return rows, columns
+
+
+def scatter_ratio(samples: NDArray[np.float32], noise_mesh_e: NDArray[np.float32]) -> NDArray[np.float32]:
     """Scatter of a filtered image in each cell relative to that of noise; 1 where it is no larger.
 
-    Of all cells, or of those alone that two slices mark, to which `noise_mesh_e` belongs.
+    `samples` are those of all cells' rows and columns, one after another's, shape (rows, columns).
     """
     import cv2
 
-    rows, columns = (_sample_places(length, _SCATTER_SAMPLES_PER_AXIS) for length in image_e.shape)
-    if cells is not None:
-        rows, columns = rows[cells[0]], columns[cells[1]]
-    ratio = cell_scatter(image_e, noise_mesh_e, rows, columns)
+    ratio = cell_scatter(samples, noise_mesh_e)
     smooth = np.asarray(cv2.medianBlur(ratio, 3), dtype=np.float32).reshape(ratio.shape)
     # A cell's ratio is known to 6 % only: those around must have some structure too.
     around = np.asarray(cv2.blur(ratio, (5, 5)), dtype=np.float32).reshape(ratio.shape)
@@ -119,7 +119,7 @@ def cell_means(
     which pixels of each cell are looked at, shape (cells, samples).
     """
     means = np.empty((len(rows), len(columns)))
-    count_of = np.zeros(1 << 16, dtype=np.int64)
+    count_of = np.zeros(1 << 16, dtype=np.uint16)
     for down in range(len(rows)):
         for across in range(len(columns)):
             lowest, highest = 1 << 16, 0
@@ -155,29 +155,25 @@ def cell_means(
 
 
 @compiled
-def cell_scatter(
-    image: NDArray[np.float32],
-    noise_mesh: NDArray[np.float32],
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-) -> NDArray[np.float32]:
+def cell_scatter(samples: NDArray[np.float32], noise_mesh: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return an image's scatter in each cell over its noise, blind to its outer thirds, where flares are.
 
     By a histogram, to less than a hundredth of the noise; where it scatters too far for that, by sorting.
-    `rows` and `columns` are as for `cell_means`.
+    `samples` has as many rows and columns for each cell, one cell's after another's.
     """
     scatter = np.empty(noise_mesh.shape, dtype=np.float32)
-    number = rows.shape[1] * columns.shape[1]
-    low, high = round(0.1587 * (number - 1)), round(0.8413 * (number - 1))
+    tall, wide = samples.shape[0] // len(noise_mesh), samples.shape[1] // noise_mesh.shape[1]
+    low, high = round(0.1587 * (tall * wide - 1)), round(0.8413 * (tall * wide - 1))
     last = 2 * STEPS_PER_NOISE * MOST_NOISES + 1
     count_of = np.empty(last + 1, dtype=np.int32)
-    for down in range(len(rows)):
-        for across in range(len(columns)):
+    for down in range(len(noise_mesh)):
+        for across in range(noise_mesh.shape[1]):
+            cell = samples[down * tall : (down + 1) * tall, across * wide : (across + 1) * wide]
             count_of[:] = 0
             per_unit = np.float32(STEPS_PER_NOISE) / noise_mesh[down, across]
-            for row in rows[down]:
-                for column in columns[across]:
-                    place = image[row, column] * per_unit + np.float32(0.5 * last)
+            for row in range(tall):
+                for column in range(wide):
+                    place = cell[row, column] * per_unit + np.float32(0.5 * last)
                     count_of[int(min(max(place, np.float32(0.0)), np.float32(last)))] += 1
             step, up_to = 0, count_of[0]
             while up_to <= low:
@@ -189,12 +185,7 @@ def cell_scatter(
                 up_to += count_of[step]
             if first > 0 and step < last:
                 scatter[down, across] = 0.5 * (step - first) / STEPS_PER_NOISE
-                continue
-            samples, at = np.empty(number, dtype=np.float32), 0
-            for row in rows[down]:
-                for column in columns[across]:
-                    samples[at] = image[row, column]
-                    at += 1
-            samples.sort()
-            scatter[down, across] = 0.5 * (samples[high] - samples[low]) / noise_mesh[down, across]
+            else:
+                ordered = np.sort(cell.copy().ravel())
+                scatter[down, across] = 0.5 * (ordered[high] - ordered[low]) / noise_mesh[down, across]
     return scatter

@@ -15,6 +15,7 @@ from perception.model.layout import CLIPPED, SEEN, UNUSABLE
 
 Float32 = NDArray[np.float32]
 Array = NDArray[np.float64]
+Places = NDArray[np.int64]
 
 OWN, OTHERS, STRAY = 1, 2, 3
 """Whose the light of a lit pixel is: that of a window's flares, of others, or of what is no flare."""
@@ -66,57 +67,134 @@ def electrons_at(pixels: Pixels, row: int, column: int) -> float:
 
 
 @compiled
-def filtered(pixels: Pixels, kernel: Float32) -> Float32:
-    """Correlate what exceeds the background with a kernel along both axes, zero beyond the border.
+def filtered(pixels: Pixels, kernel: Float32, bad_at: Places, box: tuple[int, int, int, int]) -> Float32:
+    """Correlate what exceeds the background with a kernel along both axes, within a box inside the frame.
 
-    Zero is the expected value there, so the border is less noisy than the rest, never more. The kernel is
-    symmetric, and of odd length.
+    Zero is what lies beyond the frame, which is what is expected there, and so are bad pixels. The box is
+    (top, left, height, width); the kernel is symmetric, and of odd length.
+    """
+    top, left, height, width = box
+    half, padded = len(kernel) // 2, np.empty(width + len(kernel) - 1, dtype=np.float32)
+    across = np.zeros((len(kernel), width), dtype=np.float32)  # the last rows, filtered along themselves
+    into = np.empty((height, width), dtype=np.float32)
+    for row in range(top - half, top + height + half):
+        _filter_row(pixels, kernel, bad_at, row, left, padded, across[row % len(kernel)])
+        if row - half >= top:
+            _sum_rows(across, kernel, row - half, into[row - half - top])
+    return into
+
+
+@compiled
+def exceeding(
+    pixels: Pixels, kernel: Float32, limit_e: Float32, sample_of: Places, sampled: Places
+) -> tuple[Places, Float32, Float32]:
+    """Filter a whole frame, and keep what exceeds a limit, and samples of the rest.
+
+    Parameters
+    ----------
+    pixels, kernel
+        As for `filtered`.
+    limit_e
+        The limit, on the mesh's rows as `Pixels.ground_e`.
+    sample_of, sampled
+        For each row of the frame the row of samples that it gives, or -1; the columns that are sampled.
+
+    Returns
+    -------
+    The pixels above the limit, as indices in the frame, in order; the filtered image there; and the samples.
     """
     rows, columns = pixels.data_dn.shape
-    taps, half = len(kernel), len(kernel) // 2
-    into = np.empty((rows, columns), dtype=np.float32)
-    padded = np.zeros(columns + 2 * half, dtype=np.float32)
-    across = np.zeros((taps, columns), dtype=np.float32)  # the last rows, filtered along themselves
-    for row in range(rows + half):
-        line = across[row % taps]
-        if row < rows:
-            one, other, share = between(row, rows, len(pixels.ground_e))
-            _excess(pixels, row, one, other, np.float32(share), padded[half : half + columns])
-            _times(padded[half : half + columns], kernel[half], line)
-            for step in range(1, half + 1):
-                before, behind = padded[half - step :][:columns], padded[half + step :][:columns]
-                _add_both(before, behind, kernel[half + step], line)
-        else:
-            line[:] = 0.0
-        done = row - half
-        if done >= 0:
-            result = into[done]
-            _times(across[done % taps], kernel[half], result)
-            for step in range(1, half + 1):
-                up, down = across[(done - step) % taps], across[(done + step) % taps]
-                _add_both(up, down, kernel[half + step], result)
-    return into
+    half, none = len(kernel) // 2, np.empty(0, dtype=np.int64)
+    across = np.zeros((len(kernel), columns), dtype=np.float32)
+    padded = np.empty(columns + 2 * half, dtype=np.float32)
+    result, limit = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
+    samples = np.empty((sample_of.max() + 1, len(sampled)), dtype=np.float32)
+    places, values, count = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.float32), 0
+    for ahead in range(-half, rows + half):
+        _filter_row(pixels, kernel, none, ahead, 0, padded, across[ahead % len(kernel)])
+        row = ahead - half
+        if row < 0:
+            continue
+        _sum_rows(across, kernel, row, result)
+        if sample_of[row] >= 0:
+            for at in range(len(sampled)):
+                samples[sample_of[row], at] = result[sampled[at]]
+        one, other, share = between(row, rows, len(limit_e))
+        _blend(limit_e[one], limit_e[other], np.float32(share), limit)
+        more = _count_above(result, limit)
+        if count + more > len(places):
+            places = np.append(places, np.empty(2 * (count + more), dtype=np.int64))
+            values = np.append(values, np.empty(2 * (count + more), dtype=np.float32))
+        for column in range(columns if more else 0):
+            if result[column] > limit[column]:
+                places[count], values[count] = row * columns + column, result[column]
+                count += 1
+    return places[:count].copy(), values[:count].copy(), samples
+
+
+@compiled
+def above(places: Places, values: Float32, limit_e: Float32, rows: int) -> NDArray[np.bool_]:
+    """Tell which of some pixels exceed a limit, given on the mesh's rows, in a frame of so many rows."""
+    columns = limit_e.shape[1]
+    kept = np.empty(len(places), dtype=np.bool_)
+    for index, place in enumerate(places):
+        one, other, share = between(place // columns, rows, len(limit_e))
+        rest, part, column = np.float32(1.0 - share), np.float32(share), place % columns
+        kept[index] = values[index] > rest * limit_e[one, column] + part * limit_e[other, column]
+    return kept
 
 
 # Each of these runs along a row with nothing else in sight: so the processor does several pixels at once.
 
 
 @compiled
-def _excess(pixels: Pixels, row: int, one: int, other: int, share: np.float32, into: Float32) -> None:
-    """Write what a row exceeds the background by, which lies between two rows of the mesh."""
-    above, below, counts = pixels.ground_e[one], pixels.ground_e[other], pixels.data_dn[row]
-    black, scale, rest = (
-        np.float32(pixels.black_level_dn),
-        np.float32(pixels.e_per_dn),
-        np.float32(1.0) - share,
-    )
-    for column in range(len(into)):
-        ground = rest * above[column] + share * below[column]
-        into[column] = (np.float32(counts[column]) - black) * scale - ground
+def _filter_row(
+    pixels: Pixels, kernel: Float32, bad_at: Places, row: int, left: int, padded: Float32, into: Float32
+) -> None:
+    """Write a part of a row, from a column on, filtered along itself; `padded` has room for its ends."""
+    rows, columns = pixels.data_dn.shape
+    width, half = len(into), len(kernel) // 2
+    if not 0 <= row < rows:
+        into[:] = 0.0
+        return
+    one, other, share = between(row, rows, len(pixels.ground_e))
+    first, end = max(left - half, 0), min(left + width + half, columns)
+    padded[:] = 0.0
+    excess, counts = padded[first - left + half :][: end - first], pixels.data_dn[row, first:end]
+    _blend(pixels.ground_e[one, first:end], pixels.ground_e[other, first:end], np.float32(share), excess)
+    black, scale = np.float32(pixels.black_level_dn), np.float32(pixels.e_per_dn)
+    for column in range(len(excess)):
+        excess[column] = (np.float32(counts[column]) - black) * scale - excess[column]
+    if len(bad_at):
+        at = np.searchsorted(bad_at, row * columns + first)
+        while at < len(bad_at) and bad_at[at] < row * columns + end:
+            excess[bad_at[at] - row * columns - first] = 0.0
+            at += 1
+    _weigh(padded[half:][:width], kernel[half], into)
+    for step in range(1, half + 1):
+        _add_both(padded[half - step :][:width], padded[half + step :][:width], kernel[half + step], into)
 
 
 @compiled
-def _times(row: Float32, factor: np.float32, into: Float32) -> None:
+def _sum_rows(across: Float32, kernel: Float32, row: int, into: Float32) -> None:
+    """Write a row filtered across rows too; `across` holds the nearest, each where its number leaves it."""
+    half = len(kernel) // 2
+    _weigh(across[row % len(kernel)], kernel[half], into)
+    for step in range(1, half + 1):
+        up, down = across[(row - step) % len(kernel)], across[(row + step) % len(kernel)]
+        _add_both(up, down, kernel[half + step], into)
+
+
+@compiled
+def _blend(one: Float32, other: Float32, share: np.float32, into: Float32) -> None:
+    """Write what lies between two rows."""
+    rest = np.float32(1.0) - share
+    for column in range(len(into)):
+        into[column] = rest * one[column] + share * other[column]
+
+
+@compiled
+def _weigh(row: Float32, factor: np.float32, into: Float32) -> None:
     """Write a row times a factor."""
     for column in range(len(into)):
         into[column] = factor * row[column]
@@ -130,52 +208,33 @@ def _add_both(one: Float32, other: Float32, factor: np.float32, into: Float32) -
 
 
 @compiled
-def above(filtered_e: Float32, limit_e: Float32) -> NDArray[np.int64]:
-    """Return which pixels exceed a limit, given on the mesh's rows, as indices in the frame, in order."""
-    rows, columns = filtered_e.shape
-    line = np.empty(columns, dtype=np.float32)
-    counts = np.zeros(rows, dtype=np.int64)
-    for row in range(rows):
-        one, other, share = between(row, rows, len(limit_e))
-        rest, part = np.float32(1.0 - share), np.float32(share)
-        first, second, image = limit_e[one], limit_e[other], filtered_e[row]
-        count = 0
-        for column in range(columns):
-            count += image[column] > rest * first[column] + part * second[column]
-        counts[row] = count
-    found = np.empty(counts.sum(), dtype=np.int64)
-    at = 0
-    for row in range(rows):
-        if counts[row] == 0:
-            continue
-        one, other, share = between(row, rows, len(limit_e))
-        rest, part = np.float32(1.0 - share), np.float32(share)
-        for column in range(columns):
-            line[column] = rest * limit_e[one, column] + part * limit_e[other, column]
-        for column in range(columns):
-            if filtered_e[row, column] > line[column]:
-                found[at] = row * columns + column
-                at += 1
-    return found
+def _count_above(row: Float32, limit: Float32) -> int:
+    """Count how many pixels of a row exceed a limit."""
+    count = 0
+    for column in range(len(row)):
+        count += row[column] > limit[column]
+    return count
 
 
 @compiled
-def without(filtered_e: Float32, pixels: Pixels, kernel: Float32, places: NDArray[np.int64]) -> None:
-    """Take what some pixels exceed the background by out of a filtered image."""
-    rows, columns = filtered_e.shape
+def without(places: Places, values: Float32, pixels: Pixels, kernel: Float32, bad_at: Places) -> None:
+    """Take what bad pixels exceed the background by out of a filtered image, known at some places."""
+    rows, columns = pixels.data_dn.shape
     half = len(kernel) // 2
-    for place in places:
-        row, column = place // columns, place % columns
+    for bad in bad_at:
+        row, column = bad // columns, bad % columns
         excess = np.float32(electrons_at(pixels, row, column) - ground_at(pixels, row, column))
         for near_row in range(max(0, row - half), min(rows, row + half + 1)):
-            for near in range(max(0, column - half), min(columns, column + half + 1)):
-                weight = kernel[half + near_row - row] * kernel[half + near - column]
-                filtered_e[near_row, near] -= weight * excess
+            at = np.searchsorted(places, near_row * columns + max(0, column - half))
+            while at < len(places) and places[at] <= near_row * columns + min(columns - 1, column + half):
+                across = places[at] - near_row * columns - column
+                values[at] -= kernel[half + near_row - row] * kernel[half + across] * excess
+                at += 1
 
 
 @compiled
 def neighbours(
-    pixels: Pixels, places: NDArray[np.int64], floor_e2: float, along_rows: bool
+    pixels: Pixels, places: Places, floor_e2: float, along_rows: bool
 ) -> tuple[Array, Array, Array]:
     """Return by how much pixels exceed the background, their eight neighbours together, and their variance.
 
@@ -203,31 +262,30 @@ def neighbours(
 
 @compiled
 def ring_level(
-    filtered_e: Float32, box: tuple[int, int, int, int], gap_px: int, wide_px: int
+    pixels: Pixels, kernel: Float32, bad_at: Places, box: tuple[int, int, int, int], gap_px: int, wide_px: int
 ) -> tuple[float, int]:
-    """Return the median of a filtered image over a frame of pixels around a box, and how many there are.
+    """Return the median of the filtered image over a frame of pixels around a box, and how many there are.
 
     The box is (top, left, height, width); the frame begins `gap_px` beyond it and is `wide_px` wide.
     """
-    rows, columns = filtered_e.shape
+    rows, columns = pixels.data_dn.shape
     top, left = box[0] - gap_px, box[1] - gap_px
     bottom, right = box[0] + box[2] + gap_px, box[1] + box[3] + gap_px
     first_row, end_row = max(0, top - wide_px), min(rows, bottom + wide_px)
     first, end = max(0, left - wide_px), min(columns, right + wide_px)
-    values = np.empty(max(0, end_row - first_row) * max(0, end - first), dtype=np.float32)
-    count = 0
+    near = filtered(pixels, kernel, bad_at, (first_row, first, end_row - first_row, end - first))
+    values, count = np.empty(near.size, dtype=np.float32), 0
     for row in range(first_row, end_row):
         inside = top <= row < bottom
         for column in range(first, end):
-            if inside and left <= column < right:
-                continue
-            values[count] = filtered_e[row, column]
-            count += 1
+            if not (inside and left <= column < right):
+                values[count] = near[row - first_row, column - first]
+                count += 1
     return (float(np.median(values[:count])) if count else 0.0), count
 
 
 @compiled
-def _is_among(places: NDArray[np.int64], place: int) -> bool:
+def _is_among(places: Places, place: int) -> bool:
     """Tell whether a place is one of some, which are in order."""
     at = np.searchsorted(places, place)
     return bool(at < len(places) and places[at] == place)
@@ -235,46 +293,35 @@ def _is_among(places: NDArray[np.int64], place: int) -> bool:
 
 @compiled
 def light_of(
-    pixels: Pixels, filtered_e: Float32, bad_at: NDArray[np.int64], mask: NDArray[np.bool_],
-    corner: tuple[int, int], clipped_dn: int,
-) -> tuple[float, float, float, int, int]:  # fmt: skip
-    """Look at a blob: centroid (u, v), flux in electrons, clipped pixels, and its half area.
+    pixels: Pixels, bad_at: Places, places: Places, clipped_dn: int
+) -> tuple[float, float, float, int]:
+    """Look at a blob's pixels, indices in the frame: centroid (u, v), flux in electrons, clipped pixels.
 
-    The centroid is weighted by what exceeds the background; pixels that are bad count nowhere. The half area
-    is how many pixels exceed half of the maximum in the filtered image.
+    The centroid is weighted by what exceeds the background; pixels that are bad count nowhere.
     """
-    u, v, weight, flux, clipped, peak, count = 0.0, 0.0, 0.0, 0.0, 0, -math.inf, 0
-    even_u, even_v = 0.0, 0.0
-    for row in range(corner[0], corner[0] + mask.shape[0]):
-        for column in range(corner[1], corner[1] + mask.shape[1]):
-            if not mask[row - corner[0], column - corner[1]]:
-                continue
-            count += 1
-            even_u += column
-            even_v += row
-            peak = max(peak, filtered_e[row, column])
-            if len(bad_at) and _is_among(bad_at, row * pixels.data_dn.shape[1] + column):
-                continue
-            light = electrons_at(pixels, row, column) - ground_at(pixels, row, column)
-            clipped += pixels.data_dn[row, column] >= clipped_dn
-            flux += light
-            u += max(light, 0.0) * column
-            v += max(light, 0.0) * row
-            weight += max(light, 0.0)
-    half_area = 0
-    for row in range(mask.shape[0]):
-        for column in range(mask.shape[1]):
-            if mask[row, column] and filtered_e[corner[0] + row, corner[1] + column] > 0.5 * peak:
-                half_area += 1
+    columns = pixels.data_dn.shape[1]
+    u, v, weight, flux, clipped, even_u, even_v = 0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0
+    for place in places:
+        row, column = place // columns, place % columns
+        even_u += column / len(places)
+        even_v += row / len(places)
+        if len(bad_at) and _is_among(bad_at, place):
+            continue
+        light = electrons_at(pixels, row, column) - ground_at(pixels, row, column)
+        clipped += pixels.data_dn[row, column] >= clipped_dn
+        flux += light
+        u += max(light, 0.0) * column
+        v += max(light, 0.0) * row
+        weight += max(light, 0.0)
     if not weight > 0.0:
-        return even_u / count, even_v / count, flux, clipped, half_area
-    return u / weight, v / weight, flux, clipped, half_area
+        return even_u, even_v, flux, clipped
+    return u / weight, v / weight, flux, clipped
 
 
 @compiled
 def cut(
-    pixels: Pixels, lit_at: NDArray[np.int64], owner: NDArray[np.int64], bad_at: NDArray[np.int64],
-    box: tuple[int, int, int, int], own: NDArray[np.int64], clipped_dn: int, touching_px: int, kept_px: int,
+    pixels: Pixels, lit_at: Places, owner: Places, bad_at: Places,
+    box: tuple[int, int, int, int], own: Places, clipped_dn: int, touching_px: int, kept_px: int,
 ) -> tuple[Array, NDArray[np.uint8]]:  # fmt: skip
     """Cut a window out of a frame: its electrons, and what each of its pixels is.
 

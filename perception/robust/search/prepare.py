@@ -14,10 +14,20 @@ from perception.robust.search.background import (
     as_wide,
     background_mesh_e,
     resized,
+    scatter_places,
     scatter_ratio,
     spread_mesh,
 )
-from perception.robust.search.frame import Pixels, above, filtered, ground_at, neighbours, without
+from perception.robust.search.blobs import Blob
+from perception.robust.search.frame import (
+    Pixels,
+    above,
+    exceeding,
+    filtered,
+    ground_at,
+    neighbours,
+    without,
+)
 from perception.robust.search.limit import limit_mesh_of, point_kernel
 from perception.robust.structure import autocorrelation, structure_of
 from perception.types import Calibration, RawFrame
@@ -41,28 +51,26 @@ class PreparedFrame:
         Counts and background, for loops over pixels.
     mesh_e
         Smooth local background in cells.
-    filtered_e
-        Matched filter of what exceeds the background, the frame's shape.
-    filtered_noise
-        Noise of `filtered_e` relative to that of a pixel, √Σh².
-    lit_at
-        Pixels above the detection limit, as indices in the frame, in order.
+    kernel
+        One axis of the matched filter of what exceeds the background.
+    lit_at, lit_e
+        Pixels above the detection limit, as indices in the frame, in order, and the filtered image there.
     floor_e2
         Variance of a dark pixel.
     texture_e
         Standard deviation of the background's structure, on the mesh's rows as `pixels.ground_e`; 0 where the
         background is even, None where it is so everywhere.
     bad_at
-        Pixels that are stuck or hot, as indices; `filtered_e` has them as dark as the background.
+        Pixels that are stuck or hot, as indices, in order; the filter takes them to be as the background.
     """
 
     frame: RawFrame
     calibration: Calibration
     pixels: Pixels
     mesh_e: NDArray[np.float32]
-    filtered_e: NDArray[np.float32]
-    filtered_noise: float
+    kernel: NDArray[np.float32]
     lit_at: NDArray[np.int64]
+    lit_e: NDArray[np.float32]
     floor_e2: float
     texture_e: NDArray[np.float32] | None
     bad_at: NDArray[np.int64]
@@ -72,15 +80,31 @@ class PreparedFrame:
         """Count from which on a pixel is clipped."""
         return saturation_dn(self.calibration, self.frame.gain)
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the frame."""
+        return self.calibration.height_px, self.calibration.width_px
+
+    @property
+    def filtered_noise(self) -> float:
+        """Noise of the filtered image relative to that of a pixel, √Σh²."""
+        return float(np.sum(self.kernel**2))
+
+    def filtered_in(self, blob: Blob) -> NDArray[np.float32]:
+        """Return the filtered image in a blob of lit pixels, 0 elsewhere in its box."""
+        image_e = np.zeros(blob.pixels.shape, dtype=np.float32)
+        image_e[blob.pixels] = self.lit_e[np.searchsorted(self.lit_at, blob.places(self.shape[1]))]
+        return image_e
+
     @cached_property
     def lit(self) -> NDArray[np.bool_]:
         """Mask of the pixels above the detection limit."""
-        return _mask(self.lit_at, self.filtered_e.shape)
+        return _mask(self.lit_at, self.shape)
 
     @cached_property
     def bad(self) -> NDArray[np.bool_]:
         """Mask of the pixels that are stuck or hot."""
-        return _mask(self.bad_at, self.filtered_e.shape)
+        return _mask(self.bad_at, self.shape)
 
     @cached_property
     def excess_e(self) -> NDArray[np.float32]:
@@ -112,7 +136,7 @@ class PreparedFrame:
         )
 
     def _nearest(self, u_px: float, v_px: float) -> tuple[int, int]:
-        rows, columns = self.filtered_e.shape
+        rows, columns = self.shape
         return min(max(round(v_px), 0), rows - 1), min(max(round(u_px), 0), columns - 1)
 
     def lit_in(self, box: PixelBox) -> NDArray[np.bool_]:
@@ -159,34 +183,46 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
         1.0 / gain_dn_per_e(frame, calibration),
         as_wide(mesh_e, calibration),
     )
-    filtered_e = filtered(pixels, narrow)
     noise_mesh_e = filtered_noise * np.sqrt(np.maximum(mesh_e, 0.0) + floor_e2).astype(np.float32)
     limit_mesh_e = limit_mesh_of(mesh_e, floor_e2, kernel)
-    ratio = scatter_ratio(filtered_e, noise_mesh_e)
-    limit_e = as_wide(limit_mesh_e * ratio, calibration)
-    lit_at = above(filtered_e, limit_e)
+    limit_e = as_wide(limit_mesh_e, calibration)
+    rows, columns = scatter_places(frame.data_dn.shape)
+    sample_of = np.full(calibration.height_px, -1)
+    sample_of[rows.ravel()] = np.arange(rows.size)
+    lit_at, lit_e, samples = exceeding(pixels, narrow, limit_e, sample_of, columns.ravel())
+    ratio = scatter_ratio(samples, noise_mesh_e)
+    structured = bool((ratio > 1.0).any())
+    if structured:
+        limit_e = as_wide(limit_mesh_e * ratio, calibration)
+        kept = above(lit_at, lit_e, limit_e, calibration.height_px)
+        lit_at, lit_e = lit_at[kept], lit_e[kept]
     bad_at = bad_pixels(pixels, lit_at, floor_e2, kernel, along_rows=frame.line_time_s > 0.0)
     if len(bad_at):
-        without(filtered_e, pixels, narrow, bad_at)
-        lit_at = above(filtered_e, limit_e)
+        without(lit_at, lit_e, pixels, narrow, bad_at)
+        kept = above(lit_at, lit_e, limit_e, calibration.height_px)
+        lit_at, lit_e = lit_at[kept], lit_e[kept]
     prepared = PreparedFrame(
         frame=frame,
         calibration=calibration,
         pixels=pixels,
         mesh_e=mesh_e,
-        filtered_e=filtered_e,
-        filtered_noise=filtered_noise,
+        kernel=narrow,
         lit_at=lit_at,
+        lit_e=lit_e,
         floor_e2=floor_e2,
         texture_e=None,
         bad_at=bad_at,
     )
-    if not (ratio > 1.0).any():
+    if not structured:
         return prepared
-    standing_out = _local_contrast(filtered_e, limit_mesh_e, noise_mesh_e, ratio, kernel, calibration)
+    more_at, more_e = _local_contrast(prepared, limit_mesh_e, noise_mesh_e, ratio)
+    lit_at, first = np.unique(np.concatenate([lit_at, more_at]), return_index=True)
     sigma_mesh_e = noise_mesh_e * np.sqrt(ratio**2 - np.float32(1.0))
     return replace(
-        prepared, lit_at=np.union1d(lit_at, standing_out), texture_e=as_wide(sigma_mesh_e, calibration)
+        prepared,
+        lit_at=lit_at,
+        lit_e=np.concatenate([lit_e, more_e])[first],
+        texture_e=as_wide(sigma_mesh_e, calibration),
     )
 
 
@@ -231,19 +267,19 @@ def bad_pixels(
 
 
 def _local_contrast(
-    filtered_e: NDArray[np.float32],
+    prepared: PreparedFrame,
     limit_mesh_e: NDArray[np.float32],
     noise_mesh_e: NDArray[np.float32],
     ratio: NDArray[np.float32],
-    kernel: NDArray[np.float64],
-    calibration: Calibration,
-) -> NDArray[np.int64]:
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Find what stands out of its close surroundings where the background has structure.
 
     A point on a hill that is wider than the point spread does so though the hill is as bright as the point.
+    Returns the pixels, and the filtered image there.
     """
     import cv2
 
+    kernel, calibration = prepared.kernel.astype(np.float64), prepared.calibration
     side = 2 * len(kernel) - 1
     widened = cv2.dilate((ratio > 1.0).astype(np.uint8), np.ones((3, 3), np.uint8))
     structured = np.asarray(widened).reshape(ratio.shape) > 0
@@ -252,20 +288,24 @@ def _local_contrast(
         slice(max(0, int(at.min()) - _SMOOTHING_REACH), int(at.max()) + _SMOOTHING_REACH + 1)
         for at in np.nonzero(structured)
     ]
-    near = tuple(
-        slice(
-            max(0, part.start * length // count - side), min(length, part.stop * length // count + 1 + side)
-        )
-        for part, length, count in zip(cells, filtered_e.shape, ratio.shape, strict=True)
+    (top, bottom), (left, right) = (
+        (max(0, part.start * length // count - side), min(length, part.stop * length // count + 1 + side))
+        for part, length, count in zip(cells, prepared.shape, ratio.shape, strict=True)
     )
-    contrast_e = np.zeros(filtered_e.shape, dtype=np.float32)
-    contrast_e[near] = filtered_e[near] - cv2.blur(filtered_e[near], (side, side))
+    part_e = filtered(
+        prepared.pixels, prepared.kernel, prepared.bad_at, (top, left, bottom - top, right - left)
+    )
+    contrast_e = part_e - cv2.blur(part_e, (side, side))
     padded = np.pad(kernel, side // 2)
     mean = np.convolve(kernel, np.full(side, 1.0 / side))
     of_noise = math.sqrt(float(np.sum((np.outer(padded, padded) - np.outer(mean, mean)) ** 2)))
     share = np.float32(of_noise / float(np.sum(kernel**2)))
+    rows, columns = (each[part] for each, part in zip(scatter_places(prepared.shape), cells, strict=True))
+    samples = contrast_e[np.ix_(rows.ravel() - top, columns.ravel() - left)]
     more = np.ones_like(ratio)
-    more[tuple(cells)] = scatter_ratio(contrast_e, noise_mesh_e[tuple(cells)] * share, cells)
+    more[tuple(cells)] = scatter_ratio(samples, noise_mesh_e[tuple(cells)] * share)
     # Cells of even ground have no limit here.
     limit_e = np.where(structured, limit_mesh_e * share * more, np.float32(1e9))
-    return above(contrast_e, as_wide(limit_e, calibration))
+    within = np.arange(top, bottom)[:, None] * calibration.width_px + np.arange(left, right)
+    kept = above(within.ravel(), contrast_e.ravel(), as_wide(limit_e, calibration), calibration.height_px)
+    return within.ravel()[kept], part_e.ravel()[kept]
