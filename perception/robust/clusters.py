@@ -13,7 +13,8 @@ from perception.model.lens import stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
 from perception.model.sensor import clip_level_e
 from perception.robust.search.blobs import Blob, near_groups
-from perception.robust.search.frame import cut, light_of
+from perception.robust.search.cutout import cut, light_of
+from perception.robust.search.frame import excess_at
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Start, Window
 
@@ -94,10 +95,11 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
     if not blobs:
         return []
     frame, calibration = prepared.frame, prepared.calibration
-    width = prepared.shape[1]
-    light = [
-        light_of(prepared.pixels, prepared.bad_at, blob.places(width), prepared.clipped_dn) for blob in blobs
-    ]
+    light = []
+    for blob in blobs:
+        places, width = blob.places(prepared.shape[1]), prepared.shape[1]
+        excess_e, counts_dn = excess_at(prepared.pixels, places), prepared.pixels.data_dn.ravel()[places]
+        light.append(light_of(excess_e, counts_dn, places, prepared.bad_at, width, prepared.clipped_dn))
     u_px, v_px, flux_e = np.array([each[:3] for each in light]).T
     direction = direction_camera(np.column_stack([u_px, v_px]), calibration)
     exposed_s = exposure_towards(direction, frame.exposure_s, frame.gain, calibration)
@@ -122,8 +124,7 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
     """
     if candidate.is_clipped:
         return False
-    brightness_e = prepared.filtered_in(candidate.blob)
-    half_area = int(np.count_nonzero(brightness_e > 0.5 * brightness_e.max()))
+    half_area = int(np.count_nonzero(candidate.blob.filtered_e > 0.5 * candidate.blob.peak_e))
     # Half maximum of a Gaussian filtered with itself lies at √(2 ln 2) · √2 σ = 1.67 σ.
     smooth_px = math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
     return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
@@ -194,8 +195,9 @@ def _cluster(
     about = members if len(wanted) == len(members) else [members[k] for k in wanted]
     box = _window_box(about, prepared)
     image_e, state = cut(
-        prepared.pixels, prepared.lit_at, owner, prepared.bad_at, (box.top, box.left, box.height, box.width),
-        np.array(indices), prepared.clipped_dn, _TOUCHING_PX, _KEPT_PX,
+        *prepared.pixels[:3], prepared.lit_at, owner, prepared.bad_at,
+        (box.top, box.left, box.height, box.width), np.array(indices), prepared.clipped_dn,
+        _TOUCHING_PX, _KEPT_PX,
     )  # fmt: skip
     u_px, v_px = members[0].u_px, members[0].v_px
     structure, sigma_e = prepared.structure_at(u_px, v_px, box.height)

@@ -9,7 +9,8 @@ from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import brightest, candidates, clusters, is_extended
 from perception.robust.measure import Measurement, measure
 from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
-from perception.robust.search.frame import ring_level
+from perception.robust.search.cutout import ring_median
+from perception.robust.search.frame import filtered
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.types import Calibration, Detection, RawFrame
 
@@ -59,7 +60,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     prepared = prepare(frame, calibration)
     blobs = [
         blob
-        for component in blobs_at(prepared.lit_at, calibration.width_px)
+        for component in blobs_at(prepared.lit_at, prepared.lit_e, calibration.width_px)
         for blob in _split(component, prepared)
         if _stands_above_surroundings(blob, prepared)
     ]
@@ -94,31 +95,28 @@ def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
     -------
     True also where the frame's edges leave too little of the ring.
     """
-    box = blob.box
-    gap_px = math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1
-    level_e, count = ring_level(
-        prepared.pixels,
-        prepared.kernel,
-        prepared.bad_at,
-        (box.top, box.left, box.height, box.width),
-        gap_px,
-        _RING_PX,
-    )
+    box, (rows, columns) = blob.box, prepared.shape
+    inner = box.with_margin(math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1)
+    outer = inner.with_margin(_RING_PX)
+    top, left = max(outer.top, 0), max(outer.left, 0)
+    height, width = min(outer.top + outer.height, rows) - top, min(outer.left + outer.width, columns) - left
+    around_e = filtered(prepared.pixels, prepared.kernel, prepared.bad_at, (top, left, height, width))
+    first, start = inner.top - top, inner.left - left
+    level_e, count = ring_median(around_e, (first, first + inner.height, start, start + inner.width))
     if count < _FEWEST_RING_PIXELS:
         return True
     middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
     noise_e = prepared.filtered_noise * math.sqrt(max(level_e + middle_e, 0.0) + prepared.floor_e2)
-    return float(prepared.filtered_in(blob).max()) - level_e > CONTRAST_SIGMAS * noise_e
+    return blob.peak_e - level_e > CONTRAST_SIGMAS * noise_e
 
 
 def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
     """Divide a component at maxima that differ by more than their noise."""
     box = component.box
-    brightness_e = prepared.filtered_in(component)
     middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
-    expected_e = np.maximum(brightness_e + np.float32(middle_e), np.float32(0.0))
+    expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
-    return split_at_peaks(component, brightness_e, noise_e)
+    return split_at_peaks(component, noise_e)
 
 
 def _detection(

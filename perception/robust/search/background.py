@@ -13,13 +13,13 @@ from perception.types import Calibration, RawFrame
 CELL_PX = 64
 CLIP_SIGMA = 3.0
 CLIP_ROUNDS = 3
-STEPS_PER_NOISE, MOST_NOISES = 128, 8
+STEPS_PER_NOISE, MOST_NOISES = 64, 8
 
 LEAST_RATIO = 1.06
 """Parts of a frame whose scatter exceeds noise by less count as even: so exactly it is measured."""
 
-LEAST_RATIO_AROUND = 1.04
-"""As much the mean over 5 × 5 parts must have: of nine even frames of 1280 × 960 one has it, in one part."""
+LEAST_RATIO_AROUND = 1.05
+"""As much the mean over 5 × 5 parts must have: chance gives it to one even frame in a hundred or so."""
 
 _SAMPLES_PER_AXIS = 24
 _SCATTER_SAMPLES_PER_AXIS = 16
@@ -148,9 +148,7 @@ def cell_means(
             for count in range(low, high + 1):
                 total += count * int(count_of[count])
             means[down, across] = total / kept
-            for row in rows[down]:
-                for column in columns[across]:
-                    count_of[data_dn[row, column]] = 0
+            count_of[lowest : highest + 1] = 0
     return means
 
 

@@ -1,7 +1,8 @@
 """From a mask to blobs: connected components, and where one of them holds several flares."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,19 @@ _MAX_PEAKS = 16
 
 @dataclass(frozen=True, eq=False)
 class Blob:
-    """One flare's pixels: a box, and which pixels of it belong, shape (box.height, box.width)."""
+    """One flare's pixels: a box, and which pixels of it belong, shape (box.height, box.width).
+
+    `filtered_e`, of the same shape, is the filtered image there, 0 elsewhere; empty if only a mask is known.
+    """
 
     box: PixelBox
     pixels: NDArray[np.bool_]
+    filtered_e: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0), dtype=np.float32))
+
+    @cached_property
+    def peak_e(self) -> float:
+        """Maximum of the filtered image."""
+        return float(self.filtered_e.max())
 
     @property
     def area_px(self) -> int:
@@ -32,24 +42,28 @@ class Blob:
 
 def components(mask: NDArray[np.bool_], min_area_px: int = 1) -> list[Blob]:
     """Find connected components (8 neighbours) of at least a given area, by their first row."""
-    found = blobs_at(np.flatnonzero(mask), mask.shape[1])
+    places = np.flatnonzero(mask)
+    found = blobs_at(places, np.ones(len(places), dtype=np.float32), mask.shape[1])
     return [blob for blob in found if blob.area_px >= min_area_px]
 
 
-def blobs_at(places: NDArray[np.int64], width: int) -> list[Blob]:
+def blobs_at(places: NDArray[np.int64], filtered_e: NDArray[np.float32], width: int) -> list[Blob]:
     """Find connected components (8 neighbours) of pixels, given as their indices in a frame, in order.
 
-    Only what is marked is looked at: in most frames that is next to nothing.
+    `filtered_e` is the filtered image at these places, `width` the frame's. Only what is marked is looked at:
+    in most frames that is next to nothing.
     """
     labels, boxes = _labelled(places, width)
     order = np.argsort(labels, kind="stable")
     ends = np.cumsum(np.bincount(labels, minlength=len(boxes)))
     rows, columns = np.divmod(places[order], width)
-    blobs, first = [], 0
+    values, blobs, first = filtered_e[order], [], 0
     for end, (top, left, bottom, right) in zip(ends.tolist(), boxes.tolist(), strict=True):
         pixels = np.zeros((bottom - top, right - left), dtype=bool)
-        pixels[rows[first:end] - top, columns[first:end] - left] = True
-        blobs.append(Blob(PixelBox(top, left, *pixels.shape), pixels))
+        image_e = np.zeros(pixels.shape, dtype=np.float32)
+        at = (rows[first:end] - top, columns[first:end] - left)
+        pixels[at], image_e[at] = True, values[first:end]
+        blobs.append(Blob(PixelBox(top, left, *pixels.shape), pixels, image_e))
         first = end
     return blobs
 
@@ -109,9 +123,7 @@ def _join(leader: NDArray[np.int64], one: int, other: int) -> None:
     leader[max(one, other)] = min(one, other)
 
 
-def split_at_peaks(
-    blob: Blob, brightness: NDArray[np.float32], noise: NDArray[np.float32], dip: float = 0.05
-) -> list[Blob]:
+def split_at_peaks(blob: Blob, noise: NDArray[np.float32], dip: float = 0.05) -> list[Blob]:
     """Divide a blob among its distinct local maxima.
 
     Two maxima are distinct if the lowest saddle between them lies below the fainter one by more than 5 σ of
@@ -122,10 +134,8 @@ def split_at_peaks(
     ----------
     blob
         A connected component.
-    brightness
-        The filtered image within the blob's box, shape (box.height, box.width).
     noise
-        Standard deviation of `brightness`, same shape.
+        Standard deviation of its filtered image, shape (box.height, box.width).
     dip
         Least relative depth of a saddle.
 
@@ -133,6 +143,7 @@ def split_at_peaks(
     -------
     The blob itself, or one blob for each maximum, brightest first.
     """
+    brightness = blob.filtered_e
     peaks = _peaks(blob.pixels, brightness, noise, dip)
     if len(peaks) == 1:
         return [blob]
@@ -240,4 +251,5 @@ def _trimmed(blob: Blob, pixels: NDArray[np.bool_]) -> Blob:
     top, left = int(rows[0]), int(columns[0])
     height, width = int(rows[-1]) - top + 1, int(columns[-1]) - left + 1
     box = PixelBox(blob.box.top + top, blob.box.left + left, height, width)
-    return Blob(box, pixels[top : top + height, left : left + width])
+    inside = np.s_[top : top + height, left : left + width]
+    return Blob(box, pixels[inside], np.where(pixels[inside], blob.filtered_e[inside], np.float32(0.0)))

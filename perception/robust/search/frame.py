@@ -1,4 +1,4 @@
-"""Loops over the pixels of a raw frame, compiled: filtered, looked at around a blob, cut into windows.
+"""Loops over the pixels of a raw frame, compiled: what exceeds the background, and what a point filter finds.
 
 Electrons are made of counts where they are wanted, and the smooth background is interpolated there: no image
 of the frame's size is made but the filtered one.
@@ -11,14 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.layout import CLIPPED, SEEN, UNUSABLE
 
 Float32 = NDArray[np.float32]
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
-
-OWN, OTHERS, STRAY = 1, 2, 3
-"""Whose the light of a lit pixel is: that of a window's flares, of others, or of what is no flare."""
 
 
 class Pixels(NamedTuple):
@@ -71,7 +67,8 @@ def filtered(pixels: Pixels, kernel: Float32, bad_at: Places, box: tuple[int, in
     """Correlate what exceeds the background with a kernel along both axes, within a box inside the frame.
 
     Zero is what lies beyond the frame, which is what is expected there, and so are bad pixels. The box is
-    (top, left, height, width); the kernel is symmetric, and of odd length.
+    (top, left, height, width); the kernel is symmetric, of the sum 1, and has a multiple of three weights on
+    either side of its middle (`in_threes`).
     """
     top, left, height, width = box
     half, padded = len(kernel) // 2, np.empty(width + len(kernel) - 1, dtype=np.float32)
@@ -90,6 +87,9 @@ def exceeding(
 ) -> tuple[Places, Float32, Float32]:
     """Filter a whole frame, and keep what exceeds a limit, and samples of the rest.
 
+    Rows are filtered along themselves first. Their weighted sum exceeds a limit only where one of them does:
+    so rows are summed only where that is so, next to nowhere in most frames, and where samples are taken.
+
     Parameters
     ----------
     pixels, kernel
@@ -104,32 +104,69 @@ def exceeding(
     The pixels above the limit, as indices in the frame, in order; the filtered image there; and the samples.
     """
     rows, columns = pixels.data_dn.shape
-    half, none = len(kernel) // 2, np.empty(0, dtype=np.int64)
-    across = np.zeros((len(kernel), columns), dtype=np.float32)
-    padded = np.empty(columns + 2 * half, dtype=np.float32)
-    result, limit = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
+    taps, half, none = len(kernel), len(kernel) // 2, np.empty(0, dtype=np.int64)
+    across = np.zeros((taps, columns), dtype=np.float32)
+    padded, result = np.empty(columns + 2 * half, dtype=np.float32), np.empty(columns, dtype=np.float32)
+    # The lowest limit that any of the rows may have in whose sum a row is.
+    lowest_e = np.minimum(np.minimum(limit_e, _shifted(limit_e, 1)), _shifted(limit_e, -1))
+    bright, count_of = np.empty((taps, columns), dtype=np.int64), np.zeros(taps, dtype=np.int64)
+    latest = np.full(columns, -1)
     samples = np.empty((sample_of.max() + 1, len(sampled)), dtype=np.float32)
     places, values, count = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.float32), 0
-    for ahead in range(-half, rows + half):
-        _filter_row(pixels, kernel, none, ahead, 0, padded, across[ahead % len(kernel)])
-        row = ahead - half
+    for ahead in range(rows + half):
+        now, row = ahead % taps, ahead - half
+        _filter_row(pixels, kernel, none, ahead, 0, padded, across[now])
+        one, other, _ = between(min(ahead, rows - 1), rows, len(limit_e))
+        count_of[now] = _brighter(across[now], lowest_e[one], lowest_e[other], bright[now])
         if row < 0:
             continue
-        _sum_rows(across, kernel, row, result)
         if sample_of[row] >= 0:
+            _sum_rows(across, kernel, row, result)
             for at in range(len(sampled)):
                 samples[sample_of[row], at] = result[sampled[at]]
+        if not count_of.any():
+            continue
         one, other, share = between(row, rows, len(limit_e))
-        _blend(limit_e[one], limit_e[other], np.float32(share), limit)
-        more = _count_above(result, limit)
-        if count + more > len(places):
-            places = np.append(places, np.empty(2 * (count + more), dtype=np.int64))
-            values = np.append(values, np.empty(2 * (count + more), dtype=np.float32))
-        for column in range(columns if more else 0):
-            if result[column] > limit[column]:
-                places[count], values[count] = row * columns + column, result[column]
-                count += 1
+        rest, part, before = np.float32(1.0 - share), np.float32(share), count
+        for line in range(taps):
+            for column in bright[line, : count_of[line]]:
+                if latest[column] == row:
+                    continue
+                latest[column] = row
+                total = np.float32(0.0)
+                for step in range(taps):
+                    total += kernel[step] * across[(row + step - half) % taps, column]
+                if total > rest * limit_e[one, column] + part * limit_e[other, column]:
+                    if count == len(places):
+                        places = np.append(places, np.empty(count, dtype=np.int64))
+                        values = np.append(values, np.empty(count, dtype=np.float32))
+                    places[count], values[count] = row * columns + column, total
+                    count += 1
+        order = np.argsort(places[before:count])
+        places[before:count], values[before:count] = places[before:count][order], values[before:count][order]
     return places[:count].copy(), values[:count].copy(), samples
+
+
+@compiled
+def _shifted(mesh: Float32, by: int) -> Float32:
+    """Return a mesh moved by some rows, its first or last one repeated."""
+    moved = np.empty_like(mesh)
+    for row in range(len(mesh)):
+        moved[row] = mesh[min(max(row + by, 0), len(mesh) - 1)]
+    return moved
+
+
+@compiled
+def _brighter(row: Float32, one: Float32, other: Float32, into: Places) -> int:
+    """Write which pixels of a row exceed the lower one of two limits, and return how many do."""
+    if _count_above(row, one, other) == 0:
+        return 0
+    count = 0
+    for column in range(len(row)):
+        if row[column] > min(one[column], other[column]):
+            into[count] = column
+            count += 1
+    return count
 
 
 @compiled
@@ -151,46 +188,64 @@ def above(places: Places, values: Float32, limit_e: Float32, rows: int) -> NDArr
 def _filter_row(
     pixels: Pixels, kernel: Float32, bad_at: Places, row: int, left: int, padded: Float32, into: Float32
 ) -> None:
-    """Write a part of a row, from a column on, filtered along itself; `padded` has room for its ends."""
+    """Write what a part of a row, from a column on, exceeds the background by, filtered along itself.
+
+    `padded` has room for its ends. What lies beyond the frame, and bad pixels, are taken to be background.
+    """
     rows, columns = pixels.data_dn.shape
     width, half = len(into), len(kernel) // 2
     if not 0 <= row < rows:
         into[:] = 0.0
         return
-    one, other, share = between(row, rows, len(pixels.ground_e))
     first, end = max(left - half, 0), min(left + width + half, columns)
-    padded[:] = 0.0
-    excess, counts = padded[first - left + half :][: end - first], pixels.data_dn[row, first:end]
-    _blend(pixels.ground_e[one, first:end], pixels.ground_e[other, first:end], np.float32(share), excess)
-    black, scale = np.float32(pixels.black_level_dn), np.float32(pixels.e_per_dn)
-    for column in range(len(excess)):
-        excess[column] = (np.float32(counts[column]) - black) * scale - excess[column]
+    start = first - left + half
+    counts, within = pixels.data_dn[row, first:end], padded[start:][: end - first]
+    for column in range(len(within)):
+        within[column] = np.float32(counts[column])
+    padded[:start] = _ground_dn(pixels, row, first)
+    padded[start + end - first :] = _ground_dn(pixels, row, end - 1)
     if len(bad_at):
         at = np.searchsorted(bad_at, row * columns + first)
         while at < len(bad_at) and bad_at[at] < row * columns + end:
-            excess[bad_at[at] - row * columns - first] = 0.0
+            column = bad_at[at] - row * columns
+            within[column - first] = _ground_dn(pixels, row, column)
             at += 1
     _weigh(padded[half:][:width], kernel[half], into)
-    for step in range(1, half + 1):
-        _add_both(padded[half - step :][:width], padded[half + step :][:width], kernel[half + step], into)
+    for step in range(1, half + 1, 3):
+        before = (
+            padded[half - step :][:width],
+            padded[half - step - 1 :][:width],
+            padded[half - step - 2 :][:width],
+        )
+        behind = (
+            padded[half + step :][:width],
+            padded[half + step + 1 :][:width],
+            padded[half + step + 2 :][:width],
+        )
+        _add_six(before, behind, kernel[half + step : half + step + 3], into)
+    one, other, share = between(row, rows, len(pixels.ground_e))
+    above, below = pixels.ground_e[one, left : left + width], pixels.ground_e[other, left : left + width]
+    scale, part, rest = np.float32(pixels.e_per_dn), np.float32(share), np.float32(1.0 - share)
+    black_e = np.float32(pixels.black_level_dn * pixels.e_per_dn)
+    for column in range(width):
+        into[column] = into[column] * scale - black_e - (rest * above[column] + part * below[column])
+
+
+@compiled
+def _ground_dn(pixels: Pixels, row: int, column: int) -> np.float32:
+    """Return the background of a pixel in counts."""
+    return np.float32(ground_at(pixels, row, column) / pixels.e_per_dn + pixels.black_level_dn)
 
 
 @compiled
 def _sum_rows(across: Float32, kernel: Float32, row: int, into: Float32) -> None:
     """Write a row filtered across rows too; `across` holds the nearest, each where its number leaves it."""
-    half = len(kernel) // 2
-    _weigh(across[row % len(kernel)], kernel[half], into)
-    for step in range(1, half + 1):
-        up, down = across[(row - step) % len(kernel)], across[(row + step) % len(kernel)]
-        _add_both(up, down, kernel[half + step], into)
-
-
-@compiled
-def _blend(one: Float32, other: Float32, share: np.float32, into: Float32) -> None:
-    """Write what lies between two rows."""
-    rest = np.float32(1.0) - share
-    for column in range(len(into)):
-        into[column] = rest * one[column] + share * other[column]
+    half, taps = len(kernel) // 2, len(kernel)
+    _weigh(across[row % taps], kernel[half], into)
+    for step in range(1, half + 1, 3):
+        up = across[(row - step) % taps], across[(row - step - 1) % taps], across[(row - step - 2) % taps]
+        down = across[(row + step) % taps], across[(row + step + 1) % taps], across[(row + step + 2) % taps]
+        _add_six(up, down, kernel[half + step : half + step + 3], into)
 
 
 @compiled
@@ -201,18 +256,30 @@ def _weigh(row: Float32, factor: np.float32, into: Float32) -> None:
 
 
 @compiled
-def _add_both(one: Float32, other: Float32, factor: np.float32, into: Float32) -> None:
-    """Add the sum of two rows times a factor."""
+def _add_six(
+    before: tuple[Float32, Float32, Float32],
+    behind: tuple[Float32, Float32, Float32],
+    weights: Float32,
+    into: Float32,
+) -> None:
+    """Add three pairs of rows, each times its weight."""
+    one, two, three = before
+    first, second, third = behind
+    a, b, c = weights[0], weights[1], weights[2]
     for column in range(len(into)):
-        into[column] += factor * (one[column] + other[column])
+        into[column] += (
+            a * (one[column] + first[column])
+            + b * (two[column] + second[column])
+            + c * (three[column] + third[column])
+        )
 
 
 @compiled
-def _count_above(row: Float32, limit: Float32) -> int:
-    """Count how many pixels of a row exceed a limit."""
+def _count_above(row: Float32, one: Float32, other: Float32) -> int:
+    """Count how many pixels of a row exceed the lower one of two limits."""
     count = 0
     for column in range(len(row)):
-        count += row[column] > limit[column]
+        count += row[column] > min(one[column], other[column])
     return count
 
 
@@ -230,6 +297,16 @@ def without(places: Places, values: Float32, pixels: Pixels, kernel: Float32, ba
                 across = places[at] - near_row * columns - column
                 values[at] -= kernel[half + near_row - row] * kernel[half + across] * excess
                 at += 1
+
+
+@compiled
+def excess_at(pixels: Pixels, places: Places) -> Array:
+    """Return by how many electrons pixels, indices in the frame, exceed the background."""
+    excess, columns = np.empty(len(places)), pixels.data_dn.shape[1]
+    for index, place in enumerate(places):
+        row, column = place // columns, place % columns
+        excess[index] = electrons_at(pixels, row, column) - ground_at(pixels, row, column)
+    return excess
 
 
 @compiled
@@ -258,151 +335,3 @@ def neighbours(
                 around[index] += seen - ground_at(pixels, near_row, near)
                 variance[index] += max(seen, 0.0) + floor_e2
     return own, around, variance
-
-
-@compiled
-def ring_level(
-    pixels: Pixels, kernel: Float32, bad_at: Places, box: tuple[int, int, int, int], gap_px: int, wide_px: int
-) -> tuple[float, int]:
-    """Return the median of the filtered image over a frame of pixels around a box, and how many there are.
-
-    The box is (top, left, height, width); the frame begins `gap_px` beyond it and is `wide_px` wide.
-    """
-    rows, columns = pixels.data_dn.shape
-    top, left = box[0] - gap_px, box[1] - gap_px
-    bottom, right = box[0] + box[2] + gap_px, box[1] + box[3] + gap_px
-    first_row, end_row = max(0, top - wide_px), min(rows, bottom + wide_px)
-    first, end = max(0, left - wide_px), min(columns, right + wide_px)
-    near = filtered(pixels, kernel, bad_at, (first_row, first, end_row - first_row, end - first))
-    values, count = np.empty(near.size, dtype=np.float32), 0
-    for row in range(first_row, end_row):
-        inside = top <= row < bottom
-        for column in range(first, end):
-            if not (inside and left <= column < right):
-                values[count] = near[row - first_row, column - first]
-                count += 1
-    return (float(np.median(values[:count])) if count else 0.0), count
-
-
-@compiled
-def _is_among(places: Places, place: int) -> bool:
-    """Tell whether a place is one of some, which are in order."""
-    at = np.searchsorted(places, place)
-    return bool(at < len(places) and places[at] == place)
-
-
-@compiled
-def light_of(
-    pixels: Pixels, bad_at: Places, places: Places, clipped_dn: int
-) -> tuple[float, float, float, int]:
-    """Look at a blob's pixels, indices in the frame: centroid (u, v), flux in electrons, clipped pixels.
-
-    The centroid is weighted by what exceeds the background; pixels that are bad count nowhere.
-    """
-    columns = pixels.data_dn.shape[1]
-    u, v, weight, flux, clipped, even_u, even_v = 0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0
-    for place in places:
-        row, column = place // columns, place % columns
-        even_u += column / len(places)
-        even_v += row / len(places)
-        if len(bad_at) and _is_among(bad_at, place):
-            continue
-        light = electrons_at(pixels, row, column) - ground_at(pixels, row, column)
-        clipped += pixels.data_dn[row, column] >= clipped_dn
-        flux += light
-        u += max(light, 0.0) * column
-        v += max(light, 0.0) * row
-        weight += max(light, 0.0)
-    if not weight > 0.0:
-        return even_u, even_v, flux, clipped
-    return u / weight, v / weight, flux, clipped
-
-
-@compiled
-def cut(
-    pixels: Pixels, lit_at: Places, owner: Places, bad_at: Places,
-    box: tuple[int, int, int, int], own: Places, clipped_dn: int, touching_px: int, kept_px: int,
-) -> tuple[Array, NDArray[np.uint8]]:  # fmt: skip
-    """Cut a window out of a frame: its electrons, and what each of its pixels is.
-
-    Parameters
-    ----------
-    pixels
-        The frame.
-    lit_at, owner
-        Its lit pixels, as indices in order, and the number of the flare that each belongs to; -1 for light
-        that is no flare's.
-    bad_at
-        Its bad pixels, in order.
-    box
-        Top, left, height and width; it may reach beyond the frame.
-    own
-        Numbers of the window's flares.
-    clipped_dn
-        Count from which on a pixel is clipped.
-    touching_px
-        Light that is no flare's is left out unless it comes so near: then it is what the flares stand on.
-    kept_px
-        What lies so near to what is left out is left out, too.
-
-    Returns
-    -------
-    Shape (height, width) both; the second is of `model.layout`'s states.
-    """
-    top, left, height, width = box
-    rows, columns = pixels.data_dn.shape
-    image, state = np.zeros((height, width)), np.full((height, width), SEEN, dtype=np.uint8)
-    whose = np.zeros((height, width), dtype=np.int8)
-    stray = False
-    for row in range(height):
-        at_row = min(max(top + row, 0), rows - 1)
-        for column in range(width):
-            at = min(max(left + column, 0), columns - 1)
-            image[row, column] = electrons_at(pixels, at_row, at)
-            if at_row != top + row or at != left + column:
-                state[row, column] = UNUSABLE
-            elif pixels.data_dn[at_row, at] >= clipped_dn:
-                state[row, column] = CLIPPED
-        if at_row != top + row:
-            continue
-        lit = np.searchsorted(lit_at, at_row * columns + max(left, 0))
-        while lit < len(lit_at) and lit_at[lit] < at_row * columns + min(left + width, columns):
-            column = lit_at[lit] - at_row * columns - left
-            if owner[lit] < 0:
-                whose[row, column] = STRAY
-                stray = True
-            else:
-                whose[row, column] = OTHERS
-                for one in own:
-                    if owner[lit] == one:
-                        whose[row, column] = OWN
-            lit += 1
-    for place in bad_at:
-        row, column = place // columns - top, place % columns - left
-        if 0 <= row < height and 0 <= column < width:
-            state[row, column] = UNUSABLE
-    touching = stray and _comes_near(whose, touching_px)
-    for row in range(height):
-        for column in range(width):
-            if whose[row, column] == OTHERS or (whose[row, column] == STRAY and not touching):
-                state[
-                    max(0, row - kept_px) : row + kept_px + 1, max(0, column - kept_px) : column + kept_px + 1
-                ] = UNUSABLE
-    return image, state
-
-
-@compiled
-def _comes_near(whose: NDArray[np.int8], within_px: int) -> bool:
-    """Tell whether light that is no flare's comes near to the flares of a window, inside it."""
-    height, width = whose.shape
-    for row in range(height):
-        for column in range(width):
-            if whose[row, column] != OWN:
-                continue
-            near = whose[
-                max(0, row - within_px) : row + within_px + 1,
-                max(0, column - within_px) : column + within_px + 1,
-            ]
-            if (near == STRAY).any():
-                return True
-    return False

@@ -18,6 +18,11 @@ def point_kernel(psf_sigma_px: float) -> NDArray[np.float64]:
     return np.asarray(share / share.sum())
 
 
+def in_threes(kernel: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Lengthen a kernel by zeros to a multiple of three weights on either side, as `frame` wants it."""
+    return np.pad(kernel, -(len(kernel) // 2) % 3).astype(np.float32)
+
+
 def detection_limit_e(
     background_e: NDArray[np.floating],
     floor_e2: float,

@@ -18,7 +18,6 @@ from perception.robust.search.background import (
     scatter_ratio,
     spread_mesh,
 )
-from perception.robust.search.blobs import Blob
 from perception.robust.search.frame import (
     Pixels,
     above,
@@ -28,7 +27,7 @@ from perception.robust.search.frame import (
     neighbours,
     without,
 )
-from perception.robust.search.limit import limit_mesh_of, point_kernel
+from perception.robust.search.limit import in_threes, limit_mesh_of, point_kernel
 from perception.robust.structure import autocorrelation, structure_of
 from perception.types import Calibration, RawFrame
 
@@ -75,7 +74,7 @@ class PreparedFrame:
     texture_e: NDArray[np.float32] | None
     bad_at: NDArray[np.int64]
 
-    @property
+    @cached_property
     def clipped_dn(self) -> int:
         """Count from which on a pixel is clipped."""
         return saturation_dn(self.calibration, self.frame.gain)
@@ -85,16 +84,10 @@ class PreparedFrame:
         """Rows and columns of the frame."""
         return self.calibration.height_px, self.calibration.width_px
 
-    @property
+    @cached_property
     def filtered_noise(self) -> float:
         """Noise of the filtered image relative to that of a pixel, √Σh²."""
         return float(np.sum(self.kernel**2))
-
-    def filtered_in(self, blob: Blob) -> NDArray[np.float32]:
-        """Return the filtered image in a blob of lit pixels, 0 elsewhere in its box."""
-        image_e = np.zeros(blob.pixels.shape, dtype=np.float32)
-        image_e[blob.pixels] = self.lit_e[np.searchsorted(self.lit_at, blob.places(self.shape[1]))]
-        return image_e
 
     @cached_property
     def lit(self) -> NDArray[np.bool_]:
@@ -174,7 +167,7 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     """
     floor_e2 = noise_floor_e2(calibration, frame.gain)
     kernel = point_kernel(calibration.psf_sigma_px)
-    narrow = kernel.astype(np.float32)
+    narrow = in_threes(kernel)
     filtered_noise = float(np.sum(kernel**2))
     mesh_e = background_mesh_e(frame, calibration)
     pixels = Pixels(

@@ -7,8 +7,9 @@ from scipy.ndimage import correlate1d
 from scipy.stats import norm, poisson
 
 from perception.robust.search.background import background_mesh_e, cell_means, cell_scatter, spread_mesh
-from perception.robust.search.frame import Pixels, above, filtered
-from perception.robust.search.limit import FALSE_ALARMS_PER_PIXEL, detection_limit_e, point_kernel
+from perception.robust.search.frame import Pixels, above, exceeding, filtered, without
+from perception.robust.search.limit import FALSE_ALARMS_PER_PIXEL, detection_limit_e, in_threes, point_kernel
+from perception.types import Calibration
 from tests.unit.perception.simulation import calibration, expose, random
 
 
@@ -101,37 +102,62 @@ def correlate(image: NDArray[np.floating], kernel: NDArray[np.float64]) -> NDArr
     return np.asarray(correlate1d(once, kernel, axis=1, mode="constant"))
 
 
-def test_filtered_electrons_are_those_of_another_library() -> None:
-    """On a slope of background between mesh points, up to the borders: within 10⁻⁴ e of scipy's and OpenCV's."""
+def slope_of(camera: Calibration) -> tuple[Pixels, NDArray[np.float64]]:
+    """Random counts on a background that rises from row to row of the mesh, and what exceeds it in electrons."""
+    counts = random(25).integers(60, 4000, (camera.height_px, camera.width_px)).astype(np.uint16)
+    mesh_e = np.array([[3.0], [50.0], [20.0]], dtype=np.float32).repeat(3, axis=1)
+    wide_e = mesh_e[:, :1].repeat(camera.width_px, axis=1)
+    excess_e = (counts - 64.0) / 0.74 - spread_mesh(mesh_e, camera)
+    return Pixels(counts, 64.0, 1.0 / 0.74, wide_e), np.asarray(excess_e, dtype=np.float64)
+
+
+@pytest.mark.parametrize("psf_sigma_px", [0.5, 0.7, 1.3])
+def test_filtered_electrons_are_those_of_another_library(psf_sigma_px: float) -> None:
+    """The whole frame up to its borders, and a part of it, against scipy's correlation; one pixel is bad."""
     camera = calibration(width_px=150, height_px=90)
-    counts = random(25).integers(60, 4000, (90, 150)).astype(np.uint16)
-    mesh_e = np.array([[3.0, 9.0, 4.0], [20.0, 50.0, 2.0]], dtype=np.float32)
-    wide_e = np.array(
-        [np.interp(np.arange(150), [24.5, 74.5, 124.5], line) for line in mesh_e], dtype=np.float32
-    )
-    kernel = point_kernel(0.9)
-    found = filtered(Pixels(counts, 64.0, 1.0 / 0.74, wide_e), kernel.astype(np.float32))
-    expected = correlate((counts - 64.0) / 0.74 - spread_mesh(mesh_e, camera), kernel)
-    np.testing.assert_allclose(found, expected, atol=1e-2, rtol=1e-5)
+    pixels, excess_e = slope_of(camera)
+    kernel, bad_at = point_kernel(psf_sigma_px), np.array([40 * 150 + 70])
+    expected = correlate(excess_e, kernel)
+    whole = filtered(pixels, in_threes(kernel), np.empty(0, dtype=np.int64), (0, 0, 90, 150))
+    np.testing.assert_allclose(whole, expected, atol=0.02)
+    excess_e[40, 70] = 0.0
+    part = filtered(pixels, in_threes(kernel), bad_at, (30, 55, 25, 40))
+    np.testing.assert_allclose(part, correlate(excess_e, kernel)[30:55, 55:95], atol=0.02)
+    places = np.arange(150 * 90)
+    values = whole.ravel().copy()
+    without(places, values, pixels, in_threes(kernel), bad_at)
+    np.testing.assert_allclose(values.reshape(90, 150), correlate(excess_e, kernel), atol=0.02)
 
 
 def test_what_exceeds_the_limit_is_found_in_order() -> None:
-    image = random(26).normal(size=(37, 41)).astype(np.float32)
-    limit = np.array([[0.5], [1.5]], dtype=np.float32).repeat(41, axis=1)
-    rows = np.interp(np.arange(37), [8.75, 27.25], [0.5, 1.5])
-    assert above(image, limit).tolist() == np.flatnonzero(image > rows[:, None]).tolist()
+    """With a limit that jumps from one mesh row to the next, where rows below it take part in sums above it."""
+    camera = calibration(width_px=150, height_px=90)
+    pixels, _ = slope_of(camera)
+    kernel = in_threes(point_kernel(0.7))
+    limit_e = np.array([[2300.0], [3000.0], [2600.0]], dtype=np.float32).repeat(150, axis=1)
+    sample_of = np.full(90, -1)
+    sample_of[[5, 50]] = (0, 1)
+    sampled = np.array([0, 77, 149])
+    places, values, samples = exceeding(pixels, kernel, limit_e, sample_of, sampled)
+    image = filtered(pixels, kernel, np.empty(0, dtype=np.int64), (0, 0, 90, 150))
+    limit = np.interp(np.arange(90), [14.5, 44.5, 74.5], limit_e[:, 0])
+    assert places.tolist() == np.flatnonzero(image > limit[:, None]).tolist()
+    assert len(places) > 500
+    np.testing.assert_allclose(values, image.ravel()[places], rtol=1e-5)
+    np.testing.assert_allclose(samples, image[np.ix_(np.array([5, 50]), sampled)], rtol=1e-4, atol=0.01)
+    kept = above(places, values, limit_e + np.float32(200.0), 90)
+    assert places[kept].tolist() == np.flatnonzero(image > limit[:, None] + 200.0).tolist()
 
 
 def test_scatter_of_cells_against_sorting() -> None:
     """Narrow, as noise, and 20 times as wide, beyond the histogram: within its step of the sorted samples'."""
-    rows, columns = np.arange(256).reshape(1, 256)[:, ::4], np.arange(400).reshape(2, 200)[:, ::5]
     for width in (1.0, 20.0):
-        image = random(27, int(width)).normal(0.0, 3.0 * width, (256, 400)).astype(np.float32)
-        found = cell_scatter(image, np.full((1, 2), 3.0, dtype=np.float32), rows, columns)
-        for cell in (0, 1):
-            samples = np.sort(image[np.ix_(rows[0], columns[cell])].ravel())
-            low, high = round(0.1587 * (samples.size - 1)), round(0.8413 * (samples.size - 1))
-            assert found[0, cell] == pytest.approx((samples[high] - samples[low]) / 6.0, abs=0.01)
+        samples = random(27, int(width)).normal(0.0, 3.0 * width, (64, 80)).astype(np.float32)
+        found = cell_scatter(samples, np.full((1, 2), 3.0, dtype=np.float32))
+        for cell, part in enumerate((samples[:, :40], samples[:, 40:])):
+            ordered = np.sort(part.ravel())
+            low, high = round(0.1587 * (ordered.size - 1)), round(0.8413 * (ordered.size - 1))
+            assert found[0, cell] == pytest.approx((ordered[high] - ordered[low]) / 6.0, abs=0.01)
 
 
 def test_means_of_cells_against_sorting() -> None:
@@ -148,12 +174,11 @@ def test_means_of_cells_against_sorting() -> None:
 
 
 def test_filter_keeps_the_place_and_is_quiet_at_the_border() -> None:
-    image = np.zeros((20, 30), np.uint16)
+    image, none, box = np.zeros((20, 30), np.uint16), np.empty(0, dtype=np.int64), (0, 0, 20, 30)
     image[7, 11] = 1000
-    kernel = point_kernel(0.7).astype(np.float32)
-    ground = np.zeros((1, 30), np.float32)
-    response = filtered(Pixels(image, 0.0, 1e-3, ground), kernel)
+    kernel, ground = in_threes(point_kernel(0.7)), np.zeros((1, 30), np.float32)
+    response = filtered(Pixels(image, 0.0, 1e-3, ground), kernel, none, box)
     assert response.argmax() == 7 * 30 + 11
     assert response.max() == pytest.approx(kernel.max() ** 2, rel=1e-6)
-    ones = filtered(Pixels(np.full((20, 30), 1000, np.uint16), 0.0, 1e-3, ground), kernel)
+    ones = filtered(Pixels(np.full((20, 30), 1000, np.uint16), 0.0, 1e-3, ground), kernel, none, box)
     assert ones[0, 0] < 0.7 < ones[10, 10] == pytest.approx(1.0, rel=1e-6)
