@@ -34,6 +34,7 @@ def main(arguments: "list[str]", root: Path = ROOT) -> int:
     """Do what is missing; return the exit status."""
     try:
         if arguments == ["--llvm"]:  # called by `set_up`, with the interpreter of .venv
+            compile_loops()
             finish_with_llvm(root)
         elif not is_complete(root):
             interpreter = find_interpreter()
@@ -197,6 +198,14 @@ def pip_environment(environ: "dict[str, str]") -> "dict[str, str]":
     for variable in ("PIP_CONSTRAINT", "PIP_BUILD_CONSTRAINT"):
         environ = {**environ, variable: f"{environ.get(variable, '')} constraints.txt".strip()}
     return environ
+
+
+def compile_loops() -> None:
+    """Compile the loops of perception, so that no first frame waits for it."""
+    import perception
+
+    say("compiling the loops of perception")
+    perception.warm_up()
 
 
 # LLVM

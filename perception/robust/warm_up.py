@@ -1,0 +1,39 @@
+"""A frame with something of everything, so that loops are compiled before the first frame that matters."""
+
+import numpy as np
+
+from perception.robust.detect import detect_robust
+from perception.types import Calibration, RawFrame
+
+_ROWS, _COLUMNS = 256, 320
+
+
+def warm_up() -> None:
+    """Compile the loops of the robust detector, where that has not been done on this machine.
+
+    It takes a minute once, when the package is new, and a moment after: to be called where a robot is set up,
+    or starts, so that no frame waits for it.
+    """
+    detect_robust(*_sample())
+
+
+def _sample() -> tuple[RawFrame, Calibration]:
+    """Return a frame with a lone flare, a clipped one, two that overlap, a bad pixel, and texture."""
+    calibration = Calibration(
+        camera="warm-up", width_px=_COLUMNS, height_px=_ROWS, fx_px=160.0, fy_px=160.0,
+        cx_px=0.5 * (_COLUMNS - 1), cy_px=0.5 * (_ROWS - 1),
+        rotation_body_camera=np.eye(3), position_body_m=np.zeros(3), system_gain_dn_per_e=0.5,
+        read_noise_e=4.0, black_level_dn=64.0, saturation_dn=4095, bit_depth=12, psf_sigma_px=0.8,
+        source_radius_m=0.01, wavelength_m=940e-9, response_angle_rad=np.array([0.0, 1.2]),
+        response_relative=np.array([1.0, 0.9]), range_constant_dn_m2_per_s=1e8,
+        range_constant_paper_dn_m2_per_s=7e6,
+    )  # fmt: skip
+    rows, columns = np.indices((_ROWS, _COLUMNS))
+    light_e = 20.0 + 60.0 * (columns > 0.5 * _COLUMNS) * (1.0 + np.sin(columns / 3.0) * np.sin(rows / 3.0))
+    for u, v, flux_e in ((40.3, 60.2, 9e3), (70.1, 150.4, 2e5), (100.0, 100.0, 9e3), (102.0, 101.5, 9e3)):
+        light_e += flux_e / 4.5 * np.exp(-0.5 * ((columns - u) ** 2 + (rows - v) ** 2) / 0.72)
+    noise = np.random.Generator(np.random.Philox(1))
+    electrons = noise.poisson(light_e) + noise.normal(0.0, calibration.read_noise_e, light_e.shape)
+    counts = np.clip(np.rint(0.5 * electrons + 64.0), 0, 4095).astype(np.uint16)
+    counts[20, 20] = 4095
+    return RawFrame("warm-up", 0, 0.0, 1e-3, counts, 64.0), calibration
