@@ -6,14 +6,18 @@ disk, so that only the first call on a machine (`make setup` makes it) takes lon
 without being compiled, far slower, where the variable NUMBA_DISABLE_JIT is set: to follow it in a debugger,
 and for the test that holds that both find the same.
 
-What is kept on disk is renewed when the file of a function changes, not when one does that it calls: so a
-compiled function calls compiled functions of its own file alone (a test holds it).
+What is kept on disk is renewed when the file of a function changes, not when another does. So a compiled
+function calls compiled functions of its own file alone (a test holds it), and the constants and named tuples
+that its file takes from others are a part of what it is known by.
 """
 
+import types
+import warnings
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar, cast
 
 import numba
+import numpy as np
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -24,8 +28,34 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
     Sums are made in the order in which they are written, so that every processor finds the same.
     """
+    known = _with_constants(cast("types.FunctionType", function))
     try:
-        made = numba.njit(function, nogil=True, error_model="numpy", cache=True)
-    except RuntimeError:  # there is no folder where it may be kept
-        made = numba.njit(function, nogil=True, error_model="numpy")
+        made = numba.njit(known, nogil=True, error_model="numpy", cache=True)
+    except RuntimeError:
+        warnings.warn(
+            "there is no folder where perception's compiled loops may be kept: every start compiles them "
+            "anew, for a minute; set NUMBA_CACHE_DIR to a folder that can be written",
+            stacklevel=2,
+        )
+        made = numba.njit(known, nogil=True, error_model="numpy")
     return cast("Callable[Arguments, Result]", made)
+
+
+def _with_constants(function: types.FunctionType) -> types.FunctionType:
+    """Return a function with the constants of its file in a closure: by that Numba tells functions apart."""
+    held = tuple(
+        (name, value.tobytes() if isinstance(value, np.ndarray) else getattr(value, "_fields", value))
+        for name, value in sorted(function.__globals__.items())
+        if name.upper() == name or hasattr(value, "_fields")
+    )
+    code = function.__code__
+    code = code.replace(co_freevars=(*code.co_freevars, "constants"))
+    closure = (*(function.__closure__ or ()), types.CellType(repr(held)))
+    made = types.FunctionType(code, function.__globals__, function.__name__, function.__defaults__, closure)
+    made.__doc__, made.__module__, made.__qualname__ = (
+        function.__doc__,
+        function.__module__,
+        function.__qualname__,
+    )
+    made.__annotations__ = function.__annotations__
+    return made

@@ -98,7 +98,7 @@ def detect_frames(
     calibrations
         Of each camera, by its name.
     estimator
-        As for `detect`.
+        As for `detect`; one's own is called by several threads at once.
 
     Returns
     -------

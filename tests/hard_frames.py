@@ -188,6 +188,41 @@ def lone(frames: int = 6, estimator: str = "robust") -> dict[str, Any]:
     return _counts(scored)
 
 
+def lone_sigmas(flare: Flare, camera: Calibration, background_e: float) -> Array:
+    """Return the Cramér–Rao sigmas of (u, v, ln F) of a point far from all others, background free too."""
+    far = Flare(flare.u_px + 15.0, flare.v_px + 15.0, flare.flux_e)
+    return np.asarray(pair_sigmas(flare, far, camera, background_e)[0])
+
+
+def lone_of(flux_e: float, frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
+    """Flares of one flux, anywhere in their pixels: errors of place and range over the bound, and claims."""
+    camera = replace(POINT, bit_depth=12, saturation_dn=4095)
+    scored, over_bound, pulls, errors = [], [], [], []
+    for index in range(frames):
+        places = random(18, index, round(flux_e)).random((CELLS * CELLS, 2))
+        flares = [
+            Flare(u + du, v + dv, flux_e) for (u, v), (du, dv) in zip(cell_centres(), places, strict=True)
+        ]
+        frame = frame_of(flares, camera, BACKGROUND_E, 19, index, round(flux_e))
+        scored.append(score(flares, perception.detect(frame, camera, estimator), 1.0))
+        for flare, hit in zip(flares, scored[-1].hits, strict=True):
+            if hit is None:
+                continue
+            true_m = flare.source(camera)[2]
+            error = np.array([hit.u_px - flare.u_px, hit.v_px - flare.v_px, hit.range_m / true_m - 1.0])
+            errors.append(error)
+            over_bound.append(error / (lone_sigmas(flare, camera, BACKGROUND_E) * (1.0, 1.0, 0.5)))
+            pulls.append(error / (hit.u_sigma_px, hit.v_sigma_px, hit.range_sigma_m / hit.range_m))
+    squares = np.square(np.array(pulls))
+    return {
+        **_counts(scored),
+        "rmse_over_bound_u_v_range": _rms(over_bound),
+        "bias_px_px_share": np.mean(errors, axis=0).round(6).tolist(),
+        "mean_nees_of_3": round(float(squares.sum(axis=1).mean()), 3),
+        "beyond_4_sigma": round(float(np.mean(squares > 16.0)), 6),
+    }
+
+
 def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
     """Points whose peak is so many times full scale."""
     camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=1e-6)
@@ -211,6 +246,7 @@ def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[st
         "only_a_bound": _share([not math.isfinite(hit.range_sigma_m) for _, hit in hits]),
         "range_rmse_share": _rms(errors),
         "pull_rms": _rms(pulls),
+        "greatest_pull": round(float(np.max(np.abs(pulls), initial=0.0)), 2),
     }
 
 
@@ -330,6 +366,7 @@ ROWS: dict[str, Callable[..., dict[str, Any]]] = {
     "pair 1:5 at 4 px": lambda **more: pairs(4.0, 5.0, **more),
     "pair 1:20 at 3 px": lambda **more: pairs(3.0, 20.0, **more),
     "lone": lone,
+    **{f"lone of {flux:g} e": lambda flux=flux, **more: lone_of(flux, **more) for flux in (1e3, 4e3, 1.6e4)},
     **{f"clipped {times} times": lambda times=times, **more: clipped(times, **more) for times in (3, 10, 20, 50)},
     "60 stuck pixels": lambda **more: bad_pixels(60, 0, **more),
     "120 hot pixels": lambda **more: bad_pixels(0, 120, **more),

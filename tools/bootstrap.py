@@ -60,7 +60,7 @@ def set_up(root: Path) -> None:
         write_stamp(root, None)
     # The interpreter of .venv does the rest: only it has Mitsuba to probe with.
     if subprocess.call([str(environment_python(root)), str(Path(__file__).resolve()), "--llvm"]) != 0:
-        raise SetupError("the search for LLVM broke off, see above; the same command goes on from here")
+        raise SetupError("the last part of it broke off, see above; the same command goes on from here")
     say(f"complete after {time.monotonic() - start_s:.0f} s")
 
 

@@ -67,8 +67,8 @@ def disc_nodes(
         np.concatenate(rules, axis=1),
         direction,
         angular_radius_rad,
-        calibration.response_angle_rad,
-        calibration.response_relative,
+        np.array(calibration.response_angle_rad, dtype=np.float64),
+        np.array(calibration.response_relative, dtype=np.float64),
     )
     # What lies beyond the lens's fold has no image: its light counts, and falls on no pixel.
     at_px = project(omega, calibration)

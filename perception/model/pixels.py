@@ -160,7 +160,7 @@ def expectation(
 
 @compiled
 def log_upper_tail(z: float) -> float:
-    """Return ln Q(z) of the normal distribution: to 10⁻¹² beyond z = 36, where Q itself is too small."""
+    """Return ln Q(z) of the normal distribution: to 10⁻⁸ beyond z = 36, where Q itself is too small."""
     if z < 0.0:
         return math.log1p(-0.5 * math.erfc(-z * _SQRT_HALF))
     if z < 36.0:

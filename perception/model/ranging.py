@@ -58,14 +58,6 @@ def flux_at_one_metre_dn(
     return np.asarray(calibration.range_constant_dn_m2_per_s * exposed_s)
 
 
-def flux_at_one_metre_e(
-    u_px: ArrayLike, v_px: ArrayLike, exposure_s: float, gain: float, calibration: Calibration
-) -> Array:
-    """As `flux_at_one_metre_dn`, in electrons."""
-    exposed_s = effective_exposure_s(u_px, v_px, exposure_s, gain, calibration)
-    return flux_e_of(exposed_s, gain, calibration)
-
-
 def flux_e_of(exposed_s: Array, gain: float, calibration: Calibration) -> Array:
     """Electrons that a source one metre away gives in an effective exposure (`effective_exposure_s`)."""
     at_one_metre_dn = calibration.range_constant_dn_m2_per_s * exposed_s

@@ -8,7 +8,10 @@ from numpy.typing import NDArray
 
 from perception.types import Calibration, RawFrame
 
-_LEAST = {"psf_sigma_px": 1e-3, "system_gain_dn_per_e": 1e-12, "read_noise_e": 0.0, "source_radius_m": 0.0}
+_LEAST = {
+    "psf_sigma_px": 1e-3, "system_gain_dn_per_e": 1e-12, "read_noise_e": 0.0, "dsnu_e": 0.0, "prnu": 0.0,
+    "source_radius_m": 0.0,
+}  # fmt: skip
 
 
 def check_frame(frame: RawFrame, calibration: Calibration) -> None:
@@ -41,12 +44,14 @@ def check_frame(frame: RawFrame, calibration: Calibration) -> None:
     if wrong:
         raise ValueError(
             f"{where}: its calibration has {', '.join(wrong)}; wanted finite numbers, psf_sigma_px and "
-            "system_gain_dn_per_e above 0, read_noise_e, source_radius_m and every sigma 0 or more"
+            "system_gain_dn_per_e above 0, all else and every sigma 0 or more"
         )
-    if not (frame.exposure_s > 0.0 and frame.gain > 0.0):
+    if not (0.0 < frame.exposure_s < math.inf and 0.0 < frame.gain < math.inf):
         raise ValueError(
             f"{where} has exposure_s = {frame.exposure_s} and gain = {frame.gain}; both must be positive"
         )
+    if not math.isfinite(frame.black_level_dn):
+        raise ValueError(f"{where} has black_level_dn = {frame.black_level_dn}; it must be a finite number")
 
 
 def gain_dn_per_e(frame: RawFrame, calibration: Calibration) -> float:

@@ -71,7 +71,8 @@ class Camera:
         """Return what compiled loops are told of the camera, and at how many electrons a pixel clips."""
         calibration = self.calibration
         tie_spread = self.tie_spread if self.radius_m > 0.0 else 0.0
-        return Known(calibration.psf_sigma_px, tie_spread, self.width_spread, clip_e, calibration.prnu)
+        width_px, prnu = float(calibration.psf_sigma_px), float(calibration.prnu)
+        return Known(width_px, float(tie_spread), float(self.width_spread), float(clip_e), prnu)
 
     def log_range(self, photometric: Array, slack: Array | None, covariance: Array) -> tuple[Array, Array]:
         """Return the logarithms of sources' ranges, and their standard deviations.
@@ -127,4 +128,5 @@ def lay_out(camera: Camera, u_px: Array, v_px: Array, log_range: Array) -> tuple
         radius_rad = np.where(imaged, radius_rad, 0.0)
     nodes = disc_nodes(u_px, v_px, direction, radius_rad, calibration)
     log_flux_at_1_m = np.log(np.where(at_1_m_e > 0.0, at_1_m_e, 1.0))
-    return Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.weight, log_range, log_flux_at_1_m), imaged
+    at = np.ascontiguousarray(log_range)
+    return Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.weight, at, log_flux_at_1_m), imaged

@@ -15,7 +15,7 @@ from perception.model.sensor import clip_level_e
 from perception.robust.search.blobs import Blob, near_groups
 from perception.robust.search.cutout import cut, light_of
 from perception.robust.search.frame import excess_at
-from perception.robust.search.prepare import PreparedFrame
+from perception.robust.search.prepare import MOST_STRUCTURED_PX, PreparedFrame
 from perception.robust.solve import Start, Window
 
 Array = NDArray[np.float64]
@@ -33,8 +33,8 @@ _KEPT_PX = 2
 MAX_IMAGE_RADIUS_PX = 20.0
 """Sources that look larger are measured by aperture: as good for them, and far cheaper than the fit."""
 
-# So few sizes of windows that those of many flares go through one batch.
-_SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, 129)
+# Few sizes of windows, as what texture looks like is reckoned once for each.
+_SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX)
 _CLIPPED_FACTORS = (1.0, 4.0, 16.0, 64.0)
 _CUT_FACTORS = (1.0, 2.0, 4.0)
 
@@ -207,7 +207,7 @@ def _cluster(
         state=state,
         floor_e2=prepared.floor_e2,
         clip_e=clip_level_e(calibration, frame.black_level_dn, frame.gain),
-        prnu=calibration.prnu,
+        prnu=float(calibration.prnu),
         structure=structure,
         structure_e=sigma_e,
     )

@@ -132,7 +132,7 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     parted = {}
     if prepared.frame.line_time_s == 0.0:
         parted = _parted([None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)], camera)
-    _retry_without_spill(best, parted, camera)
+    _retry_without_spill(best, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in best]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
     spread_e = {
@@ -218,23 +218,21 @@ def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[floa
             best[index] = again
 
 
-def _retry_without_spill(best: list[Solution | None], parted: Container[int], camera: Camera) -> None:
-    """Fit badly fitted clipped flares without the columns of their clipped pixels, where charge may spill."""
-    tried = [
-        (index, solution)
-        for index, solution in enumerate(best)
-        if solution is not None
-        and index not in parted
-        and solution.window.clipped.any()
-        and not solution.left_over.is_good
-    ]
-    problems = []
-    for _, solution in tried:
-        window = solution.window
-        spilled = window.clipped.any(axis=0)
-        dry = replace(window, state=np.where(spilled, UNUSABLE, window.state).astype(np.uint8))
-        problems.append(solution.again(dry))
-    for (index, _), again in zip(tried, solve(problems, camera), strict=True):
+def _retry_without_spill(
+    best: list[Solution | None], parted: Container[int], prepared: PreparedFrame, camera: Camera
+) -> None:
+    """Fit badly fitted clipped flares without the columns of clipped pixels, where charge may spill."""
+    tried, problems = [], []
+    for index, solution in enumerate(best):
+        if solution is None or index in parted or solution.left_over.is_good:
+            continue
+        # Also those of flares that are none of the window's.
+        spilled = prepared.clipped_columns(solution.window.box)
+        if spilled.any():
+            tried.append(index)
+            state = np.where(spilled, UNUSABLE, solution.window.state).astype(np.uint8)
+            problems.append(solution.again(replace(solution.window, state=state)))
+    for index, again in zip(tried, solve(problems, camera), strict=True):
         if again is not None and again.left_over.share < MOST_LEFT:
             best[index] = again
 
@@ -274,7 +272,8 @@ def _measurement(
     # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.
     range_m = math.nan
     if solution.ranged[index]:
-        range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * (flux_sigma_e / flux_e) ** 2)
+        relative = min(flux_sigma_e / flux_e, 1.0)
+        range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * relative**2)
     frame = prepared.frame
     clips = blob.pixels & (frame.data_dn[blob.box.slices] >= prepared.clipped_dn)
     if clips.any() and len(prepared.bad_at):

@@ -28,7 +28,7 @@ def is_one_pixel(solution: Solution) -> bool:
     """Tell whether a single pixel that is stuck or hot explains a window better than a lone flare does.
 
     A flare's light lies on its pixel's neighbours as well. χ² over 5 × 5 pixels is compared: of the even
-    background with one pixel free, and of the flare. (Bright ones `sensor.bad_pixels` has found before.)
+    background with one pixel free, and of the flare. (Bright ones `bad_pixels` has found before.)
     """
     window = solution.window
     return _is_one_pixel(

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from perception.model.fisher import flare_limit
+from perception.model.flare import PixelBox, flare_image
 from perception.robust.detect import detect_robust
 from perception.types import Calibration, RawFrame
 
@@ -9,12 +11,15 @@ _ROWS, _COLUMNS = 256, 320
 
 
 def warm_up() -> None:
-    """Compile the loops of the robust detector, where that has not been done on this machine.
+    """Compile the loops of the robust detector and of the limits, where that was not done on this machine.
 
     It takes a minute once, when the package is new, and a moment after: to be called where a robot is set up,
     or starts, so that no frame waits for it.
     """
-    detect_robust(*_sample())
+    frame, calibration = _sample()
+    detect_robust(frame, calibration)
+    flare_limit(calibration, 40.3, 60.2, 4.0, 9e3, 20.0)
+    flare_image(40.3, 60.2, 0.0025, PixelBox(50, 30, 21, 21), calibration)
 
 
 def _sample() -> tuple[RawFrame, Calibration]:

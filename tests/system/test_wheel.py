@@ -16,7 +16,7 @@ def test_the_wheel_carries_templates_presets_and_examples(tmp_path: Path) -> Non
         file.relative_to(ROOT).as_posix()
         for package in ("nir_render", "perception")
         for file in (ROOT / package).rglob("*")
-        if file.is_file() and file.suffix not in (".pyc", "")
+        if file.is_file() and file.suffix != "" and "__pycache__" not in file.parts
     }
     assert {
         "nir_render/report/base.html",

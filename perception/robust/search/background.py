@@ -139,8 +139,8 @@ def cell_means(
                 if clipping == CLIP_ROUNDS:
                     break
                 sigma = gain_dn_per_e * math.sqrt(max((median - black_dn) / gain_dn_per_e, 0.0) + floor_e2)
-                low = max(lowest, math.ceil(median - CLIP_SIGMA * sigma))
-                high = min(highest, math.floor(median + CLIP_SIGMA * sigma))
+                low = max(lowest, math.ceil(max(median - CLIP_SIGMA * sigma, 0.0)))
+                high = min(highest, math.floor(min(median + CLIP_SIGMA * sigma, 65535.0)))
                 kept = 0
                 for count in range(low, high + 1):
                     kept += int(count_of[count])
@@ -172,7 +172,7 @@ def cell_scatter(samples: NDArray[np.float32], noise_mesh: NDArray[np.float32]) 
             for row in range(tall):
                 for column in range(wide):
                     place = cell[row, column] * per_unit + np.float32(0.5 * last)
-                    count_of[int(min(max(place, np.float32(0.0)), np.float32(last)))] += 1
+                    count_of[int(min(max(np.float32(0.0), place), np.float32(last)))] += 1
             step, up_to = 0, count_of[0]
             while up_to <= low:
                 step += 1

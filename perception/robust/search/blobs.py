@@ -26,8 +26,8 @@ class Blob:
 
     @cached_property
     def peak_e(self) -> float:
-        """Maximum of the filtered image."""
-        return float(self.filtered_e.max())
+        """Maximum of the filtered image in the blob."""
+        return float(self.filtered_e[self.pixels].max())
 
     @property
     def area_px(self) -> int:
@@ -87,7 +87,7 @@ def _labelled(places: NDArray[np.int64], width: int) -> tuple[NDArray[np.int64],
             above += 1
         near = above
         while near < at and places[near] <= place - width + 1:
-            if abs(places[near] % width - column) <= 1:
+            if places[near] // width == place // width - 1 and abs(places[near] % width - column) <= 1:
                 _join(leader, near, at)
             near += 1
     labels, count = np.empty(len(places), dtype=np.int64), 0

@@ -108,7 +108,9 @@ def exceeding(
     across = np.zeros((taps, columns), dtype=np.float32)
     padded, result = np.empty(columns + 2 * half, dtype=np.float32), np.empty(columns, dtype=np.float32)
     # The lowest limit that any of the rows may have in whose sum a row is.
-    lowest_e = np.minimum(np.minimum(limit_e, _shifted(limit_e, 1)), _shifted(limit_e, -1))
+    lowest_e = limit_e
+    for by in range(1, half * len(limit_e) // rows + 2):
+        lowest_e = np.minimum(np.minimum(lowest_e, _shifted(limit_e, by)), _shifted(limit_e, -by))
     bright, count_of = np.empty((taps, columns), dtype=np.int64), np.zeros(taps, dtype=np.int64)
     latest = np.full(columns, -1)
     samples = np.empty((sample_of.max() + 1, len(sampled)), dtype=np.float32)

@@ -132,6 +132,18 @@ class PreparedFrame:
         rows, columns = self.shape
         return min(max(round(v_px), 0), rows - 1), min(max(round(u_px), 0), columns - 1)
 
+    def clipped_columns(self, box: PixelBox) -> NDArray[np.bool_]:
+        """Tell in which columns of a box, which may leave the frame, a pixel is clipped and not bad."""
+        rows, columns = self.shape
+        first, end = max(box.left, 0), min(box.left + box.width, columns)
+        inside = np.s_[max(box.top, 0) : min(box.top + box.height, rows), first:end]
+        clipped = self.pixels.data_dn[inside] >= self.clipped_dn
+        if clipped.any() and len(self.bad_at):
+            clipped &= ~self.bad[inside]
+        spilled = np.zeros(box.width, dtype=bool)
+        spilled[first - box.left : end - box.left] = clipped.any(axis=0)
+        return spilled
+
     def lit_in(self, box: PixelBox) -> NDArray[np.bool_]:
         """Return `lit` in a box that may reach beyond the frame."""
         rows, columns = self.lit.shape
@@ -169,9 +181,11 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     kernel = point_kernel(calibration.psf_sigma_px)
     narrow = in_threes(kernel)
     filtered_noise = float(np.sum(kernel**2))
+    # Compiled loops know arrays that may be written and lie in order; others would be compiled for anew.
+    frame = replace(frame, data_dn=np.require(frame.data_dn, requirements=("C", "W")))
     mesh_e = background_mesh_e(frame, calibration)
     pixels = Pixels(
-        np.ascontiguousarray(frame.data_dn),
+        frame.data_dn,
         float(frame.black_level_dn),
         1.0 / gain_dn_per_e(frame, calibration),
         as_wide(mesh_e, calibration),
@@ -272,7 +286,8 @@ def _local_contrast(
     """
     import cv2
 
-    kernel, calibration = prepared.kernel.astype(np.float64), prepared.calibration
+    calibration = prepared.calibration
+    kernel = point_kernel(calibration.psf_sigma_px)
     side = 2 * len(kernel) - 1
     widened = cv2.dilate((ratio > 1.0).astype(np.uint8), np.ones((3, 3), np.uint8))
     structured = np.asarray(widened).reshape(ratio.shape) > 0

@@ -6,11 +6,16 @@ import os
 import pkgutil
 import subprocess
 import sys
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 
 import perception
+from perception.compiled import _with_constants
+from perception.types import RawFrame
+from tests.unit.perception.simulation import calibration, random
 
 MODULES = [info.name for info in pkgutil.walk_packages(perception.__path__, "perception.")]
 
@@ -45,6 +50,45 @@ def test_a_frame_is_read_alike_without_the_compiler() -> None:
     assert len(compiled) >= 4
     assert [hit[:5] for hit in compiled] == [pytest.approx(hit[:5], rel=1e-6, nan_ok=True) for hit in plain]
     assert [hit[5] for hit in compiled] == [hit[5] for hit in plain]
+
+
+def _functions() -> list[Dispatcher]:
+    files = [vars(importlib.import_module(name)).values() for name in MODULES]
+    return [each for file in files for each in file if isinstance(each, Dispatcher)]
+
+
+def test_after_warming_up_no_frame_waits_for_the_compiler() -> None:
+    """Frames that may not be written, as of a message, flipped ones, and calibrations of whole numbers or lists."""
+    perception.warm_up()
+    known = sum(len(function.signatures) for function in _functions())
+    counts = np.frombuffer(random(72).poisson(80.0, (96, 128)).astype(np.uint16).tobytes(), np.uint16)
+    camera = calibration(width_px=128, height_px=96, cx_px=60.0, cy_px=50.0)
+    plain = replace(camera, psf_sigma_px=1, prnu=0, response_angle_rad=[0, 1.1], response_relative=[1, 1])  # type: ignore[arg-type]
+    for data in (
+        counts.reshape(96, 128),
+        counts.reshape(96, 128)[::-1],
+        np.asfortranarray(counts.reshape(96, 128)),
+    ):
+        brighter = np.array(data)
+        brighter[40:44, 60:64] += 900
+        brighter.setflags(write=False)
+        for shown in (data, brighter):
+            for one in (camera, plain):
+                perception.detect(RawFrame(camera.camera, 0, 0.0, 1e-3, shown, 64.0), one)
+    assert sum(len(function.signatures) for function in _functions()) == known
+
+
+def test_constants_of_other_files_tell_compiled_functions_apart() -> None:
+    """What is kept of a function on disk is not used where a constant that its file imports has changed."""
+    plain = {"np": np, "LIMIT": 3.0, "__name__": "loops"}
+    source = "def clipped(x):\n    return min(x, LIMIT)\n"
+    held = []
+    for limit in (3.0, 3.0, 4.0):
+        names = {**plain, "LIMIT": limit}
+        exec(source, names)
+        held.append(_with_constants(names["clipped"]).__closure__)  # type: ignore[arg-type]
+    contents = [tuple(cell.cell_contents for cell in cells) for cells in held if cells is not None]
+    assert contents[0] == contents[1] != contents[2]
 
 
 @pytest.mark.parametrize("name", MODULES)

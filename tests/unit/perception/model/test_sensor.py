@@ -75,6 +75,8 @@ def test_the_well_clips_at_more_counts_with_gain_up_to_full_scale() -> None:
         ({"camera": "r2.left"}, "r2.left"),
         ({"exposure_s": 0.0}, "exposure_s"),
         ({"gain": -1.0}, "gain"),
+        ({"gain": np.inf}, "gain"),
+        ({"black_level_dn": np.nan}, "black_level_dn"),
     ],
 )
 def test_frames_that_do_not_match(changes: dict[str, object], text: str) -> None:

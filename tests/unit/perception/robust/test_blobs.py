@@ -27,6 +27,17 @@ def test_components_touch_at_corners_and_obey_the_area() -> None:
     assert components(np.zeros((4, 4), dtype=bool)) == []
 
 
+def test_rows_of_a_frame_two_pixels_wide_do_not_touch_across_its_edges() -> None:
+    mask = np.array([[False, True], [False, False], [True, False], [True, True]])
+    assert [blob.box for blob in components(mask)] == [PixelBox(0, 1, 1, 1), PixelBox(2, 0, 2, 2)]
+
+
+def test_the_peak_is_one_of_the_blob() -> None:
+    """In a dark trough what stands out may still lie below the background."""
+    image = np.array([[-40.0, 0.0], [0.0, -50.0]], dtype=np.float32)
+    assert Blob(PixelBox(0, 0, 2, 2), image < 0.0, image).peak_e == -40.0
+
+
 def test_two_hills_are_parted() -> None:
     image = hill((8.0, 10.0, 1000.0), (13.0, 10.0, 400.0))
     one, two = split_at_peaks(whole(image), np.sqrt(image + 1))

@@ -173,7 +173,14 @@ def test_without_a_range_constant_flares_are_found_unranged() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"psf_sigma_px": math.nan}, {"source_radius_m": -0.01}, {"sigma": {"psf_sigma_px": math.inf}}]
+    "changes",
+    [
+        {"psf_sigma_px": math.nan},
+        {"source_radius_m": -0.01},
+        {"dsnu_e": math.inf},
+        {"prnu": math.nan},
+        {"sigma": {"psf_sigma_px": math.inf}},
+    ],
 )
 def test_a_calibration_that_cannot_be_is_refused(changes: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="its calibration has"):
