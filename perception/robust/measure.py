@@ -19,7 +19,13 @@ from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Problem, Solution, solve
 from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
-from perception.robust.verdict import LEAST_RANGE_M, is_no_large_disc, is_one_pixel, is_other_size
+from perception.robust.verdict import (
+    LEAST_RANGE_M,
+    is_no_large_disc,
+    is_on_flank,
+    is_one_pixel,
+    is_other_size,
+)
 
 CLIPPED_RANGE_SIGMA = 0.125
 """A clipped flare counts as recovered if its fit claims its range to better than this, relatively."""
@@ -256,7 +262,11 @@ def _judged(cluster: Cluster, solution: Solution, prepared: PreparedFrame) -> li
     if solution.count != len(blobs):
         blobs = divide(blobs, solution.u_px, solution.v_px)
     wanted = cluster.wanted if solution.count == len(cluster.members) else range(solution.count)
-    return [(blobs[k], _measurement(solution, k, blobs[k], misfit, prepared)) for k in wanted]
+    return [
+        (blobs[k], _measurement(solution, k, blobs[k], misfit, prepared))
+        for k in wanted
+        if not is_on_flank(solution, k, prepared.shape)
+    ]
 
 
 def _measurement(

@@ -26,6 +26,7 @@ _MOST_LAYOUTS = 7
 _LAYOUT_KEPT = 0.02
 _LAYOUT_KEPT_PX = 0.05
 _PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
+_NEIGHBOURS = 20.0 * 50.0 / (1280.0 * 960.0)  # of twenty flares in a frame, how many lie in those 50 px²
 
 Start = tuple[float, float, float]
 """First guess of (u_px, v_px, ln range) of a flare, its range as the flux alone says."""
@@ -134,10 +135,11 @@ class Solution:
 
         Laplace's approximation (MacKay, Neural Comput. 4, 415, 1992): an unknown costs the logarithm of how
         much narrower the data leave it than its prior, which for a flare is any of `_PLACES` places and
-        brightnesses.
+        brightnesses. That others lie in the same blob is as rare as `_NEIGHBOURS`, each.
         """
         by_flares = self.count * (2.0 * math.log(_PLACES) - 3.0 * math.log(2.0 * math.pi))
-        return self.deviance + self.log_information + by_flares
+        by_chance = -2.0 * (self.count - 1) * math.log(_NEIGHBOURS)
+        return self.deviance + self.log_information + by_flares + by_chance
 
     @property
     def count(self) -> int:

@@ -22,6 +22,7 @@ _DISC_FILLS = (0.88, 1.12)
 _MOST_ASPECT = 1.5
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _LEAST_PX, _LEAST_SHARE = 1.0, 0.15
+_FLANK_PX, _FLANK_SHARE = 3.0, 0.25
 
 
 def is_one_pixel(solution: Solution) -> bool:
@@ -62,6 +63,50 @@ def _is_one_pixel(
             model = MODEL_ERROR * flares_e[row, column]
             of_flare += left * left / (lit + (prnu * lit) ** 2 + floor_e2 + model * model)
     return of_pixel < of_flare
+
+
+def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
+    """Tell whether a flare stands on the flank of something larger that is not explained, as a lit patch.
+
+    Light falls off around a flare, on all sides. Where a quarter of a ring around it, all flares taken away,
+    still exceeds the background by half of the flare's own peak, it is a part of what lies there. `shape` is
+    the frame's: what a window shows beyond it does not count.
+    """
+    box, window = solution.window.box, solution.window
+    reach_px = float(solution.image_radius_px[index])
+    inner_px = reach_px + 2.0 * solution.psf_sigma_px + 1.0
+    top, left = max(0, -box.top), max(0, -box.left)
+    inside = np.s_[top : shape[0] - box.top, left : shape[1] - box.left]
+    place = (
+        float(solution.u_px[index]) - box.left - left,
+        float(solution.v_px[index]) - box.top - top,
+    )
+    share = _share_above(
+        np.ascontiguousarray(window.image_e[inside]),
+        np.ascontiguousarray(solution.flares_e[inside]),
+        solution.background_e,
+        place,
+        inner_px,
+        inner_px + _FLANK_PX,
+    )
+    return share > _FLANK_SHARE
+
+
+@compiled
+def _share_above(
+    image_e: Array, flares_e: Array, background_e: float, place: tuple[float, float],
+    inner_px: float, outer_px: float,
+) -> float:  # fmt: skip
+    """Return the share of a ring where what is no flare exceeds half of the flares' light in its middle."""
+    rows, columns = image_e.shape
+    middle_row, middle = min(max(round(place[1]), 0), rows - 1), min(max(round(place[0]), 0), columns - 1)
+    half_peak, count, above = 0.5 * flares_e[middle_row, middle], 0, 0
+    for row in range(rows):
+        for column in range(columns):
+            if inner_px <= math.hypot(column - place[0], row - place[1]) <= outer_px:
+                count += 1
+                above += image_e[row, column] - flares_e[row, column] - background_e > half_peak
+    return above / max(count, 1)
 
 
 def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) -> bool:

@@ -30,6 +30,12 @@ def test_nothing_is_reported_where_no_source_is(row: str) -> None:
     assert result.get("false_alarms_per_frame", result.get("reported")) == 0
 
 
+def test_the_edge_of_a_lit_patch_is_no_chain_of_flares() -> None:
+    """Frames 2, 25 and 42 of the sun patches, where edges were told as two or eight flares."""
+    result = ROWS["empty, sun patches"](frames=43)
+    assert result["false_alarms"] <= 1
+
+
 @pytest.mark.verify
 @pytest.mark.parametrize("row", EMPTY)
 def test_false_alarms_are_rarer_than_one_in_ten_frames(row: str) -> None:
