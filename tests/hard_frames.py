@@ -306,12 +306,12 @@ def lamps(frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
     return {"frames": frames, "lamps": count, "reported": alarms, "reported_share": alarms / count}
 
 
-def empty(kind: str, frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
+def empty(kind: str, frames: int = 4, estimator: str = "robust", first: int = 0) -> dict[str, Any]:
     """Frames that hold no source: sheen, sun patches, blinds, or texture of 3 to 20 %, 4 to 30 px."""
     alarms = 0
     size = (POINT.height_px, POINT.width_px)
     rows, columns = np.indices(size, dtype=np.float64)
-    for index in range(frames):
+    for index in range(first, first + frames):
         generator = random(16, len(kind), index)
         mean_e = np.full(size, 10.0 ** generator.uniform(1.0, 3.0))
         if kind == "texture":

