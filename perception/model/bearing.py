@@ -36,8 +36,12 @@ def direction_camera(points_px: ArrayLike, calibration: Calibration) -> NDArray[
 
 def field_angle_rad(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:
     """Angle between the optical axis and the direction of each pixel, shape (n,)."""
-    direction = direction_camera(points_px, calibration)
-    return np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
+    return angle_from_axis_rad(direction_camera(points_px, calibration))
+
+
+def angle_from_axis_rad(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angle between the optical axis and directions in camera axes, shape (..., 3) → (...)."""
+    return np.arctan2(np.hypot(direction[..., 0], direction[..., 1]), direction[..., 2])
 
 
 def bearing_body(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:

@@ -184,7 +184,7 @@ def flare_limits(
     known, structure = camera.known(clip_e), structure or even(pixels)
     layout = known.layout(len(flares), len(structure.columns))
     values = np.zeros(layout.size)
-    own = values[: layout.width].reshape(len(flares), layout.per_source)
+    own = layout.of_sources(values)
     own[:, 0], own[:, 1], own[:, 2] = place[:, 0], place[:, 1], log_range
     values[layout.background] = background_e
     expected_e, variance_e2, jacobian = np.empty(pixels), np.empty(pixels), np.empty((layout.size, pixels))

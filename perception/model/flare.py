@@ -34,15 +34,30 @@ class PixelBox:
     @classmethod
     def around(cls, u_px: float, v_px: float, half_px: float, calibration: Calibration) -> Self:
         """All pixels of the sensor within `half_px` of (u, v) in each axis; it may be empty."""
-        top = max(0, math.floor(v_px - half_px + 0.5))
-        left = max(0, math.floor(u_px - half_px + 0.5))
-        bottom = min(calibration.height_px, math.floor(v_px + half_px + 0.5) + 1)
-        right = min(calibration.width_px, math.floor(u_px + half_px + 0.5) + 1)
-        return cls(top, left, max(0, bottom - top), max(0, right - left))
+        top, left = math.floor(v_px - half_px + 0.5), math.floor(u_px - half_px + 0.5)
+        bottom, right = math.floor(v_px + half_px + 0.5) + 1, math.floor(u_px + half_px + 0.5) + 1
+        return cls(top, left, bottom - top, right - left).inside(
+            (calibration.height_px, calibration.width_px)
+        )
+
+    def inside(self, shape: tuple[int, int]) -> Self:
+        """Return the part of the box that lies in a frame of so many rows and columns; it may be empty."""
+        top, left = max(self.top, 0), max(self.left, 0)
+        bottom, right = min(self.top + self.height, shape[0]), min(self.left + self.width, shape[1])
+        return type(self)(top, left, max(bottom - top, 0), max(right - left, 0))
+
+    def seen_from(self, corner: "PixelBox") -> Self:
+        """Return the box with its place counted from the corner of another."""
+        return type(self)(self.top - corner.top, self.left - corner.left, self.height, self.width)
 
     def with_margin(self, by_px: int) -> "PixelBox":
         """Return the box with a margin all around, which may reach beyond the image."""
         return PixelBox(self.top - by_px, self.left - by_px, self.height + 2 * by_px, self.width + 2 * by_px)
+
+    @property
+    def corner_and_size(self) -> tuple[int, int, int, int]:
+        """Top, left, height and width, as compiled loops take a box."""
+        return self.top, self.left, self.height, self.width
 
     @property
     def slices(self) -> tuple[slice, slice]:

@@ -46,6 +46,10 @@ class Layout:
         """Number of unknowns."""
         return self.background + 1 + self.structure
 
+    def of_sources(self, values: Array) -> Array:
+        """Return the sources' part of unknowns, a view of shape (sources, unknowns of each)."""
+        return values[: self.width].reshape(self.sources, self.per_source)
+
     @property
     def most_step(self) -> Array:
         """How far each unknown may move in one step of a fit that trusts its slopes, shape (unknowns,)."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.model.bearing import direction_camera
+from perception.model.bearing import angle_from_axis_rad, direction_camera
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
@@ -36,9 +36,8 @@ def effective_exposure_s(
 
 def exposure_towards(direction: Array, exposure_s: float, gain: float, calibration: Calibration) -> Array:
     """As `effective_exposure_s`, of unit directions in camera axes, shape (..., 3) → (...)."""
-    theta = np.arctan2(np.hypot(direction[..., 0], direction[..., 1]), direction[..., 2])
     response = np.interp(
-        theta,
+        angle_from_axis_rad(direction),
         calibration.response_angle_rad,
         calibration.response_relative,
         left=math.nan,

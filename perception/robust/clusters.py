@@ -196,7 +196,7 @@ def _cluster(
     box = _window_box(about, prepared)
     image_e, state = cut(
         *prepared.pixels[:3], prepared.lit_at, owner, prepared.bad_at,
-        (box.top, box.left, box.height, box.width), np.array(indices), prepared.clipped_dn,
+        box.corner_and_size, np.array(indices), prepared.clipped_dn,
         _TOUCHING_PX, _KEPT_PX,
     )  # fmt: skip
     u_px, v_px = members[0].u_px, members[0].v_px

@@ -95,14 +95,11 @@ def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
     -------
     True also where the frame's edges leave too little of the ring.
     """
-    box, (rows, columns) = blob.box, prepared.shape
+    box = blob.box
     inner = box.with_margin(math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1)
-    outer = inner.with_margin(_RING_PX)
-    top, left = max(outer.top, 0), max(outer.left, 0)
-    height, width = min(outer.top + outer.height, rows) - top, min(outer.left + outer.width, columns) - left
-    around_e = filtered(prepared.pixels, prepared.kernel, prepared.bad_at, (top, left, height, width))
-    first, start = inner.top - top, inner.left - left
-    level_e, count = ring_median(around_e, (first, first + inner.height, start, start + inner.width))
+    outer = inner.with_margin(_RING_PX).inside(prepared.shape)
+    around_e = filtered(prepared.pixels, prepared.kernel, prepared.bad_at, outer.corner_and_size)
+    level_e, count = ring_median(around_e, inner.seen_from(outer).corner_and_size)
     if count < _FEWEST_RING_PIXELS:
         return True
     middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)

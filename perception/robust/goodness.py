@@ -123,6 +123,13 @@ def residual_e(image_e: Array, state: NDArray[np.uint8], expected_e: Array) -> A
 
 
 @compiled
+def _noise_e2(expected_e: float, floor_e2: float, prnu: float) -> float:
+    """Return a pixel's variance, as `sensor.pixel_variance_e2`."""
+    lit = max(expected_e, 0.0)
+    return lit + (prnu * lit) ** 2 + floor_e2
+
+
+@compiled
 def _reckoned(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array,
     floor_e2: float, prnu: float, smooth_px: float,
@@ -134,8 +141,8 @@ def _reckoned(
     chi2, pixels, residual2, flares2, seen_chi2, seen_pixels = 0.0, 0, 0.0, 0.0, 0.0, 0
     for row in range(rows):
         for column in range(columns):
-            lit, flare, left = max(expected_e[row, column], 0.0), flares_e[row, column], residual[row, column]
-            noise[row, column] = lit + (prnu * lit) ** 2 + floor_e2
+            flare, left = flares_e[row, column], residual[row, column]
+            noise[row, column] = _noise_e2(expected_e[row, column], floor_e2, prnu)
             variance = noise[row, column] + (MODEL_ERROR * flare) ** 2
             if flare > REACHED_SIGMAS * math.sqrt(noise[row, column]):
                 for down in range(-DISC_PX, DISC_PX + 1):
@@ -224,8 +231,7 @@ def halo_sigmas(
             for column in range(image_e.shape[1]):
                 if state[row, column] != SEEN:
                     continue
-                lit = max(expected_e[row, column], 0.0)
-                variance = lit + (prnu * lit) ** 2 + floor_e2
+                variance = _noise_e2(expected_e[row, column], floor_e2, prnu)
                 spread = 1.0 + ((column - place[0]) ** 2 + (row - place[1]) ** 2) / width**2
                 profile = 1.0 / (spread * math.sqrt(spread))
                 score += profile * (image_e[row, column] - expected_e[row, column]) / variance

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.layout import CLIPPED, UNUSABLE, Sources, Structure, View, even
+from perception.model.layout import UNUSABLE, Sources, Structure, View, even
 from perception.model.pixels import maximise
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
@@ -64,11 +64,6 @@ class Window:
     def usable(self) -> NDArray[np.bool_]:
         """Which pixels count, clipped ones too."""
         return np.not_equal(self.state, UNUSABLE)
-
-    @property
-    def clipped(self) -> NDArray[np.bool_]:
-        """Which of them are clipped."""
-        return np.equal(self.state, CLIPPED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,12 +211,12 @@ class _Fit:
         self.expected_e = np.empty(window.image_e.shape)
         self.deviance = self.log_information = math.inf
         self.converged = False
-        self.sources: Sources | None = None
+        self.log_flux_at_1_m = self.image_radius_px = np.empty(0)
 
     @property
     def own(self) -> Array:
         """The sources' unknowns, a view of shape (sources, unknowns of each)."""
-        return self.values[: self.layout.width].reshape(self.layout.sources, self.layout.per_source)
+        return self.layout.of_sources(self.values)
 
     @property
     def of_sources(self) -> Array:
@@ -231,29 +226,31 @@ class _Fit:
             [self.covariance[at : at + step, at : at + step] for at in range(0, self.layout.width, step)]
         )
 
-    def climb(self, sources: Sources) -> None:
-        """Go on to the greatest likelihood, with images as laid out."""
+    def climb(self, sources: Sources, reach_px: Array) -> None:
+        """Go on to the greatest likelihood, with images as laid out, of so large radii."""
         box, layout = self.window.box, self.layout
         view = View(box.top, box.left, self.window.image_e, self.window.state, self.window.floor_e2)
-        self.sources = sources
         self.deviance, self.log_information = maximise(
             view, sources, self.structure, self.known, layout.prior(self.structure), layout.most_step,
             self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
         self.converged = math.isfinite(self.deviance)
+        growth = np.exp(sources.log_range_at - _log_range_by_size(self.own, self))
+        self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
 
 
 def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
     laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]))
+    reach_px = laid.reach_px
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
         fit.converged = False
         if imaged[first:end].all():
-            fit.climb(laid.part(first, end))
+            fit.climb(laid.part(first, end), reach_px[first:end])
     change = laid.log_range_at - _log_range_by_size(np.concatenate([fit.own for fit in fits]), fits[0])
-    moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * laid.reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
+    moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
     if not moved.any():
         return []
     return [
@@ -272,19 +269,14 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
     """Return what has been found, reckoned for all sources at once."""
     if not fits:
         return []
-    own, covariance = (
-        np.concatenate([fit.own for fit in fits]),
-        np.concatenate([fit.of_sources for fit in fits]),
-    )
-    laid = [fit.sources for fit in fits if fit.sources is not None]
-    log_flux_at_1_m = np.concatenate([each.log_flux_at_1_m for each in laid])
-    growth = np.exp(np.concatenate([each.log_range_at for each in laid]) - _log_range_by_size(own, fits[0]))
+    own = np.concatenate([fit.own for fit in fits])
+    covariance = np.concatenate([fit.of_sources for fit in fits])
+    log_flux_at_1_m = np.concatenate([fit.log_flux_at_1_m for fit in fits])
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     slack = own[:, 3] if fits[0].layout.has_slack else None
     log_range, log_range_sigma = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
     flux_e = np.exp(log_flux_at_1_m - 2.0 * own[:, 2])
     flux_sigma_e, ranged = 2.0 * sigma[:, 2] * flux_e, log_flux_at_1_m != 0.0
-    radius_px = np.concatenate([each.reach_px for each in laid]) * growth
     solutions, first = [], 0
     for fit in fits:
         these = slice(first, first + fit.layout.sources)
@@ -307,7 +299,7 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
                 log_range=log_range[these],
                 log_range_sigma=log_range_sigma[these],
                 ranged=ranged[these],
-                image_radius_px=radius_px[these],
+                image_radius_px=fit.image_radius_px,
                 background_e=background_e,
                 expected_e=fit.expected_e,
                 flares_e=flares_e,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.layout import CLIPPED, UNUSABLE
+from perception.model.layout import UNUSABLE
 from perception.robust.clusters import Candidate
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.search.prepare import PreparedFrame
@@ -32,15 +32,16 @@ def is_one_pixel(solution: Solution) -> bool:
     background with one pixel free, and of the flare. (Bright ones `bad_pixels` has found before.)
     """
     window = solution.window
-    return _is_one_pixel(
-        window.image_e, window.state, solution.expected_e, solution.flares_e, window.floor_e2, window.prnu
-    )
+    chi2 = solution.residual_e**2 / solution.variance_e2(MODEL_ERROR)
+    ground_e = solution.expected_e - solution.flares_e
+    return _is_one_pixel(window.image_e, window.state, solution.flares_e, ground_e, chi2, window.floor_e2)
 
 
 @compiled
 def _is_one_pixel(
-    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float, prnu: float
+    image_e: Array, state: NDArray[np.uint8], flares_e: Array, ground_e: Array, chi2: Array, floor_e2: float
 ) -> bool:
+    """Compare a flare's χ² with that of the ground alone but for the brightest pixel."""
     rows, columns = image_e.shape
     brightest, at_row, at = -math.inf, 0, 0
     least = REACHED_SHARE * flares_e.max()
@@ -54,14 +55,10 @@ def _is_one_pixel(
         for column in range(max(0, at - REACH_PX), min(columns, at + REACH_PX + 1)):
             if state[row, column] == UNUSABLE:
                 continue
-            lit, ground = max(expected_e[row, column], 0.0), expected_e[row, column] - flares_e[row, column]
+            ground = ground_e[row, column]
             if row != at_row or column != at:
                 of_pixel += (image_e[row, column] - ground) ** 2 / (max(ground, 0.0) + floor_e2)
-            left = image_e[row, column] - expected_e[row, column]
-            if state[row, column] == CLIPPED:
-                left = max(left, 0.0)
-            model = MODEL_ERROR * flares_e[row, column]
-            of_flare += left * left / (lit + (prnu * lit) ** 2 + floor_e2 + model * model)
+            of_flare += chi2[row, column]
     return of_pixel < of_flare
 
 
@@ -72,20 +69,16 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
     still exceeds the background by half of the flare's own peak, it is a part of what lies there. `shape` is
     the frame's: what a window shows beyond it does not count.
     """
-    box, window = solution.window.box, solution.window
+    window = solution.window
+    seen = window.box.inside(shape)
+    part = seen.seen_from(window.box).slices
     reach_px = float(solution.image_radius_px[index])
     inner_px = reach_px + 2.0 * solution.psf_sigma_px + 1.0
-    top, left = max(0, -box.top), max(0, -box.left)
-    inside = np.s_[top : shape[0] - box.top, left : shape[1] - box.left]
-    place = (
-        float(solution.u_px[index]) - box.left - left,
-        float(solution.v_px[index]) - box.top - top,
-    )
     share = _share_above(
-        np.ascontiguousarray(window.image_e[inside]),
-        np.ascontiguousarray(solution.flares_e[inside]),
+        np.ascontiguousarray(window.image_e[part]),
+        np.ascontiguousarray(solution.flares_e[part]),
         solution.background_e,
-        place,
+        (float(solution.u_px[index]) - seen.left, float(solution.v_px[index]) - seen.top),
         inner_px,
         inner_px + _FLANK_PX,
     )

@@ -16,12 +16,13 @@ OWN, OTHERS, STRAY = 1, 2, 3
 
 @compiled
 def ring_median(image: Float32, inner: tuple[int, int, int, int]) -> tuple[float, int]:
-    """Return the median of an image around an inner (top, bottom, left, right), and of how many pixels."""
+    """Return the median of an image around an inner (top, left, height, width), and of how many pixels."""
+    top, left, height, width = inner
     values, count = np.empty(image.size, dtype=np.float32), 0
     for row in range(image.shape[0]):
-        inside = inner[0] <= row < inner[1]
+        inside = top <= row < top + height
         for column in range(image.shape[1]):
-            if not (inside and inner[2] <= column < inner[3]):
+            if not (inside and left <= column < left + width):
                 values[count] = image[row, column]
                 count += 1
     return (float(np.median(values[:count])) if count else 0.0), count

@@ -134,27 +134,19 @@ class PreparedFrame:
 
     def clipped_columns(self, box: PixelBox) -> NDArray[np.bool_]:
         """Tell in which columns of a box, which may leave the frame, a pixel is clipped and not bad."""
-        rows, columns = self.shape
-        first, end = max(box.left, 0), min(box.left + box.width, columns)
-        inside = np.s_[max(box.top, 0) : min(box.top + box.height, rows), first:end]
-        clipped = self.pixels.data_dn[inside] >= self.clipped_dn
+        part = box.inside(self.shape)
+        clipped = self.pixels.data_dn[part.slices] >= self.clipped_dn
         if clipped.any() and len(self.bad_at):
-            clipped &= ~self.bad[inside]
+            clipped &= ~self.bad[part.slices]
         spilled = np.zeros(box.width, dtype=bool)
-        spilled[first - box.left : end - box.left] = clipped.any(axis=0)
+        spilled[part.seen_from(box).slices[1]] = clipped.any(axis=0)
         return spilled
 
     def lit_in(self, box: PixelBox) -> NDArray[np.bool_]:
         """Return `lit` in a box that may reach beyond the frame."""
-        rows, columns = self.lit.shape
-        inside = np.zeros((box.height, box.width), dtype=bool)
-        top, left = max(0, -box.top), max(0, -box.left)
-        part = self.lit[
-            max(box.top, 0) : min(box.top + box.height, rows),
-            max(box.left, 0) : min(box.left + box.width, columns),
-        ]
-        inside[top : top + part.shape[0], left : left + part.shape[1]] = part
-        return inside
+        part, lit = box.inside(self.shape), np.zeros((box.height, box.width), dtype=bool)
+        lit[part.seen_from(box).slices] = self.lit[part.slices]
+        return lit
 
 
 def _mask(places: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -201,13 +193,11 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     structured = bool((ratio > 1.0).any())
     if structured:
         limit_e = as_wide(limit_mesh_e * ratio, calibration)
-        kept = above(lit_at, lit_e, limit_e, calibration.height_px)
-        lit_at, lit_e = lit_at[kept], lit_e[kept]
+        lit_at, lit_e = _above(lit_at, lit_e, limit_e, calibration)
     bad_at = bad_pixels(pixels, lit_at, floor_e2, kernel, along_rows=frame.line_time_s > 0.0)
     if len(bad_at):
         without(lit_at, lit_e, pixels, narrow, bad_at)
-        kept = above(lit_at, lit_e, limit_e, calibration.height_px)
-        lit_at, lit_e = lit_at[kept], lit_e[kept]
+        lit_at, lit_e = _above(lit_at, lit_e, limit_e, calibration)
     prepared = PreparedFrame(
         frame=frame,
         calibration=calibration,
@@ -231,6 +221,16 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
         lit_e=np.concatenate([lit_e, more_e])[first],
         texture_e=as_wide(sigma_mesh_e, calibration),
     )
+
+
+def _above(
+    places: NDArray[np.int64],
+    values: NDArray[np.float32],
+    limit_e: NDArray[np.float32],
+    calibration: Calibration,
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    kept = above(places, values, limit_e, calibration.height_px)
+    return places[kept], values[kept]
 
 
 def bad_pixels(
