@@ -50,7 +50,7 @@ from perception.files.recording import (
 )
 from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
-from perception.robust.warm_up import warm_up
+from perception.rig.warm_up import warm_up
 from perception.types import Calibration, Detection, RawFrame
 
 __all__ = [
