@@ -269,7 +269,14 @@ def bearing_axes(bearing: NDArray[np.float64]) -> NDArray[np.float64]:
 
     A bearing straight up or down counts y as left.
     """
-    left = np.stack([-bearing[..., 1], bearing[..., 0], np.zeros(bearing.shape[:-1])], axis=-1)
-    length = np.linalg.norm(left, axis=-1, keepdims=True)
-    left = np.where(length > 1e-12, left / np.maximum(length, 1e-12), np.array([0.0, 1.0, 0.0]))
-    return np.stack([left, np.cross(bearing, left), bearing], axis=-2)
+    x, y, z = bearing[..., 0], bearing[..., 1], bearing[..., 2]
+    level = np.hypot(x, y)
+    flat = level > 1e-12
+    level = np.where(flat, level, 1.0)
+    axes = np.zeros((*bearing.shape[:-1], 3, 3))
+    axes[..., 0, 0] = left_x = np.where(flat, -y, 0.0) / level
+    axes[..., 0, 1] = left_y = np.where(flat, x, 1.0) / level
+    axes[..., 1, 0], axes[..., 1, 1] = -z * left_y, z * left_x
+    axes[..., 1, 2] = x * left_y - y * left_x
+    axes[..., 2, :] = bearing
+    return axes

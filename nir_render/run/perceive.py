@@ -10,16 +10,23 @@ from nir_render.run.folder import note_seconds
 from nir_render.run.render import Progress
 from perception import (
     ESTIMATORS,
+    Calibration,
     Detection,
     Estimator,
     EstimatorError,
+    FrameRecord,
     detect,
     detection_record,
+    frame_sets,
     load_estimator,
+    measure_set,
+    measurement_record,
+    mirror_record,
     read_calibrations,
     read_frame_records,
     read_frames,
 )
+from perception.rig.frame_sets import robot_of
 from perception.types import FrameKey
 
 
@@ -60,24 +67,46 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress:
         The folder is no recording, or one's own estimator fails on a frame.
     """
     started = time.perf_counter()
-    found: dict[str, list[Detection]] = {name: [] for name in estimators}
+    found: dict[str, list[list[Detection]]] = {name: [] for name in estimators}
     try:
         calibrations = read_calibrations(folder)
+        records = read_frame_records(folder)
         total = len(frame_keys(folder))
         for done, frame in enumerate(read_frames(folder)):
             if frame.camera not in calibrations:
                 raise unknown_camera(folder, frame.camera, calibrations)
             for name, estimator in estimators.items():
-                found[name] += detect(frame, calibrations[frame.camera], estimator)
+                found[name].append(detect(frame, calibrations[frame.camera], estimator))
             progress(done + 1, total)
     except EstimatorError as error:
         raise InputError(f"--estimator {error}") from None
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
     for name, detections in found.items():
-        run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, detections))
+        hits = [hit for of_frame in detections for hit in of_frame]
+        run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, hits))
+        _measure_sets(folder, name, records, detections, calibrations)
     note_seconds(folder, "perceive", started)
-    return {name: len(detections) for name, detections in found.items()}
+    return {name: sum(map(len, detections)) for name, detections in found.items()}
+
+
+def _measure_sets(
+    folder: Path,
+    name: str,
+    records: Sequence[FrameRecord],
+    detections: Sequence[Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+) -> None:
+    """Write what each robot's cameras measure together, set by set, and the mirrors that show in it."""
+    of_frame = {(record.camera, record.index): hits for record, hits in zip(records, detections, strict=True)}
+    measurements, mirrors = [], []
+    for frames in frame_sets(records):
+        seen = measure_set(frames, [of_frame[frame.camera, frame.index] for frame in frames], calibrations)
+        measurements += [measurement_record(each) for each in seen.measurements]
+        robot, time_s = robot_of(frames[0].camera), frames[0].time_s
+        mirrors += [mirror_record(plane, robot, time_s) for plane in seen.planes]
+    run_folder.write_lines(folder / f"measurements.{name}.jsonl", measurements)
+    run_folder.write_lines(folder / f"mirrors.{name}.jsonl", mirrors)
 
 
 def frame_keys(folder: Path) -> list[FrameKey]:

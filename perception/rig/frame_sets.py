@@ -20,6 +20,18 @@ class Timed(Protocol):
         """Start of the exposure."""
 
 
+class Exposed(Timed, Protocol):
+    """What also says how long it was exposed: all that a set need know of a frame beside its detections."""
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of each row."""
+
+    @property
+    def line_time_s(self) -> float:
+        """Delay between rows."""
+
+
 Frame = TypeVar("Frame", bound=Timed)
 
 

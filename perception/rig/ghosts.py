@@ -26,7 +26,7 @@ from perception.rig.mirror_model import (
     seeds_of_kind,
 )
 from perception.rig.mirror_seeds import seeds_of_constant
-from perception.types import Ghost, Measurement, MirrorPlane
+from perception.types import Ghost, Measurement, MirrorPlane, bearing_axes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -133,21 +133,22 @@ def _called(probability: float) -> Ghost:
 
 def _flares_of(measurements: Sequence[Measurement], own_sources_body_m: Array) -> Flares:
     own = len(own_sources_body_m)
-    axes = np.array([each.axes_body for each in measurements])
+    axes = bearing_axes(np.array([each.bearing_body for each in measurements]))
     range_m = np.array([each.range_m for each in measurements])
+    origin_m = np.array([each.origin_body_m for each in measurements])
     covariance = np.array([each.covariance for each in measurements])
     unclaimed = ~np.isfinite(covariance).all(axis=(1, 2))
     covariance[unclaimed] = np.diag([1e-3**2, 1e-3**2, 0.0])
     covariance[unclaimed, 2, 2] = (0.1 * range_m[unclaimed]) ** 2
     common = np.nan_to_num([each.range_sigma_common_m for each in measurements]) / range_m
     noise = np.sqrt(np.maximum(covariance[:, 2, 2] / range_m**2 - common**2, 1e-8))
-    scaled = axes * np.stack([range_m, range_m, range_m], axis=-1)[:, :, None]
+    scaled = axes * range_m[:, None, None]
     inner = np.zeros((len(measurements), 3, 3))
     inner[:, :2, :2] = covariance[:, :2, :2]
     inner[:, 2, 2] = noise**2
     return Flares(
-        origin_m=np.concatenate([[each.origin_body_m for each in measurements], np.zeros((own, 3))]),
-        place_m=np.concatenate([[each.position_body_m for each in measurements], own_sources_body_m]),
+        origin_m=np.concatenate([origin_m, np.zeros((own, 3))]),
+        place_m=np.concatenate([origin_m + range_m[:, None] * axes[:, 2], own_sources_body_m]),
         axes=np.concatenate([axes, np.tile(np.eye(3), (own, 1, 1))]),
         angular_rad2=np.concatenate([covariance[:, :2, :2], np.zeros((own, 2, 2))]),
         noise=np.concatenate([noise, np.zeros(own)]),
@@ -192,10 +193,11 @@ def _best_plane(
         if one is not None:
             return one
     parents, shown = _plausible_pairs(flares, robots, images)
+    own = len(flares.place_m) > len(log_chance)
     best: _Found | None = None
     for kind, seeds in _seeds(flares, parents, shown):
-        chosen, _ = best_seeds(flares, robots, images, seeds, kind, _MOST_TRIED)
-        for seed in chosen:
+        chosen, explained = best_seeds(flares, robots, images, seeds, kind, _MOST_TRIED)
+        for seed in chosen[explained >= (1 if own else 2)]:
             prior, precision = seed.copy(), np.zeros((4, 4))
             prior[4] = INDEX_PRIOR if kind != CONSTANT else seed[4]
             precision[3, 3] = 1.0 / INDEX_SIGMA**2 if kind != CONSTANT else 0.0

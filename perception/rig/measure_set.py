@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from perception.estimators import Estimator, detect_frames
-from perception.rig.frame_sets import robot_of
+from perception.rig.frame_sets import Exposed, robot_of
 from perception.rig.fusion import associated, fused
 from perception.rig.ghosts import told_ghosts
 from perception.rig.sightings import sightings_of
@@ -45,12 +45,12 @@ def detect_set(
 
 
 def measure_set(
-    frames: Sequence[RawFrame],
+    frames: Sequence[Exposed],
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
     planes: Sequence[MirrorPlane] = (),
 ) -> SetMeasurements:
-    """As `detect_set`, from the detections of each frame.
+    """As `detect_set`, from the detections of each frame, or record of a frame.
 
     Raises
     ------

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import bearing_body
+from perception.rig.frame_sets import Exposed
 from perception.rig.rays import UNKNOWN_RANGE, Rays
-from perception.types import Calibration, Detection, RawFrame, bearing_axes
+from perception.types import Calibration, Detection, bearing_axes
 
 Array = NDArray[np.float64]
 
@@ -49,7 +50,7 @@ class Sightings:
 
 
 def sightings_of(
-    frames: Sequence[RawFrame],
+    frames: Sequence[Exposed],
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
 ) -> Sightings:
@@ -58,7 +59,7 @@ def sightings_of(
     Parameters
     ----------
     frames
-        The frames of a set; their pixels are not looked at.
+        The frames of a set, or their records.
     detections
         Those of each frame.
     calibrations

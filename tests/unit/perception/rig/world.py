@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ NAMES = ("front", "left", "back", "right")
 REACH_M = 0.06
 
 
-def rig(own_source: bool = False, **changes: float) -> dict[str, Calibration]:
+def rig(own_source: bool = False, **changes: Any) -> dict[str, Calibration]:
     """Four cameras 90 degrees apart, each 6 cm out and 20 cm up, of 106° by 90° (the paper's)."""
     cameras = {}
     for quarter, name in enumerate(NAMES):
@@ -34,7 +35,9 @@ def rig(own_source: bool = False, **changes: float) -> dict[str, Calibration]:
     return cameras
 
 
-def seen_by(camera: Calibration, position_body_m: Array, margin_px: float = 0.0) -> tuple[float, float, float] | None:
+def seen_by(
+    camera: Calibration, position_body_m: Array, margin_px: float = 0.0
+) -> tuple[float, float, float] | None:
     """Return u, v and range of a place, or None where it is not in view."""
     local = camera.rotation_body_camera.T @ (position_body_m - camera.position_body_m)
     if local[2] <= 0.05:
