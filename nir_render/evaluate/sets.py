@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from nir_render.evaluate.match import GATE_PX, countable, on_a_lamp
+from nir_render.evaluate.match import GATE_PX, countable, image_radius_px, on_a_lamp
 from nir_render.truth.lamps import LampTruth
 from nir_render.truth.sources import SourceTruth
-from perception.types import Calibration, Detection, FrameKey, Measurement
+from perception.types import Calibration, Detection, FrameKey, Measurement, MirrorPlane
 
 Values = NDArray[np.float64]
 
@@ -23,15 +23,20 @@ _SAME_PLACE_M = 0.05
 class SetScore:
     """One source, or one mirror image, around a rig in one set, and what each estimator measured of it.
 
-    `truth` is its row in the frame that shows it best, `position_body_m` its place, shape (3,); `countable`
-    that it counts for recall in one frame at least.
+    `rows` are its truth in each frame that shows it, `position_body_m` its place, shape (3,); `countable`: it
+    counts for recall in one frame at least.
     """
 
     number: int
-    truth: SourceTruth
+    rows: tuple[SourceTruth, ...]
     position_body_m: Values
     countable: bool
     measurements: Mapping[str, Measurement]
+
+    @property
+    def truth(self) -> SourceTruth:
+        """Its truth in the first frame that shows it."""
+        return self.rows[0]
 
     @property
     def is_ghost(self) -> bool:
@@ -41,12 +46,16 @@ class SetScore:
 
 @dataclass(frozen=True, eq=False)
 class SetEvaluation:
-    """All scores; by estimator what was measured where nothing is, and the numbers for `summary.json`."""
+    """All scores; by estimator what it measured where nothing is, its numbers in `summary.json`, its mirrors.
+
+    False alarms and mirrors stand with the number of their set.
+    """
 
     sets: Sequence[Sequence[FrameKey]]
     scores: tuple[SetScore, ...]
     false_alarms: Mapping[str, tuple[tuple[int, Measurement], ...]]
     summary: Mapping[str, Mapping[str, Any]]
+    mirrors: Mapping[str, Sequence[tuple[int, MirrorPlane]]]
 
 
 def evaluate_sets(
@@ -56,11 +65,12 @@ def evaluate_sets(
     measurements: Mapping[str, Sequence[Measurement]],
     detections: Mapping[str, Sequence[Detection]],
     lamps: Iterable[LampTruth] = (),
+    mirrors: Mapping[str, Sequence[tuple[int, MirrorPlane]]] | None = None,
 ) -> SetEvaluation:
     """Score the measurements of each estimator.
 
-    A source that several cameras see counts once. A measurement belongs to the source, or mirror image, whose
-    direction from its origin is within 3 px or the radius of the image; one to one, the nearest first.
+    A source that several cameras see counts once. A measurement belongs to the source, or mirror image, that
+    one of its detections belongs to: within 3 px or the radius of the image, one to one, the nearest first.
 
     Parameters
     ----------
@@ -70,6 +80,8 @@ def evaluate_sets(
         As for `evaluate`.
     measurements, detections
         By estimator.
+    mirrors
+        By estimator: in which set it found which; they are shown, not judged.
     """
     of_frame = {key: number for number, keys in enumerate(sets) for key in keys}
     rows: list[list[SourceTruth]] = [[] for _ in sets]
@@ -90,15 +102,15 @@ def evaluate_sets(
         sources = _sources(number, own, calibrations)
         hits: list[dict[str, Measurement]] = [{} for _ in sources]
         for name, by_set in said.items():
-            angle, gates_rad = _angles(sources, by_set[number], calibrations)
-            paired = _pairs(angle, gates_rad)
+            apart = _apart(sources, by_set[number], places[name], calibrations)
+            paired = _pairs(apart)
             for i, j in paired:
                 hits[i][name] = by_set[number][j]
             for j in set(range(len(by_set[number]))) - {j for _, j in paired}:
                 one = by_set[number][j]
-                if len(sources) and bool((angle[:, j] < gates_rad[:, j]).any()):
+                if bool((apart[:, j] <= 1.0).any()):
                     splits[name] += 1
-                elif not _on_lamps(one, places.get(name, {}), outlines):
+                elif not _on_lamps(one, places[name], outlines):
                     false_alarms[name].append((number, one))
         scores += [replace(source, measurements=hit) for source, hit in zip(sources, hits, strict=True)]
     return SetEvaluation(
@@ -106,6 +118,7 @@ def evaluate_sets(
         tuple(scores),
         {name: tuple(alarms) for name, alarms in false_alarms.items()},
         {name: _numbers(scores, name, splits[name], len(false_alarms[name]), len(sets)) for name in said},
+        mirrors or {},
     )
 
 
@@ -124,11 +137,10 @@ def _sources(
                 other.truth.ghost_of,
             )
             if same and float(np.linalg.norm(position_m - other.position_body_m)) < _SAME_PLACE_M:
-                best = row if row.peak_snr > other.truth.peak_snr else other.truth
-                joined[k] = replace(other, truth=best, countable=counts or other.countable)
+                joined[k] = replace(other, rows=(*other.rows, row), countable=counts or other.countable)
                 break
         else:
-            joined.append(SetScore(number, row, position_m, counts, {}))
+            joined.append(SetScore(number, (row,), position_m, counts, {}))
     return joined
 
 
@@ -137,31 +149,29 @@ def position_body_m(row: SourceTruth, calibration: Calibration) -> Values:
     return np.asarray(calibration.position_body_m + row.range_m * np.array(row.bearing_body))
 
 
-def _angles(
-    sources: Sequence[SetScore], found: Sequence[Measurement], calibrations: Mapping[str, Calibration]
-) -> tuple[Values, Values]:
-    """Return the angle between each source and each measurement, and within which they belong together."""
-    if not (sources and found):
-        return np.empty((len(sources), len(found))), np.empty((len(sources), len(found)))
-    place_m = np.array([source.position_body_m for source in sources])
-    origin_m = np.array([each.origin_body_m for each in found])
-    bearing = np.array([each.bearing_body for each in found])
-    towards = place_m[:, None, :] - origin_m
-    range_m = np.linalg.norm(towards, axis=2)
-    across = np.linalg.norm(np.cross(towards / range_m[:, :, None], bearing), axis=2)
-    along = np.einsum("ijk,jk->ij", towards / range_m[:, :, None], bearing)
-    cameras = [calibrations[each.cameras[0]] for each in found]
-    by_pixels = np.array([GATE_PX / camera.fx_px for camera in cameras])
-    radius_m = np.array([camera.source_radius_m for camera in cameras])
-    by_size = np.arcsin(np.clip(radius_m / range_m, 0.0, 1.0))
-    return np.arctan2(across, along), np.maximum(by_pixels, by_size)
+def _apart(
+    sources: Sequence[SetScore],
+    found: Sequence[Measurement],
+    detections: Mapping[FrameKey, Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+) -> Values:
+    """Return how far measurements lie from sources, in units of the gate, in the frame where it is least."""
+    apart = np.full((len(sources), len(found)), np.inf)
+    for i, source in enumerate(sources):
+        for row in source.rows:
+            gate_px = max(GATE_PX, image_radius_px(row, calibrations[row.camera]))
+            for j, measurement in enumerate(found):
+                for camera, index, number in measurement.detections:
+                    if (camera, index) == (row.camera, row.index):
+                        hit = detections[camera, index][number]
+                        off_px = math.hypot(hit.u_px - row.u_px, hit.v_px - row.v_px)
+                        apart[i, j] = min(apart[i, j], off_px / gate_px)
+    return apart
 
 
-def _pairs(angle: Values, gates_rad: Values) -> list[tuple[int, int]]:
-    if not angle.size:
-        return []
-    within = angle <= gates_rad
-    rows, columns = linear_sum_assignment(np.where(within, angle, 1.0 + gates_rad.sum()))
+def _pairs(apart: Values) -> list[tuple[int, int]]:
+    within = apart <= 1.0
+    rows, columns = linear_sum_assignment(np.where(within, apart, 1.0 + len(apart)))
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if within[i, j]]
 
 
@@ -178,8 +188,7 @@ def _on_lamps(
     outlines: Mapping[FrameKey, Sequence[Any]],
 ) -> bool:
     for camera, index, number in measurement.detections:
-        found = detections.get((camera, index), [])
-        if number < len(found) and on_a_lamp(found[number], outlines.get((camera, index), [])):
+        if on_a_lamp(detections[camera, index][number], outlines.get((camera, index), [])):
             return True
     return False
 

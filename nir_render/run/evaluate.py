@@ -4,6 +4,7 @@ It reads files alone: a folder that another program wrote is scored like one tha
 """
 
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,10 +24,12 @@ from perception import (
     frame_sets,
     parse_detection,
     parse_measurement,
+    parse_mirror,
     read_calibrations,
     read_frame,
     read_frame_records,
 )
+from perception.rig.frame_sets import robot_of
 from perception.types import FrameKey
 
 
@@ -114,17 +117,27 @@ def _with_sets(
     }
     if not measurements:
         return result
-    sets = [
-        [(frame.camera, frame.index) for frame in each] for each in frame_sets(read_frame_records(folder))
-    ]
-    known = {key for keys in sets for key in keys}
+    records = frame_sets(read_frame_records(folder))
+    sets = [[(frame.camera, frame.index) for frame in each] for each in records]
+    began = {(robot_of(each[0].camera), each[0].time_s): number for number, each in enumerate(records)}
+    mirrors = {
+        name: [
+            (began[robot, time_s], plane)
+            for robot, time_s, plane in parse_lines(folder / f"mirrors.{name}.jsonl", parse_mirror)
+            if (robot, time_s) in began
+        ]
+        for name in measurements
+        if (folder / f"mirrors.{name}.jsonl").is_file()
+    }
     for name, found in measurements.items():
-        for camera, index, _ in (key for each in found for key in each.detections):
-            if (camera, index) not in known:
+        there = Counter((hit.camera, hit.index) for hit in detections[name])
+        for camera, index, number in (key for each in found for key in each.detections):
+            if number >= there[camera, index]:
                 raise InputError(
-                    f"{paths[name]}: speaks of frame {index} of {camera}, which frames.jsonl lacks"
+                    f"{paths[name]}: speaks of detection {number} of frame {index} of {camera}, which "
+                    f"detections.{name}.jsonl does not have; run 'nir-render perceive {folder}' again"
                 )
-    around = evaluate_sets(sets, truth, calibrations, measurements, detections, lamps)
+    around = evaluate_sets(sets, truth, calibrations, measurements, detections, lamps, mirrors)
     summary = dict(result.summary)
     summary["estimators"] = {
         name: {**numbers, **around.summary.get(name, {})} for name, numbers in summary["estimators"].items()

@@ -66,8 +66,8 @@ def mirror_record(mirror: MirrorPlane, robot: str, time_s: float) -> dict[str, A
 
 def parse_mirror(
     record: Mapping[str, Any], file: str = "mirrors.jsonl", line: int | None = None
-) -> MirrorPlane:
-    """Read one object of `mirrors.NAME.jsonl`.
+) -> tuple[str, float, MirrorPlane]:
+    """Read one object of `mirrors.NAME.jsonl`: whose it is, when, and the mirror.
 
     Raises
     ------
@@ -76,7 +76,8 @@ def parse_mirror(
     """
     place = Place(file, line)
     check_format(record, place)
-    return MirrorPlane(**read_fields(MirrorPlane, record, place, _OF_MIRROR))
+    plane = MirrorPlane(**read_fields(MirrorPlane, record, place, _OF_MIRROR))
+    return text(record, "robot", place), number(record, "time_s", place), plane
 
 
 def _plain(name: str, value: Any) -> Any:
