@@ -49,7 +49,14 @@ _READERS: dict[str, Reader] = {
     "range_constant_paper_dn_m2_per_s": number_or_nan,
 }
 _NUMBERS = (*_WHOLE, *_POSITIVE, *_REAL, *_FIXED_PATTERN)
-_LISTS = (_QUATERNION, "position_body_m", "response_angle_rad", "response_relative", "distortion")
+_LISTS = (
+    _QUATERNION,
+    "position_body_m",
+    "response_angle_rad",
+    "response_relative",
+    "distortion",
+    "own_sources_body_m",
+)
 
 
 def calibration_document(calibrations: Iterable[Calibration]) -> dict[str, Any]:

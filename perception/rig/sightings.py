@@ -123,7 +123,7 @@ def sightings_of(
             common,
             time_s,
         ),
-        claimed=np.isfinite(u_sigma_px + v_sigma_px) & (claimed | ~ranged),
+        claimed=np.isfinite(u_sigma_px + v_sigma_px) & (claimed | ~known),
         saturated=saturated,
         merged=merged,
         ghost=ghost,
