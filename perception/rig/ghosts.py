@@ -36,13 +36,16 @@ KINDS: tuple[Literal["constant", "surface", "pane"], ...] = ("constant", "surfac
 MIRROR_PROBABILITY = 0.1
 """That a set shows a flat mirror at all, before it is looked at."""
 
-SYMMETRY_PROBABILITY = 0.1
-"""That robots stand in a formation that is its own mirror image."""
+SYMMETRY_PROBABILITY = 0.01
+"""That robots stand in a formation that is its own mirror image, …"""
+
+FORMATION_SIGMAS_M = (0.0, 0.01, 0.03)
+"""… to one of these."""
 
 SEEN_PROBABILITY = 0.5
 """That a robot before a mirror has its image in it: mirrors have edges, and things stand before them."""
 
-YES, POSSIBLE = 0.999, 0.01
+YES, POSSIBLE = 0.98, 0.01
 """Probabilities of a ghost from which a measurement is called one, or possibly one."""
 
 LEAST_PLANE_DISTANCE_M, MOST_PLANE_DISTANCE_M = 0.05, 20.0
@@ -53,10 +56,12 @@ INDEX_PRIOR, INDEX_SIGMA = 1.5, 0.08
 
 _GATE_CHI2 = 25.0
 _MOST_FLARES = 40
-_MOST_SEEDS, _MOST_TRIED = 2000, 8
+_MOST_SEEDS, _MOST_TRIED = 2000, 6
+_CLEAR = 10.0
 _MOST_PAIRS_OF_PAIRS = 40_000
 _MOST_PLANES = 4
-_SEED_INDICES = (1.4, 1.5, 1.6)
+_SEED_INDICES = (1.4, 1.45, 1.5, 1.55, 1.6)
+_DIM_RATIO = 1.5
 _HEIGHT_SIGMA_M = 0.02
 _SAME_HEIGHT = 0.8
 _LOG_RANGE_SPAN = math.log(100.0)
@@ -193,17 +198,20 @@ def _best_plane(
         if one is not None:
             return one
     parents, shown = _plausible_pairs(flares, robots, images)
-    own = len(flares.place_m) > len(log_chance)
-    best: _Found | None = None
+    trials = []
     for kind, seeds in _seeds(flares, parents, shown):
         chosen, explained = best_seeds(flares, robots, images, seeds, kind, _MOST_TRIED)
-        for seed in chosen[explained >= (1 if own else 2)]:
-            prior, precision = seed.copy(), np.zeros((4, 4))
-            prior[4] = INDEX_PRIOR if kind != CONSTANT else seed[4]
-            precision[3, 3] = 1.0 / INDEX_SIGMA**2 if kind != CONSTANT else 0.0
-            one = _fitted(flares, robots, images, log_chance, seed, kind, prior, precision)
-            if one is not None and (best is None or one.log_odds > best.log_odds):
-                best = one
+        trials += [(count, kind, seed) for count, seed in zip(explained.tolist(), chosen, strict=True)]
+    best: _Found | None = None
+    for count, kind, seed in sorted(trials, key=lambda each: -each[0]):
+        if count < 2 or (best is not None and best.log_odds > _CLEAR and count < len(best.images)):
+            break
+        prior, precision = seed.copy(), np.zeros((4, 4))
+        prior[4] = INDEX_PRIOR if kind != CONSTANT else seed[4]
+        precision[3, 3] = 1.0 / INDEX_SIGMA**2 if kind != CONSTANT else 0.0
+        one = _fitted(flares, robots, images, log_chance, seed, kind, prior, precision)
+        if one is not None and (best is None or one.log_odds > best.log_odds):
+            best = one
     return best
 
 
@@ -221,6 +229,10 @@ def _seeds(flares: Flares, parents: Indices, images: Indices) -> list[tuple[int,
     pairs = len(parents)
     stride = max(1, pairs * (pairs - 1) // 2 // _MOST_PAIRS_OF_PAIRS)
     seeds = [(CONSTANT, seeds_of_constant(flares, parents, images, stride, _MOST_SEEDS))]
+    # A dielectric takes more than half of the light but at grazing angles.
+    near_m = np.linalg.norm(flares.place_m[parents] - flares.origin_m[images], axis=1)
+    dim = np.linalg.norm(flares.place_m[images] - flares.origin_m[images], axis=1) > _DIM_RATIO * near_m
+    parents, images = parents[dim], images[dim]
     for kind in (SURFACE, PANE):
         of_kind = [seeds_of_kind(flares, parents, images, kind, index) for index in _SEED_INDICES]
         seeds.append((kind, np.concatenate(of_kind)))
@@ -243,11 +255,10 @@ def _fitted(
     parents, shown, _ = matched(flares, robots, images, plane, kind, 0.0)
     result = None
     for _ in range(4):
-        own = bool((parents >= len(log_chance)).any())
-        if len(parents) < (1 if is_known or own else 2):
+        if len(parents) < (1 if is_known else 2):
             return None
         chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane, kind, prior, precision)
-        if not np.isfinite(covariance).all() or not plane[3] > LEAST_PLANE_DISTANCE_M:
+        if not (np.diagonal(covariance) > 0.0).all() or not plane[3] > LEAST_PLANE_DISTANCE_M:
             return None
         result = parents, shown, chi2, log_peak, covariance
         again, whom, _ = matched(flares, robots, images, plane, kind, _GATE_CHI2)
@@ -284,15 +295,20 @@ def _log_symmetry(
     flares: Flares, parents: Indices, images: Indices, plane: Array, log_others: float, log_prior: float
 ) -> float:
     """Return ln of the odds of robots that stand as images would, with all of their light."""
-    whole = plane.copy()
-    whole[4] = 0.0
     precision = np.zeros((4, 4))
     precision[3, 3] = 1e10
-    chi2, log_peak, covariance = fit_plane(flares, parents, images, whole, CONSTANT, whole.copy(), precision)
-    if not np.isfinite(covariance).all():
-        return -math.inf
-    log_volume = 0.5 * float(np.linalg.slogdet(2.0 * math.pi * covariance[:3, :3])[1])
-    return math.log(SYMMETRY_PROBABILITY) + log_others + log_peak - 0.5 * chi2 + log_volume + log_prior
+    log_odds = -math.inf
+    for off_m in FORMATION_SIGMAS_M:
+        whole = plane.copy()
+        whole[4] = 0.0
+        loose = flares._replace(noise_m2=flares.noise_m2 + off_m**2 * np.eye(3))
+        chi2, log_peak, covariance = fit_plane(
+            loose, parents, images, whole, CONSTANT, whole.copy(), precision
+        )
+        if (np.diagonal(covariance)[:3] > 0.0).all():
+            log_volume = 0.5 * float(np.linalg.slogdet(2.0 * math.pi * covariance[:3, :3])[1])
+            log_odds = np.logaddexp(log_odds, log_peak - 0.5 * chi2 + log_volume)
+    return float(log_odds) + math.log(SYMMETRY_PROBABILITY) + log_others + log_prior
 
 
 def _log_seen(

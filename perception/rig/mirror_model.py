@@ -21,9 +21,11 @@ CONSTANT, SURFACE, PANE = 0, 1, 2
 
 NEAREST_MIRROR_M = 0.05
 SAME_PLANE = 0.02
-SEED_LOG_RANGE, SEED_RAD = 0.3, 0.06
+SEED_LOG_RANGE, SEED_RAD = 0.3, 0.1
+SEED_COSINE2 = 1.0 - 2.0 * SEED_RAD**2
 FIT_STEPS = 8
 STEP = 1e-4
+SETTLED2 = 1e-4
 
 
 class Flares(NamedTuple):
@@ -181,7 +183,7 @@ def fit_plane(
     information, score = np.empty((4, 4)), np.empty(4)
     off, moved, covariance, slope = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 4))
     chi2, log_peak = 0.0, 0.0
-    trial, axes = np.empty(5), np.empty((2, 3))
+    trial, axes, settled = np.empty(5), np.empty((2, 3)), False
     for step in range(FIT_STEPS):
         across_m = math.hypot(plane[0], plane[1])
         axes[0, 0], axes[0, 1], axes[0, 2] = 0.0, 1.0, 0.0
@@ -227,13 +229,14 @@ def fit_plane(
             if not information[k, k] > 0.0:
                 return chi2, log_peak, np.full((4, 4), np.nan)
         invert(information)
-        if step == FIT_STEPS - 1:
+        if settled or step == FIT_STEPS - 1:
             break
-        length = 0.0
+        length, settled = 0.0, True
         for k in range(4):
             change = 0.0
             for m in range(4):
                 change += information[k, m] * score[m]
+            settled &= change**2 < SETTLED2 * information[k, k]
             if k < 2:
                 for m in range(3):
                     plane[m] += min(max(change, -0.2), 0.2) * axes[k, m]
@@ -305,6 +308,14 @@ def matched(
         for column in range(len(images)):
             j = images[column]
             if i == j:
+                continue
+            # Most images are far from where they would have to be: that is seen without a root or an angle.
+            along, length2 = 0.0, 0.0
+            for k in range(3):
+                out_m = flares.place_m[i, k] + 2.0 * before_m * plane[k] - flares.origin_m[j, k]
+                along += flares.axes[j, 2, k] * out_m
+                length2 += out_m**2
+            if along <= 0.0 or along**2 < SEED_COSINE2 * length2:
                 continue
             residual(flares, j, plane, kind, flares.place_m[i], off)
             if abs(off[0]) > SEED_RAD or abs(off[1]) > SEED_RAD or abs(off[2]) > SEED_LOG_RANGE:

@@ -79,7 +79,7 @@ def test_fusion_is_the_least_squares_solution() -> None:
         return np.concatenate(parts)
 
     best = least_squares(residuals, [*place, 0.0], x_scale=[1e-3, 1e-3, 1e-3, 1.0], xtol=1e-14, ftol=1e-14)
-    covariance = np.linalg.inv(best.jac.T @ best.jac)[:3, :3]
+    covariance = np.linalg.inv(np.asarray(best.jac).T @ np.asarray(best.jac))[:3, :3]
     np.testing.assert_allclose(one.position_body_m, best.x[:3], atol=2e-6)
     np.testing.assert_allclose(one.position_covariance_m2, covariance, rtol=0.02, atol=1e-9)
 
@@ -155,7 +155,7 @@ def test_extrinsics_that_are_not_exact_are_part_of_the_covariance() -> None:
 
 def _turned(rng: np.random.Generator) -> Array:
     a, b, c = 2e-3 * rng.normal(size=3)
-    return np.eye(3) + np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
+    return np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
 
 
 def _as_believed(hit: Detection, camera: Calibration) -> Detection:
