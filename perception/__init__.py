@@ -25,11 +25,13 @@ from perception.calibration.range_constant import (
     regress_range_constant,
 )
 from perception.calibration.result import RailCalibration
+from perception.command_estimator import CommandEstimator, CommandProcess, load_command
 from perception.estimators import (
     ESTIMATORS,
     Estimator,
     EstimatorError,
     OwnEstimator,
+    OwnSetEstimator,
     detect,
     detect_frames,
     load_estimator,
@@ -56,12 +58,15 @@ from perception.types import Calibration, Detection, RawFrame
 __all__ = [
     "ESTIMATORS",
     "Calibration",
+    "CommandEstimator",
+    "CommandProcess",
     "Detection",
     "Estimator",
     "EstimatorError",
     "FlareLimit",
     "FrameRecord",
     "OwnEstimator",
+    "OwnSetEstimator",
     "PaperRegression",
     "RailCalibration",
     "RangeConstantFit",
@@ -77,6 +82,7 @@ __all__ = [
     "flare_limit",
     "flare_limits",
     "frame_record",
+    "load_command",
     "load_estimator",
     "parse_calibration_document",
     "parse_detection",
