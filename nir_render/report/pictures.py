@@ -121,7 +121,7 @@ def whole_pictures(
             name: [alarm for alarm in alarms if (alarm.camera, alarm.index) == key]
             for name, alarms in result.false_alarms.items()
         }
-        pictures.append(_whole(load(key), calibrations[key[0]], scores, false_alarms))
+        pictures.append(shown_frame(load(key), calibrations[key[0]], scores, false_alarms))
     return pictures
 
 
@@ -186,12 +186,13 @@ def png_uri(picture: NDArray[np.uint8]) -> str:
     return data_uri(_encoded(picture, ".png"), "image/png")
 
 
-def _whole(
+def shown_frame(
     frame: RawFrame,
     calibration: Calibration,
     scores: Sequence[Score],
     false_alarms: Mapping[str, Sequence[Detection]],
 ) -> WholePicture:
+    """Show a whole frame: sources, ghosts, and what the estimators of `scores` and `false_alarms` found."""
     rows, columns = frame.data_dn.shape
     block_px = max(1, round(columns / _WHOLE_WIDTH_PX))
     grey = whole_picture(frame, calibration, block_px)
