@@ -10,6 +10,7 @@ from nir_render.command.options import Json
 if TYPE_CHECKING:
     from nir_render.compare.compare import Comparison
 
+_WIDEST = 32
 _SHORT = {"no difference seen": "none seen", "too few frames": "too few"}
 _STYLES = {"better": "green", "worse": "bold red", "differs": "yellow"}
 
@@ -61,18 +62,22 @@ def _show(result: "Comparison") -> None:
     from nir_render.compare.words import counts_sentence, has_content, interval_text, row_of, sentence_of
 
     for pair in result.estimators:
-        labels = (pair.first, pair.second) if result.first is result.second else result.labels
+        labels = result.sides(pair)
         title = pair.first if pair.first == pair.second else f"{pair.first} against {pair.second}"
         table = Table(
-            title=f"{escape(title)}, {len(pair.frames)} frames", title_justify="left", box=box.SIMPLE_HEAD
+            title=f"{escape(title)}, {len(pair.frames)} frames",
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+            pad_edge=False,
         )
-        headings = ("figure", *labels, "difference (95 %)", "verdict", "would have\nseen")
+        headings = ("figure", *labels, "difference (95 %)", "verdict", "would see")
         for heading in headings:
             table.add_column(
                 escape(heading),
                 justify="left" if heading in ("figure", "verdict") else "right",
-                no_wrap=heading not in ("figure", "difference (95 %)"),
-                min_width=12 if heading == "figure" else None,
+                no_wrap=heading != "difference (95 %)",
+                max_width=_WIDEST,
             )
         for compared in pair.figures:
             if has_content(compared):
@@ -80,6 +85,7 @@ def _show(result: "Comparison") -> None:
                 said = _SHORT.get(compared.verdict, compared.verdict)
                 style = _STYLES.get(compared.verdict)
                 said = f"[{style}]{said}[/]" if style else said
+                title = title.replace(" per frame", "\nper frame")
                 table.add_row(title, first, second, interval_text(compared, difference=True), said, least)
         print_table(table)
         recall = next(compared for compared in pair.figures if compared.figure.name == "recall")

@@ -43,6 +43,17 @@ class Comparison:
                 return labels
         return one.name, other.name
 
+    def sides(self, pair: EstimatorComparison) -> tuple[str, str]:
+        """Return what to call the sides of a pair of estimators."""
+        if self.first is self.second:
+            return pair.first, pair.second
+        first, second = self.labels
+        return (
+            (first, second)
+            if pair.first == pair.second
+            else (f"{first}: {pair.first}", f"{second}: {pair.second}")
+        )
+
     def record(self) -> dict[str, Any]:
         """Return the comparison as JSON has it."""
         return {

@@ -22,9 +22,10 @@ from nir_render.compare.words import (
     sentence_of,
 )
 from nir_render.errors import InputError
+from nir_render.evaluate.metrics import Score
 from nir_render.report.drawing import Drawing
 from nir_render.report.parts import Table, render_page
-from nir_render.report.pictures import WholePicture, shown_frame
+from nir_render.report.pictures import CloseUp, WholePicture, close_up, shown_frame
 from nir_render.report.wording import counted, degrees, metres
 from nir_render.run.folder import note_seconds, write_file
 from perception import RecordingError, read_frame
@@ -39,11 +40,12 @@ _ROW_HEADINGS = ("source", "first", "second", "limit σ")
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """One frame on both sides, and what differs in it."""
+    """One frame on both sides, the source that differs most close up, and what differs."""
 
     title: str
     first: WholePicture
     second: WholePicture
+    closes: tuple[CloseUp, ...]
     rows: Table
     more: str
 
@@ -72,7 +74,6 @@ def compare_html(comparison: Comparison) -> str:
     """
     first, second = comparison.labels
     one_run = comparison.first is comparison.second
-    names = list(dict.fromkeys(name for pair in comparison.estimators for name in (pair.first, pair.second)))
     most = max(1, min(_MOST_FRAMES, _MOST_OF_ALL // len(comparison.estimators)))
     estimators = [
         pair.first if pair.first == pair.second else f"{pair.first} and {pair.second}"
@@ -86,9 +87,9 @@ def compare_html(comparison: Comparison) -> str:
             f"estimators: {', '.join(estimators)}",
             "the same frames" if comparison.pairing.same_frames else "frames of their own",
         ],
-        names=names,
+        names=_names(comparison),
         notes=[f"{note[:1].upper()}{note[1:]}." for note in comparison.pairing.notes],
-        sections=[_section(comparison, pair, one_run, most) for pair in comparison.estimators],
+        sections=[_section(comparison, pair, most) for pair in comparison.estimators],
         rules=RULES,
     )
 
@@ -131,8 +132,13 @@ def _change(pair: SourcePair) -> float:
     return change if math.isfinite(change) else 0.0
 
 
-def _section(comparison: Comparison, pair: EstimatorComparison, one_run: bool, most: int) -> Section:
-    labels = (pair.first, pair.second) if one_run else comparison.labels
+def _names(comparison: Comparison) -> list[str]:
+    """Return the names of all estimators of the page, each once."""
+    return list(dict.fromkeys(name for pair in comparison.estimators for name in (pair.first, pair.second)))
+
+
+def _section(comparison: Comparison, pair: EstimatorComparison, most: int) -> Section:
+    labels = comparison.sides(pair)
     differing = differing_frames(pair.frames)
     shown = differing[:most]
     rows = [_marked(row_of(compared)) for compared in pair.figures if has_content(compared)]
@@ -181,6 +187,11 @@ def _shown(comparison: Comparison, pair: EstimatorComparison, frame: FramePair) 
         title=f"{frame.key[0]}, frame {frame.key[1]}",
         first=_picture(comparison.first, frame, pair.first),
         second=_picture(comparison.second, frame, pair.second),
+        closes=tuple(
+            _close(run, frame, name, _names(comparison), differing[0].name)
+            for run, name in ((comparison.first, pair.first), (comparison.second, pair.second))
+            if differing
+        ),
         rows=Table(_ROW_HEADINGS, rows),
         more=f"{counted(more, 'more source')} not listed." if more > 0 else "",
     )
@@ -194,12 +205,25 @@ def _said(said: Said) -> str:
 
 
 def _picture(run: ScoredRun, frame: FramePair, name: str) -> WholePicture:
+    raw = read_frame(run.folder, run.records[frame.key])
+    alarms = {name: list(run.evaluations[frame.key].false_alarms[name])}
+    return shown_frame(raw, run.calibrations[frame.key[0]], _scores(run, frame, name), alarms)
+
+
+def _close(run: ScoredRun, frame: FramePair, name: str, names: Sequence[str], source: str) -> CloseUp:
+    score = next(
+        score
+        for score in _scores(run, frame, name)
+        if score.truth.ghost_of is None and f"{score.truth.robot}.{score.truth.source}" == source
+    )
+    raw = read_frame(run.folder, run.records[frame.key])
+    return close_up(raw, run.calibrations[frame.key[0]], score, [name], names)
+
+
+def _scores(run: ScoredRun, frame: FramePair, name: str) -> list[Score]:
+    """Return the scores of a frame with what one estimator said."""
     evaluation = run.evaluations[frame.key]
-    scores = [
+    return [
         dataclasses.replace(score, detections={n: said for n, said in score.detections.items() if n == name})
         for score in (*evaluation.scores, *evaluation.ghosts)
     ]
-    raw = read_frame(run.folder, run.records[frame.key])
-    return shown_frame(
-        raw, run.calibrations[frame.key[0]], scores, {name: list(evaluation.false_alarms[name])}
-    )

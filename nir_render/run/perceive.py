@@ -134,6 +134,9 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progre
         listed = [detection for key in keys for detection in of_frames.get(key, [])]
         run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, listed))
         counts[name] = len(listed)
+    for name, text in failures.items():
+        if (folder / f"detections.{name}.jsonl").is_file():
+            failures[name] = f"{text}\ndetections.{name}.jsonl is of an earlier call, and stays as it was"
     if counts:
         note_seconds(folder, "perceive", started)
     return Perceived(counts, failures)

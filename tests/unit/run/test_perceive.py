@@ -111,6 +111,7 @@ def test_one_that_fails_takes_no_other_along(recording: Path, body: str, said: s
     assert answer["detections"] == {"robust": 6}
     assert said in answer["failed"]["broken"]
     assert f"error: --estimator {broken}: {said}" in done.stderr
+    assert "detections.broken.jsonl is of an earlier call, and stays as it was" in done.stderr
     assert "Traceback" not in done.stderr
     assert _found(recording, "robust") == ALL
 
