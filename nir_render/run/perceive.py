@@ -10,7 +10,6 @@ from pathlib import Path
 from nir_render.errors import InputError
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds
-from nir_render.run.frame_sets import frame_sets
 from nir_render.run.render import Progress
 from perception import (
     ESTIMATORS,
@@ -24,13 +23,18 @@ from perception import (
     RawFrame,
     detect,
     detection_record,
+    frame_sets,
     load_command,
     load_estimator,
+    measure_set,
+    measurement_record,
+    mirror_record,
     read_calibrations,
     read_frame,
     read_frame_records,
 )
 from perception.command_estimator import LIMIT_S, is_command
+from perception.rig.frame_sets import robot_of
 from perception.types import FrameKey
 
 RunEstimator = Estimator | OwnSetEstimator | CommandEstimator
@@ -133,6 +137,8 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progre
     for name, of_frames in found.items():
         listed = [detection for key in keys for detection in of_frames.get(key, [])]
         run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, listed))
+        by_record = [of_frames.get((record.camera, record.index), []) for record in records]
+        _measure_sets(folder, name, records, by_record, calibrations)
         counts[name] = len(listed)
     for name, text in failures.items():
         if (folder / f"detections.{name}.jsonl").is_file():
@@ -221,6 +227,25 @@ class _Reader:
                 for detection in detect(frame, calibrations[frame.camera], estimator)
             ]
         )
+
+
+def _measure_sets(
+    folder: Path,
+    name: str,
+    records: Sequence[FrameRecord],
+    detections: Sequence[Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+) -> None:
+    """Write what each robot's cameras measure together, set by set, and the mirrors that show in it."""
+    of_frame = {(record.camera, record.index): hits for record, hits in zip(records, detections, strict=True)}
+    measurements, mirrors = [], []
+    for frames in frame_sets(records):
+        seen = measure_set(frames, [of_frame[frame.camera, frame.index] for frame in frames], calibrations)
+        measurements += [measurement_record(each) for each in seen.measurements]
+        robot, time_s = robot_of(frames[0].camera), frames[0].time_s
+        mirrors += [mirror_record(plane, robot, time_s) for plane in seen.planes]
+    run_folder.write_lines(folder / f"measurements.{name}.jsonl", measurements)
+    run_folder.write_lines(folder / f"mirrors.{name}.jsonl", mirrors)
 
 
 def frame_keys(folder: Path) -> list[FrameKey]:

@@ -3,7 +3,7 @@
 {"format": 1, "cameras": {name: {...}}}. Fields are named as in `Calibration`, but for the pose, which stands
 as `quaternion_body_camera_xyzw` and `position_body_m`. An entry whose standard deviation is known is written
 as {"value": v, "sigma": s}; that of the quaternion is an angle in radians. `lens_model` and `distortion` may
-be missing: the lens is then rectilinear; `dsnu_e` and `prnu` too: they are then 0.
+be missing: the lens is then rectilinear; `dsnu_e` and `prnu` too: they are then 0; `own_sources_body_m` too.
 """
 
 import math
@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.files.fields import (
     Place,
@@ -48,7 +49,14 @@ _READERS: dict[str, Reader] = {
     "range_constant_paper_dn_m2_per_s": number_or_nan,
 }
 _NUMBERS = (*_WHOLE, *_POSITIVE, *_REAL, *_FIXED_PATTERN)
-_LISTS = (_QUATERNION, "position_body_m", "response_angle_rad", "response_relative", "distortion")
+_LISTS = (
+    _QUATERNION,
+    "position_body_m",
+    "response_angle_rad",
+    "response_relative",
+    "distortion",
+    "own_sources_body_m",
+)
 
 
 def calibration_document(calibrations: Iterable[Calibration]) -> dict[str, Any]:
@@ -89,7 +97,7 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     if math.isnan(calibration.range_constant_paper_dn_m2_per_s):
         record["range_constant_paper_dn_m2_per_s"] = None  # its detector found too little to calibrate with
     record[_QUATERNION] = Rotation.from_matrix(matrix).as_quat(canonical=True).tolist()
-    for name in ("position_body_m", "response_angle_rad", "response_relative"):
+    for name in ("position_body_m", "response_angle_rad", "response_relative", "own_sources_body_m"):
         record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
     record["lens_model"] = calibration.lens_model
     record["distortion"] = [float(number) for number in calibration.distortion]
@@ -152,11 +160,21 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
         position_body_m=np.array(numbers(values, "position_body_m", place, 3)),
         response_angle_rad=angles,
         response_relative=response,
+        own_sources_body_m=_own_sources(values, place),
         sigma=sigma,
         lens_model=lens_model,
         distortion=distortion,
         **{field: _READERS[field](values, field, place) for field in _NUMBERS},
     )
+
+
+def _own_sources(values: Mapping[str, Any], place: Place) -> NDArray[np.float64]:
+    """Return where the robot's own sources sit; without, none."""
+    rows = values.get("own_sources_body_m", [])
+    if not isinstance(rows, list):
+        raise place.error(f"is {rows!r}", "Write a list of [x, y, z], in metres", "own_sources_body_m")
+    parts = {f"own_sources_body_m[{i}]": row for i, row in enumerate(rows)}
+    return np.array([numbers(parts, name, place, 3) for name in parts]).reshape(-1, 3)
 
 
 def _lens(values: Mapping[str, Any], place: Place) -> tuple[str, tuple[float, ...]]:

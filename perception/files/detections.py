@@ -55,7 +55,7 @@ def parse_detection(
     """
     place = Place(file, line)
     check_format(record, place)
-    return Detection(**read_fields(Detection, record, place, _READERS))
+    return Detection(**read_fields(Detection, {**_OPTIONAL, **record}, place, _READERS))
 
 
 def _bearing(record: Mapping[str, Any], field: str, place: Place) -> tuple[float, ...]:
@@ -74,6 +74,9 @@ _READERS: dict[Any, Reader] = {
     "time_s": number,
     "bearing_body": _bearing,
 }
+
+
+_OPTIONAL = {"flux_sigma_dn": None, "range_sigma_common_m": None}
 
 
 def _null_for_nan(name: str, value: float) -> float | None:

@@ -32,6 +32,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.randomness": (),
     "nir_render.geometry": (),
     "nir_render.errors": (),
+    "perception.rig": (),
     "perception.calibration": (),
     "perception.command_estimator": (),
     "perception.estimators": (),

@@ -9,9 +9,14 @@ from pathlib import Path
 import pytest
 
 from nir_render.errors import InputError
-from nir_render.run.frame_sets import frame_sets
 from nir_render.run.perceive import chosen_estimators, frame_estimators, perceive_run
-from perception import calibration_document, encode_png16, frame_record, parse_frame_record
+from perception import (
+    calibration_document,
+    encode_png16,
+    frame_record,
+    frame_sets,
+    parse_frame_record,
+)
 from tests.system.command import nir_render
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
