@@ -123,6 +123,7 @@ class CommandProcess:
         self._calibrations = calibrations
         self._folder = folder
         self._asked = 0
+        known = calibration_document(calibrations.values())
         try:
             # A session of its own: whatever it starts can be ended with it, and Ctrl-C reaches us first.
             self._process = subprocess.Popen(  # noqa: S603 (what the user asked for, without a shell)
@@ -151,7 +152,7 @@ class CommandProcess:
         self._threads = [threading.Thread(target=one, args=rest, daemon=True) for one, *rest in work]
         for thread in self._threads:
             thread.start()
-        self._send(calibration_document(calibrations.values()))
+        self._send(known)
 
     def detect(self, frame: RawFrame, file: Path) -> list[Detection]:
         """Ask for the flares of one frame.
