@@ -78,6 +78,9 @@ class Calibration:
         Radius of a source, a sphere.
     wavelength_m
         Centre wavelength.
+    extinction_per_m
+        Of the fog, 0 in clear air. Where it is not known a σ says so (0.05 /m: anything from clear air to
+        a visibility of 40 m): ranges by flux are then no better than that allows.
     own_sources_body_m
         Where the robot's own sources sit, in body axes, shape (n, 3): mirrors show them too.
     sigma
@@ -110,6 +113,7 @@ class Calibration:
     distortion: tuple[float, ...] = ()
     dsnu_e: float = 0.0
     prnu: float = 0.0
+    extinction_per_m: float = 0.0
     own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
 
 
@@ -124,6 +128,8 @@ class Detection:
     recovered. `bearing_body` is the unit vector from the camera's centre in body axes. `flux_sigma_dn` is the
     flux's standard deviation. `range_sigma_common_m` is the part of `range_sigma_m` that measurements of one
     source share, in whatever frame or camera: by range constant, the robot's own flux, the source's radius.
+    Where the calibration does not exclude fog, `range_by_size_m` and its σ are what size alone says; NaN for
+    a source too far to tell.
     """
 
     camera: str
@@ -145,6 +151,8 @@ class Detection:
     bearing_body: tuple[float, float, float]
     flux_sigma_dn: float = math.nan
     range_sigma_common_m: float = math.nan
+    range_by_size_m: float = math.nan
+    range_by_size_sigma_m: float = math.nan
 
 
 Ghost = Literal["no", "possible", "yes"]
@@ -257,11 +265,16 @@ class SetMeasurements:
         Of each frame, in the order of the frames: what they are made of.
     planes
         Mirrors found, and those handed in that show something.
+    extinction_per_m, extinction_sigma_per_m
+        Of the fog, with which ranges were corrected; NaN where it was not looked for, or the set did not
+        tell it.
     """
 
     measurements: tuple[Measurement, ...]
     detections: tuple[tuple[Detection, ...], ...]
     planes: tuple[MirrorPlane, ...] = ()
+    extinction_per_m: float = math.nan
+    extinction_sigma_per_m: float = math.nan
 
 
 def bearing_axes(bearing: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -31,6 +31,10 @@ class Exposed(Timed, Protocol):
     def line_time_s(self) -> float:
         """Delay between rows."""
 
+    @property
+    def gain(self) -> float:
+        """Factor on the calibrated system gain."""
+
 
 Frame = TypeVar("Frame", bound=Timed)
 

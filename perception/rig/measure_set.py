@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from perception.estimators import Estimator, detect_frames
+from perception.rig.extinction import corrected, estimated_extinction
 from perception.rig.frame_sets import Exposed, robot_of
 from perception.rig.fusion import associated, fused
 from perception.rig.ghosts import told_ghosts
 from perception.rig.sightings import sightings_of
-from perception.types import Calibration, Detection, MirrorPlane, RawFrame, SetMeasurements
+from perception.types import Calibration, Detection, Measurement, MirrorPlane, RawFrame, SetMeasurements
 
 
 def detect_set(
@@ -35,6 +36,8 @@ def detect_set(
     -------
     SetMeasurements
         Every source once, however many cameras see it, with whether it is a mirror image (`told_ghosts`).
+        Where the calibrations give the extinction a σ it is estimated too, if the set tells it, and ranges are
+        corrected (`extinction`).
 
     Raises
     ------
@@ -60,8 +63,27 @@ def measure_set(
     robots = sorted({robot_of(frame.camera) for frame in frames})
     if len(robots) > 1:
         raise ValueError(f"a set is of one robot's frames, not of {', '.join(robots)}: see frame_sets")
+    measurements, mirrors = _measured(frames, detections, calibrations, planes)
+    images = {key for each in measurements if each.ghost == "yes" for key in each.detections}
+    extinction = estimated_extinction(frames, detections, calibrations, images)
+    if extinction is not None:
+        detections = corrected(frames, detections, calibrations, extinction)
+        measurements, mirrors = _measured(frames, detections, calibrations, planes)
+    return SetMeasurements(
+        measurements,
+        tuple(map(tuple, detections)),
+        mirrors,
+        *((extinction.per_m, extinction.sigma_per_m) if extinction is not None else ()),
+    )
+
+
+def _measured(
+    frames: Sequence[Exposed],
+    detections: Sequence[Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+    planes: Sequence[MirrorPlane],
+) -> tuple[tuple[Measurement, ...], tuple[MirrorPlane, ...]]:
+    """Join detections to measurements, and tell mirror images from robots."""
     found = sightings_of(frames, detections, calibrations)
     own_sources_body_m = calibrations[frames[0].camera].own_sources_body_m if frames else np.empty((0, 3))
-    measurements = fused(found, associated(found))
-    told, shown = told_ghosts(measurements, own_sources_body_m, planes)
-    return SetMeasurements(told, tuple(map(tuple, detections)), shown)
+    return told_ghosts(fused(found, associated(found)), own_sources_body_m, planes)

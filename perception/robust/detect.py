@@ -1,10 +1,14 @@
 """The robust detector: flares found against the noise of one frame, and measured by maximum likelihood."""
 
 import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from perception.model.bearing import bearing_body
+from perception.model.fog import loosened, may_be_in_fog, ranged_in_fog, size_alone
+from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
@@ -57,7 +61,8 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         If frame and calibration do not belong together (`sensor.check_frame`).
     """
     check_frame(frame, calibration)
-    prepared = prepare(frame, calibration)
+    in_fog = may_be_in_fog(calibration)
+    prepared = prepare(frame, loosened(calibration) if in_fog else calibration)
     blobs = [
         blob
         for component in blobs_at(prepared.lit_at, prepared.lit_e, calibration.width_px)
@@ -70,11 +75,49 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     reported = [(blob, found) for blob, found in measured if found.stands_out]
     if not reported:
         return []
+    if in_fog:
+        reported = list(_in_fog(reported, frame, calibration))
     bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
     return [
         _detection(blob, found, (x, y, z), frame, calibration)
         for (blob, found), (x, y, z) in zip(reported, bearings, strict=True)
     ]
+
+
+def _in_fog(
+    found: Sequence[tuple[Blob, MeasuredFlare]], frame: RawFrame, calibration: Calibration
+) -> Iterator[tuple[Blob, MeasuredFlare]]:
+    """Yield flares that were fitted with any size, with ranges as fog allows; bounds stay as they are."""
+    u_px, v_px, flux_e, flux_sigma_e, both_m, both_sigma_m = np.array(
+        [
+            (one.u_px, one.v_px, one.flux_e, one.flux_sigma_e, one.range_m, one.range_sigma_m)
+            for _, one in found
+        ]
+    ).T
+    at_1_m_dn = flux_at_one_metre_dn(u_px, v_px, frame.exposure_s, frame.gain, calibration)
+    with np.errstate(invalid="ignore"):
+        by_flux_m = np.sqrt(at_1_m_dn / (flux_e * gain_dn_per_e(frame, calibration)))
+    share_sigma = flux_sigma_e / flux_e
+    known = np.isfinite(both_sigma_m) & np.isfinite(by_flux_m)
+    by_flux_m = np.where(known, by_flux_m / (1.0 + 0.375 * np.minimum(share_sigma, 1.0) ** 2), 1.0)
+    both_m, both_sigma_m = np.where(known, both_m, 1.0), np.where(known, both_sigma_m, 1.0)
+    size_m, size_sigma_m = size_alone(both_m, both_sigma_m, by_flux_m, share_sigma)
+    ranges = ranged_in_fog(by_flux_m, share_sigma, size_m, size_sigma_m, calibration)
+    for k, (blob, one) in enumerate(found):
+        if not known[k]:
+            yield blob, one
+            continue
+        yield (
+            blob,
+            replace(
+                one,
+                range_m=float(ranges.range_m[k]),
+                range_sigma_m=float(ranges.range_sigma_m[k]),
+                range_sigma_common_m=float(ranges.range_sigma_common_m[k]),
+                range_by_size_m=float(size_m[k]),
+                range_by_size_sigma_m=float(size_sigma_m[k]),
+            ),
+        )
 
 
 def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
@@ -144,4 +187,6 @@ def _detection(
         bearing_body=bearing,
         flux_sigma_dn=measured.flux_sigma_e * gain,
         range_sigma_common_m=measured.range_sigma_common_m,
+        range_by_size_m=measured.range_by_size_m,
+        range_by_size_sigma_m=measured.range_by_size_sigma_m,
     )

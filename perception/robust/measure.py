@@ -54,6 +54,8 @@ class MeasuredFlare:
     range_m: float
     range_sigma_m: float
     range_sigma_common_m: float = math.nan
+    range_by_size_m: float = math.nan
+    range_by_size_sigma_m: float = math.nan
     saturated: bool = False
     misfit: bool = False
     on_texture: bool = False

@@ -132,7 +132,7 @@ def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     rows, columns = prepared.shape
     cut = box.top == 0 or box.left == 0 or box.top + box.height == rows or box.left + box.width == columns
     around = direction_camera(np.array([member.u_px, member.v_px]) + _PIXEL_STEPS, calibration)
-    long_rad, short_rad = np.linalg.svd(around[1::2] - around[::2], compute_uv=False).tolist()
+    long_rad, short_rad = map(float, np.linalg.svd(around[1::2] - around[::2], compute_uv=False))
     most_aspect = _MOST_ASPECT * long_rad / short_rad
     fill = member.blob.area_px / (0.25 * math.pi * box.height * box.width)
     aspect = max(box.height, box.width) / min(box.height, box.width)
