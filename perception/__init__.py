@@ -37,16 +37,18 @@ from perception.estimators import (
 from perception.files.calibration import calibration_document, parse_calibration_document
 from perception.files.detections import detection_record, parse_detection
 from perception.files.fields import RecordingError
+from perception.files.pictures import Picture, encode_png16, read_picture
 from perception.files.ranges import encode_ranges, read_ranges
 from perception.files.recording import (
     FrameRecord,
-    encode_png16,
+    Recording,
     frame_record,
     parse_frame_record,
     read_calibrations,
     read_frame,
     read_frame_records,
     read_frames,
+    read_recording,
 )
 from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
@@ -63,9 +65,11 @@ __all__ = [
     "FrameRecord",
     "OwnEstimator",
     "PaperRegression",
+    "Picture",
     "RailCalibration",
     "RangeConstantFit",
     "RawFrame",
+    "Recording",
     "RecordingError",
     "calibrate_rail",
     "calibration_document",
@@ -85,7 +89,9 @@ __all__ = [
     "read_frame",
     "read_frame_records",
     "read_frames",
+    "read_picture",
     "read_ranges",
+    "read_recording",
     "regress_paper_range_constant",
     "regress_range_constant",
     "warm_up",

@@ -16,9 +16,8 @@ from perception import (
     detect,
     detection_record,
     load_estimator,
-    read_calibrations,
     read_frame_records,
-    read_frames,
+    read_recording,
 )
 from perception.types import FrameKey
 
@@ -62,14 +61,11 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress:
     started = time.perf_counter()
     found: dict[str, list[Detection]] = {name: [] for name in estimators}
     try:
-        calibrations = read_calibrations(folder)
-        total = len(frame_keys(folder))
-        for done, frame in enumerate(read_frames(folder)):
-            if frame.camera not in calibrations:
-                raise unknown_camera(folder, frame.camera, calibrations)
+        recording = read_recording(folder)
+        for done, frame in enumerate(recording.frames()):
             for name, estimator in estimators.items():
-                found[name] += detect(frame, calibrations[frame.camera], estimator)
-            progress(done + 1, total)
+                found[name] += detect(frame, recording.calibrations[frame.camera], estimator)
+            progress(done + 1, len(recording.records))
     except EstimatorError as error:
         raise InputError(f"--estimator {error}") from None
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
