@@ -69,9 +69,7 @@ class Format(StrEnum):
 
 def schema(
     of: Annotated[Format, typer.Argument(metavar="FORMAT", help=", ".join(Format))] = Format.SCENE,
-    campaign: Annotated[
-        bool, typer.Option("--campaign", help="That of campaigns: as FORMAT campaign.")
-    ] = False,
+    campaign: Annotated[bool, typer.Option("--campaign", help="As FORMAT campaign.")] = False,
 ) -> None:
     """Print the JSON Schema of scene files, for editors, or of another format."""
     import json

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from nir_render.errors import InputError
-from perception.files.fields import Place, RecordingError, parse_json
+from perception.files.fields import Place, RecordingError, first_of, parse_json
 
 MANIFEST = "manifest.json"
 CALIBRATION = "calibration.json"
@@ -27,8 +27,6 @@ TRUTH = "truth.jsonl"
 LAMPS = "lamps.jsonl"
 
 Item = TypeVar("Item")
-
-_MOST_PROBLEMS = 20
 
 
 @contextlib.contextmanager
@@ -152,10 +150,8 @@ def parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             told = getattr(error, "problems", (str(error),))
             problems += [f"{path}, line {number}: {problem}" for problem in told]
-    if len(problems) > _MOST_PROBLEMS:
-        problems[_MOST_PROBLEMS:] = [f"… and {len(problems) - _MOST_PROBLEMS} more"]
     if problems:
-        raise InputError("\n".join(problems))
+        raise InputError("\n".join(first_of(problems)))
     return items
 
 

@@ -23,6 +23,7 @@ MOST_TIME_S = 1e12
 _UNIT_SLACK = 1e-3  # of the length of a bearing
 _MOST_TEXT = 4096
 _MOST_LIST = 100_000
+_BOUNDLESS = 1e6  # of the numbers of a list: a bound that is not worth a word
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,8 @@ def _bounds(entry: Entry) -> str:
     low, high = math.isfinite(entry.least), math.isfinite(entry.most)
     if entry.kind == "bearing":
         return ", of length 1"
+    if entry.kind == "list" and entry.most >= _BOUNDLESS:
+        return ""
     if low and high and entry.least == -entry.most:
         return f" from −{_plain(entry.most)} to {_plain(entry.most)}"
     words = ""

@@ -3,7 +3,7 @@
 import json
 import math
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +19,18 @@ _BRIEF.maxlevel = 2
 class RecordingError(ValueError):
     """A recording cannot be read; the text names file, line and field, and what to do.
 
-    `problems` holds one line per thing to mend; the text is all of them.
+    `problems` holds one line per thing to mend; the text is the first twenty of them, and how many more.
     """
 
     def __init__(self, *problems: str) -> None:
-        super().__init__("\n".join(problems))
+        super().__init__("\n".join(first_of(problems)))
         self.problems = problems
+
+
+def first_of(problems: Sequence[str]) -> list[str]:
+    """Return the first twenty problems, and how many more there are: beyond that nobody reads on."""
+    more = len(problems) - _MOST_SHOWN
+    return [*problems[:_MOST_SHOWN], *([f"… and {more} more"] if more > 0 else [])]
 
 
 class Faults:
@@ -42,10 +48,7 @@ class Faults:
             self.problems += error.problems
 
     def raise_any(self) -> None:
-        """Raise RecordingError if anything was wrong: the first twenty faults, and how many more."""
-        if len(self.problems) > _MOST_SHOWN:
-            more = len(self.problems) - _MOST_SHOWN
-            raise RecordingError(*self.problems[:_MOST_SHOWN], f"… and {more} more")
+        """Raise RecordingError if anything was wrong."""
         if self.problems:
             raise RecordingError(*self.problems)
 

@@ -109,8 +109,14 @@ def read_frame_records(folder: str | Path) -> list[FrameRecord]:
         If the file is missing; else all lines that are broken, name a frame or a file that another one
         names, or go back in time.
     """
-    path = Path(folder) / FRAMES_FILE
     faults = Faults()
+    records = _right_records(Path(folder) / FRAMES_FILE, faults)
+    faults.raise_any()
+    return records
+
+
+def _right_records(path: Path, faults: Faults) -> list[FrameRecord]:
+    """Return the lines of `frames.jsonl` that are right by themselves."""
     records: dict[int, FrameRecord] = {}
     for line, content in enumerate(read_text(path).split("\n"), start=1):
         if content.strip():
@@ -119,7 +125,6 @@ def read_frame_records(folder: str | Path) -> list[FrameRecord]:
                 records[line] = parse_frame_record(record, str(path), line)
     for problem in _clashes(records, str(path)):
         faults.problems += problem.problems
-    faults.raise_any()
     return list(records.values())
 
 
@@ -193,8 +198,9 @@ def read_recording(folder: str | Path) -> Recording:
     with faults.kept():
         calibrations = read_calibrations(folder)
     with faults.kept():
-        records = read_frame_records(folder)
-        if not records:
+        told = len(faults.problems)
+        records = _right_records(folder / FRAMES_FILE, faults)
+        if not records and len(faults.problems) == told:
             raise Place(str(folder / FRAMES_FILE)).error("names no frame", "Write one line per frame")
     for problem in _contradictions(folder, records, calibrations):
         faults.problems += problem.problems

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nir_render.errors import InputError, shown
 from perception import RecordingError, read_picture
+from perception.files.fields import first_of
 
 KINDS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _LOOKED_AT = 8
@@ -94,7 +95,7 @@ def read_pictures(folder: Path, pattern: str) -> Pictures:
         told = ", ".join(f"{file} ({w} × {h} px, {bits} bits)" for (w, h, bits), file in sizes.items())
         problems.append(f"the pictures are not alike: {told}; take out those of other cameras or settings")
     if problems:
-        raise InputError(*(problems[:20] + [f"… and {len(problems) - 20} more"] * (len(problems) > 20)))
+        raise InputError(*first_of(problems))
     ((width_px, height_px, bits),) = sizes
     return Pictures(tuple(files), width_px, height_px, bits, most_dn, lossy_dn, darkness(stack))
 
