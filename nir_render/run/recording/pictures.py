@@ -1,8 +1,6 @@
 """The pictures of one camera: which they are, what they have in common, and what their dark pixels say."""
 
-import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,19 +10,10 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError, shown
 from perception import RecordingError, read_picture
 from perception.files.fields import first_of
+from perception.model.darkness import Darkness, darkness
 
 KINDS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _LOOKED_AT = 8
-_ROUNDING_DN2 = 1.0 / 12.0
-
-
-@dataclass(frozen=True)
-class Darkness:
-    """What the dark pixels of frames say: their mean count and its σ, and their noise from frame to frame."""
-
-    level_dn: float
-    level_sigma_dn: float
-    noise_dn: float
 
 
 @dataclass(frozen=True)
@@ -98,37 +87,6 @@ def read_pictures(folder: Path, pattern: str) -> Pictures:
         raise InputError(*first_of(problems))
     ((width_px, height_px, bits),) = sizes
     return Pictures(tuple(files), width_px, height_px, bits, most_dn, lossy_dn, darkness(stack))
-
-
-def darkness(frames: Sequence[NDArray[np.uint16]]) -> Darkness:
-    """Measure dark level and noise in frames that are mostly dark.
-
-    The level is the mean count of the pixels within three σ of the median; the noise is that of the
-    differences of neighbouring frames there, without what rounding to whole counts adds; of one frame alone,
-    the scatter.
-
-    Parameters
-    ----------
-    frames
-        Counts, each of shape (rows, columns).
-    """
-    levels, squares = [], []
-    inside = np.empty(0, dtype=bool)
-    for number, frame in enumerate(frames):
-        counts = frame.astype(np.float64)
-        middle = float(np.median(counts))
-        scatter = max(1.4826 * float(np.median(np.abs(counts - middle))), 0.5)
-        here = np.abs(counts - middle) <= 3.0 * scatter
-        levels.append(float(counts[here].mean()))
-        if number:
-            both = inside & here
-            change = (counts - frames[number - 1])[both]
-            squares.append(0.5 * float(np.mean((change - change.mean()) ** 2)) if change.size else 0.0)
-        inside = here
-    if not squares:
-        squares = [float(np.var(frames[0].astype(np.float64)[inside]))]
-    noise_dn = math.sqrt(max(float(np.median(squares)) - _ROUNDING_DN2, 0.0))
-    return Darkness(float(np.mean(levels)), math.hypot(float(np.std(levels)), 0.3), noise_dn)
 
 
 def _as_counted(name: str) -> list[tuple[int, int | str]]:
