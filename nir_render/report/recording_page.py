@@ -296,9 +296,16 @@ def _range_plot(found: Found) -> Drawing | None:
             shape = look(name, names)
             sigma_m = np.nan_to_num([one.range_sigma_m for one in listed])
             axes.errorbar(
-                [one.time_s for one in listed], [one.range_m for one in listed], yerr=sigma_m,
-                fmt=shape.marker, color=shape.colour, markersize=5, fillstyle="none", elinewidth=0.8, label=name,
-            )  # fmt: skip
+                [one.time_s for one in listed],
+                [one.range_m for one in listed],
+                yerr=sigma_m,
+                fmt=shape.marker,
+                color=shape.colour,
+                markersize=5,
+                fillstyle="none",
+                elinewidth=0.8,
+                label=name,
+            )
         axes.set_xlabel("start of exposure, s")
         axes.set_ylabel("range, m")
         axes.set_ylim(bottom=0.0)
@@ -330,9 +337,20 @@ def _angles(one: Detection) -> tuple[str, str]:
 
 
 _CALIBRATED = (
-    "width_px", "height_px", "fx_px", "cx_px", "cy_px", "psf_sigma_px", "system_gain_dn_per_e",
-    "read_noise_e", "black_level_dn", "saturation_dn", "bit_depth", "range_constant_dn_m2_per_s", "source_radius_m",
-)  # fmt: skip
+    "width_px",
+    "height_px",
+    "fx_px",
+    "cx_px",
+    "cy_px",
+    "psf_sigma_px",
+    "system_gain_dn_per_e",
+    "read_noise_e",
+    "black_level_dn",
+    "saturation_dn",
+    "bit_depth",
+    "range_constant_dn_m2_per_s",
+    "source_radius_m",
+)
 
 
 def _cameras(cameras: Sequence[str], calibrations: Mapping[str, Calibration]) -> Table:
