@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nir_render.report.wording import counted
 from perception.model.darkness import Darkness, darkness
 from perception.model.flare import image_radius_px
-from perception.model.ranging import angular_radius_rad
+from perception.model.ranging import angular_radius_rad, flux_at_one_metre_dn
 from perception.types import Calibration, Detection, RawFrame
 
 _SPOTS = 3  # the brightest of a frame that are measured
@@ -19,6 +19,7 @@ _BRIGHT = 20.0  # flux over its noise: then one width is known to a few per cent
 _APART_PX = 12
 _HALF_PX = 8
 _PASSES = 12
+_MOST_DISC_PX = 1.2  # of a disc whose share of the width is its variance
 _HOT = 0.9  # of its light in one pixel: no lens makes that
 _PIXEL_PX2 = 1.0 / 12.0
 _LEAST_FLARES = 5
@@ -45,20 +46,17 @@ def shapes_seen(
     frames: Sequence[RawFrame], found: Sequence[Sequence[Detection]], calibration: Calibration
 ) -> ShapesSeen:
     """Look at the shapes in some frames of one camera, whether they were found or not."""
-    widths_px = [
-        width_px
-        for frame, detections in zip(frames, found, strict=True)
-        for width_px in _spot_sigmas_px(frame, detections, calibration)
-    ]
+    widths_px = [width_px for frame in frames for width_px in _spot_sigmas_px(frame, calibration)]
     flares = [detection for detections in found for detection in detections if not detection.saturated]
     width_px = float(np.median(widths_px)) if len(widths_px) >= _LEAST_SPOTS else math.nan
     return ShapesSeen(len(flares), sum(flare.merged for flare in flares), width_px)
 
 
-def _spot_sigmas_px(frame: RawFrame, found: Sequence[Detection], calibration: Calibration) -> Iterator[float]:
+def _spot_sigmas_px(frame: RawFrame, calibration: Calibration) -> Iterator[float]:
     """Yield the σ of the point spread that the brightest spots of a frame have.
 
-    Pixel aperture (variance 1/12) and the source's disc (radius²/4), where its range is known, are taken off.
+    Pixel aperture (variance 1/12) and the source's disc (radius²/4) are taken off; near sources, whose discs
+    are wide, are passed over.
     """
     light = frame.data_dn.astype(np.float64)
     light -= np.median(light)
@@ -78,18 +76,22 @@ def _spot_sigmas_px(frame: RawFrame, found: Sequence[Detection], calibration: Ca
         if int(frame.data_dn[around].max()) >= calibration.saturation_dn:
             continue
         variance_px2 = spot_variance_px2(light[around], noise_dn)
-        ranges_m = [
-            one.range_m
-            for one in found
-            if math.hypot(one.u_px - column, one.v_px - row) < 3.0
-            and one.range_m > calibration.source_radius_m
-        ]
-        disc_px2 = 0.0
-        if ranges_m:
-            angle_rad = angular_radius_rad(ranges_m[0], calibration.source_radius_m)
-            disc_px2 = 0.25 * float(image_radius_px(column, row, angle_rad, calibration)) ** 2
+        radius_px = _disc_radius_px(column, row, float(light[around].sum()), frame, calibration)
+        if radius_px > _MOST_DISC_PX:
+            continue
         if not math.isnan(variance_px2):
-            yield math.sqrt(max(variance_px2 - disc_px2 - _PIXEL_PX2, 0.0))
+            yield math.sqrt(max(variance_px2 - 0.25 * radius_px**2 - _PIXEL_PX2, 0.0))
+
+
+def _disc_radius_px(
+    column: int, row: int, flux_dn: float, frame: RawFrame, calibration: Calibration
+) -> float:
+    """Return the radius of a source's disc at the range that its flux tells; infinite where it tells none."""
+    at_one_metre_dn = float(flux_at_one_metre_dn(column, row, frame.exposure_s, frame.gain, calibration))
+    if not (flux_dn > 0.0 and at_one_metre_dn > 0.0):
+        return math.inf
+    angle_rad = angular_radius_rad(math.sqrt(at_one_metre_dn / flux_dn), calibration.source_radius_m)
+    return float(image_radius_px(column, row, angle_rad, calibration))
 
 
 def spot_variance_px2(light: NDArray[np.float64], noise_dn: float) -> float:

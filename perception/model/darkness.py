@@ -38,7 +38,8 @@ def darkness(frames: Sequence[NDArray[np.uint16]]) -> Darkness:
     for number, frame in enumerate(frames):
         counts = frame.astype(np.float64)
         middle = float(np.median(counts))
-        scatter = max(1.4826 * float(np.median(np.abs(counts - middle))), 0.5)
+        # Of whole counts the median deviation is one too, up to half a count too low.
+        scatter = 1.4826 * (float(np.median(np.abs(counts - middle))) + 0.5)
         here = np.abs(counts - middle) <= _WITHIN * scatter
         levels.append(float(counts[here].mean()))
         if number:

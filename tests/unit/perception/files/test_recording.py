@@ -35,7 +35,9 @@ def test_round_trip(tmp_path: Path) -> None:
 def test_frames_are_opened_one_by_one(tmp_path: Path) -> None:
     record(tmp_path)
     lines = tmp_path / "frames.jsonl"
-    lines.write_text(lines.read_text() + json.dumps({**frame_record(FRAME, "frames/5.png"), "index": 5}) + "\n")
+    lines.write_text(
+        lines.read_text() + json.dumps({**frame_record(FRAME, "frames/5.png"), "index": 5}) + "\n"
+    )
     frames = read_frames(tmp_path)
     assert next(frames).index == 4
     with pytest.raises(RecordingError, match=r"5\.png.*Put the PNG there"):
