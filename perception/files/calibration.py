@@ -28,10 +28,10 @@ CALIBRATION_ENTRIES = (
     Entry("height_px", "whole", "rows of a frame", 1, 65535, sigma=True),
     Entry("saturation_dn", "whole", "a pixel at or above this count is clipped", 1, _MOST_DN, sigma=True),
     Entry("bit_depth", "whole", "bits of a count: full scale is 2^bit_depth − 1", 1, 16, sigma=True),
-    Entry("fx_px", "number", "focal length in columns", 0.0, 1e6, above=True, sigma=True),
-    Entry("fy_px", "number", "focal length in rows", 0.0, 1e6, above=True, sigma=True),
+    Entry("fx_px", "number", "focal length in columns", 1e-3, 1e6, above=True, sigma=True),
+    Entry("fy_px", "number", "focal length in rows", 1e-3, 1e6, above=True, sigma=True),
     Entry(
-        "system_gain_dn_per_e", "number", "counts per electron", 0.0, _MOST_E, above=True, sigma=True
+        "system_gain_dn_per_e", "number", "counts per electron", 1e-9, _MOST_E, above=True, sigma=True
     ),
     Entry(
         "psf_sigma_px", "number", "σ of the Gaussian point spread, without the pixel's own aperture",
@@ -44,7 +44,7 @@ CALIBRATION_ENTRIES = (
     Entry("black_level_dn", "number", "mean count of a dark pixel", -_MOST_DN, _MOST_DN, sigma=True),
     Entry(
         "range_constant_dn_m2_per_s", "number",
-        "K of flux_dn = K · exposure · cos θ · response(θ) / range²", 0.0, _MOST_CONSTANT,
+        "K of flux_dn = K · exposure · cos θ · response(θ) / range²", 1e-9, _MOST_CONSTANT,
         above=True, sigma=True,
     ),
     Entry(

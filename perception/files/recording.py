@@ -26,9 +26,9 @@ FRAME_ENTRIES = (
         "time_s", "number", "start of the exposure of row 0; within a camera it never goes back",
         -MOST_TIME_S, MOST_TIME_S,
     ),
-    Entry("exposure_s", "number", "exposure time", 0.0, 1e4, above=True),
+    Entry("exposure_s", "number", "exposure time", 1e-12, 1e4, above=True),
     Entry("line_time_s", "number", "delay from row to row; 0 of a global shutter", 0.0, 10.0),
-    Entry("gain", "number", "factor on the calibrated system gain; 1 as calibrated", 0.0, 1e6, above=True),
+    Entry("gain", "number", "factor on the calibrated system gain; 1 as calibrated", 1e-6, 1e6, above=True),
     Entry("black_level_dn", "number", "mean count of a dark pixel in this frame", -65535.0, 65535.0),
     Entry("file", "text", "the picture, from the recording's folder, with forward slashes; once"),
 )  # fmt: skip

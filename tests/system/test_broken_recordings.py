@@ -106,8 +106,11 @@ def without(file: str) -> Break:
     return lambda folder: (folder / file).unlink()
 
 
-def content(file: str, data: bytes) -> Break:
-    return lambda folder: (folder / file).write_bytes(data) and None  # type: ignore[func-returns-value]
+def content(name: str, data: bytes) -> Break:
+    def change(folder: Path) -> None:
+        (folder / name).write_bytes(data)
+
+    return change
 
 
 def picture(kind: str, data: Any) -> bytes:

@@ -49,7 +49,7 @@ def test_frames_are_opened_one_by_one(tmp_path: Path) -> None:
     [
         ({"exposure_s": None}, "'exposure_s': the field is missing"),
         ({"exposure_s": "2 ms"}, "'exposure_s': is '2 ms'. Write a finite number"),
-        ({"exposure_s": 0.0}, "'exposure_s'.*above 0"),
+        ({"exposure_s": 0.0}, "'exposure_s'.*above 1e-12"),
         ({"index": True}, "'index'"),
         ({"index": 1.5}, "'index'.*whole number"),
         ({"camera": 3}, "'camera'.*string"),

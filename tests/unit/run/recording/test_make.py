@@ -158,6 +158,7 @@ def test_what_jpeg_costs_is_added_to_the_read_noise(tmp_path: Path, pictures: Pa
     folder = _folder(tmp_path, pictures, frames="img*.jpg", gain="0.04 DN/e", read_noise="30 e")
     for path in pictures.iterdir():
         counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert counts is not None
         assert cv2.imwrite(str(folder / f"{path.stem}.jpg"), counts, [cv2.IMWRITE_JPEG_QUALITY, 90])
     done = import_recording(folder, overwrite=False)["r1.front"]
     assert done.lossy_sigma_dn > 1.0
