@@ -14,7 +14,8 @@ An estimator is named, or is any function of frame and calibration; `detect` sho
 ['paper', 'robust']
 
 The way of the data, room by room: `files` (what touches disk) → `estimators` (the one call, and one's own) →
-`paper` (the paper's method to the letter) or `robust` (prepare → blobs → measure → detect) → detections. Both
+`paper` (the paper's method to the letter) or `robust` (prepare → blobs → measure → detect) → detections →
+`rig` (of all cameras of a robot: every source once, mirror images told from robots) → measurements. Both
 stand on `model`: lens, bearing, sensor, ranging, the image of a flare, and in `fisher` how well any estimator
 could do. `calibration` finds the constants from frames at known ranges. `types` is the contract.
 """
@@ -37,6 +38,12 @@ from perception.estimators import (
 from perception.files.calibration import calibration_document, parse_calibration_document
 from perception.files.detections import detection_record, parse_detection
 from perception.files.fields import RecordingError
+from perception.files.measurements import (
+    measurement_record,
+    mirror_record,
+    parse_measurement,
+    parse_mirror,
+)
 from perception.files.pictures import Picture, encode_png16, read_picture
 from perception.files.ranges import encode_ranges, read_ranges
 from perception.files.recording import (
@@ -52,8 +59,10 @@ from perception.files.recording import (
 )
 from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
-from perception.robust.warm_up import warm_up
-from perception.types import Calibration, Detection, RawFrame
+from perception.rig.frame_sets import frame_sets
+from perception.rig.measure_set import detect_set, measure_set
+from perception.rig.warm_up import warm_up
+from perception.types import Calibration, Detection, Measurement, MirrorPlane, RawFrame, SetMeasurements
 
 __all__ = [
     "ESTIMATORS",
@@ -63,6 +72,8 @@ __all__ = [
     "EstimatorError",
     "FlareLimit",
     "FrameRecord",
+    "Measurement",
+    "MirrorPlane",
     "OwnEstimator",
     "PaperRegression",
     "Picture",
@@ -71,20 +82,28 @@ __all__ = [
     "RawFrame",
     "Recording",
     "RecordingError",
+    "SetMeasurements",
     "calibrate_rail",
     "calibration_document",
     "detect",
     "detect_frames",
+    "detect_set",
     "detection_record",
     "encode_png16",
     "encode_ranges",
     "flare_limit",
     "flare_limits",
     "frame_record",
+    "frame_sets",
     "load_estimator",
+    "measure_set",
+    "measurement_record",
+    "mirror_record",
     "parse_calibration_document",
     "parse_detection",
     "parse_frame_record",
+    "parse_measurement",
+    "parse_mirror",
     "read_calibrations",
     "read_frame",
     "read_frame_records",

@@ -1,11 +1,13 @@
-"""What perception reads and what it says: raw frames, calibration, detections.
+"""What perception reads and what it says: raw frames, calibration, detections, measurements of a rig.
 
 Pixel coordinates follow OpenCV: (0, 0) is the centre of the top left pixel, u to the right, v down.
 Camera axes: x right, y down, z forward. Body axes: x forward, y left, z up.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +78,8 @@ class Calibration:
         Radius of a source, a sphere.
     wavelength_m
         Centre wavelength.
+    own_sources_body_m
+        Where the robot's own sources sit, in body axes, shape (n, 3): mirrors show them too.
     sigma
         Standard deviation of entries, by field name; an entry that is missing is taken as exact.
     """
@@ -106,6 +110,7 @@ class Calibration:
     distortion: tuple[float, ...] = ()
     dsnu_e: float = 0.0
     prnu: float = 0.0
+    own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +121,9 @@ class Detection:
     (black level included), `background_dn` the local background as read. `range_sigma_m` and the pixel
     sigmas are what the estimator claims; NaN where it makes no claim. `range_m` is NaN where no range
     could be had, and a lower bound of the flux (so an upper bound of the range) where `saturated` and not
-    recovered. `bearing_body` is the unit vector from the camera's centre in body axes.
+    recovered. `bearing_body` is the unit vector from the camera's centre in body axes. `flux_sigma_dn` is the
+    flux's standard deviation. `range_sigma_common_m` is the part of `range_sigma_m` that measurements of one
+    source share, in whatever frame or camera: by range constant, the robot's own flux, the source's radius.
     """
 
     camera: str
@@ -136,3 +143,140 @@ class Detection:
     range_m: float
     range_sigma_m: float
     bearing_body: tuple[float, float, float]
+    flux_sigma_dn: float = math.nan
+    range_sigma_common_m: float = math.nan
+
+
+Ghost = Literal["no", "possible", "yes"]
+"""Whether something is the mirror image of a robot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """One source, as all cameras of a rig saw it in one set of frames.
+
+    Attributes
+    ----------
+    robot
+        The observer's name.
+    time_s
+        Mid-exposure, the mean over its detections weighted by how well each places it.
+    cameras
+        Those that saw it, each once.
+    detections
+        Of which detections it is made: camera, index of the frame, place among that frame's detections.
+    origin_body_m
+        The point that bearing and range count from, in body axes: the camera's centre, of several their mean.
+    bearing_body
+        Unit vector from there, in body axes.
+    range_m
+        Distance from there; NaN where no detection has a range, or only a bound of it.
+    covariance
+        Of the bearing's angle to the left (about the body's z), its angle upwards, and the range, in rad²,
+        rad m and m², shape (3, 3); NaN where no σ is claimed.
+    range_sigma_common_m
+        The part of the range's σ that every measurement of this source shares.
+    saturated, merged
+        Whether one of its detections is.
+    ghost
+        Whether it is a mirror image: `yes` where mirror images of several robots, or of the observer itself,
+        agree on one plane; `possible` where no more than chance speaks for or against it.
+    ghost_probability
+        What geometry and brightness say of that, from 0 to 1.
+    """
+
+    robot: str
+    time_s: float
+    cameras: tuple[str, ...]
+    detections: tuple[tuple[str, int, int], ...]
+    origin_body_m: tuple[float, float, float]
+    bearing_body: tuple[float, float, float]
+    range_m: float
+    covariance: NDArray[np.float64]
+    range_sigma_common_m: float
+    saturated: bool
+    merged: bool
+    ghost: Ghost = "no"
+    ghost_probability: float = 0.0
+
+    @property
+    def position_body_m(self) -> NDArray[np.float64]:
+        """Where it is, from the body's origin, shape (3,)."""
+        return np.asarray(self.origin_body_m) + self.range_m * np.asarray(self.bearing_body)
+
+    @property
+    def axes_body(self) -> NDArray[np.float64]:
+        """Unit vectors to the left, upwards and along the bearing, as rows, shape (3, 3)."""
+        return bearing_axes(np.asarray(self.bearing_body))
+
+    @property
+    def position_covariance_m2(self) -> NDArray[np.float64]:
+        """Covariance of `position_body_m`, shape (3, 3)."""
+        scaled = self.axes_body * np.array([self.range_m, self.range_m, 1.0])[:, None]
+        return np.asarray(scaled.T @ self.covariance @ scaled)
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorPlane:
+    """A flat mirror that a set of measurements shows: n · x = c in body axes.
+
+    Attributes
+    ----------
+    normal_body
+        Unit vector n from the observer to the mirror.
+    distance_m
+        c, from the body's origin.
+    kind
+        `constant` reflectance, as metal has; `surface` or `pane`: one side of a dielectric, or both of it.
+    parameter
+        The reflectance of a `constant` one, the refractive index of the others.
+    covariance
+        Of the normal's angles to the left and upwards (rad), of the distance (m) and of the parameter,
+        shape (4, 4).
+    images
+        How many mirror images it explains.
+    """
+
+    normal_body: tuple[float, float, float]
+    distance_m: float
+    kind: Literal["constant", "surface", "pane"]
+    parameter: float
+    covariance: NDArray[np.float64]
+    images: int
+
+
+@dataclass(frozen=True, eq=False)
+class SetMeasurements:
+    """What a rig measures in one set of frames.
+
+    Attributes
+    ----------
+    measurements
+        One for each source and each mirror image.
+    detections
+        Of each frame, in the order of the frames: what they are made of.
+    planes
+        Mirrors found, and those handed in that show something.
+    """
+
+    measurements: tuple[Measurement, ...]
+    detections: tuple[tuple[Detection, ...], ...]
+    planes: tuple[MirrorPlane, ...] = ()
+
+
+def bearing_axes(bearing: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit vectors to the left (about z), upwards and along bearings, shape (..., 3) → (..., 3, 3).
+
+    A bearing straight up or down counts y as left.
+    """
+    x, y, z = bearing[..., 0], bearing[..., 1], bearing[..., 2]
+    level = np.hypot(x, y)
+    flat = level > 1e-12
+    level = np.where(flat, level, 1.0)
+    axes = np.zeros((*bearing.shape[:-1], 3, 3))
+    axes[..., 0, 0] = left_x = np.where(flat, -y, 0.0) / level
+    axes[..., 0, 1] = left_y = np.where(flat, x, 1.0) / level
+    axes[..., 1, 0], axes[..., 1, 1] = -z * left_y, z * left_x
+    axes[..., 1, 2] = x * left_y - y * left_x
+    axes[..., 2, :] = bearing
+    return axes

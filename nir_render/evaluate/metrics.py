@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.evaluate.match import countable, image_radius_px, match, on_a_lamp
+from nir_render.evaluate.sets import SetEvaluation
 from nir_render.truth.lamps import LampTruth, Outline
 from nir_render.truth.sources import SourceTruth
 from perception.model.bearing import direction_camera
@@ -39,13 +40,15 @@ class Score:
 class Evaluation:
     """All scores, each estimator's false alarms, and the numbers of `summary.json`.
 
-    `ghosts` are the scores of the sources' mirror images, none of which counts.
+    `ghosts` are the scores of the sources' mirror images, none of which counts; `around` those of the rigs'
+    measurements, where there are any.
     """
 
     scores: tuple[Score, ...]
     false_alarms: Mapping[str, tuple[Detection, ...]]
     summary: Mapping[str, Any]
     ghosts: tuple[Score, ...] = ()
+    around: SetEvaluation | None = None
 
 
 def evaluate(

@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from nir_render.evaluate.estimator_errors import EstimatorErrors, errors_of
 from nir_render.evaluate.metrics import Evaluation, Score
+from nir_render.report.around import around_section
 from nir_render.report.drawing import Drawing
 from nir_render.report.parts import Table, facts_table, render_page
 from nir_render.report.pictures import (
@@ -79,6 +80,7 @@ def report_html(
         rules=RULES,
         numbers=_numbers(result),
         frames=_frames(keys, result, load, calibrations) if keys else None,
+        around=around_section(result.around),
         plots=_plots(by_estimator),
         cameras=_cameras(keys, result),
         more_cameras=counted(len(cameras) - MOST_CAMERAS, "more camera")

@@ -4,11 +4,14 @@ It reads files alone: a folder that another program wrote is scored like one tha
 """
 
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from nir_render.errors import InputError
 from nir_render.evaluate.metrics import Evaluation, evaluate
+from nir_render.evaluate.sets import evaluate_sets
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds, parse_lines
 from nir_render.run.perceive import unknown_camera
@@ -18,11 +21,15 @@ from perception import (
     Calibration,
     Detection,
     RecordingError,
+    frame_sets,
     parse_detection,
+    parse_measurement,
+    parse_mirror,
     read_frame,
     read_frame_records,
     read_recording,
 )
+from perception.rig.frame_sets import robot_of
 from perception.types import FrameKey
 
 
@@ -57,6 +64,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         lamps = parse_lines(lamps_path, parse_lamp) if lamps_path.is_file() else []
         _check_frames_known(keys, truth, lamps, detections, calibrations, folder)
         result = evaluate(keys, truth, calibrations, detections, lamps)
+        result = _with_sets(folder, result, truth, calibrations, detections, lamps)
         preview = _preview(folder, keys, calibrations, result)
     except InputError:
         raise
@@ -93,6 +101,49 @@ def _check_frames_known(
                     f"{folder / file}: speaks of frame {item.index} of {item.camera}, "
                     "which frames.jsonl does not name"
                 )
+
+
+def _with_sets(
+    folder: Path,
+    result: Evaluation,
+    truth: Sequence[SourceTruth],
+    calibrations: Mapping[str, Calibration],
+    detections: Mapping[str, Sequence[Detection]],
+    lamps: Sequence[LampTruth],
+) -> Evaluation:
+    """Add the scores of what the rigs measured, where the folder has `measurements.*.jsonl`."""
+    paths = {name: folder / f"measurements.{name}.jsonl" for name in detections}
+    measurements = {
+        name: parse_lines(path, parse_measurement) for name, path in paths.items() if path.is_file()
+    }
+    if not measurements:
+        return result
+    records = frame_sets(read_frame_records(folder))
+    sets = [[(frame.camera, frame.index) for frame in each] for each in records]
+    began = {(robot_of(each[0].camera), each[0].time_s): number for number, each in enumerate(records)}
+    mirrors = {
+        name: [
+            (began[robot, time_s], plane)
+            for robot, time_s, plane in parse_lines(folder / f"mirrors.{name}.jsonl", parse_mirror)
+            if (robot, time_s) in began
+        ]
+        for name in measurements
+        if (folder / f"mirrors.{name}.jsonl").is_file()
+    }
+    for name, found in measurements.items():
+        there = Counter((hit.camera, hit.index) for hit in detections[name])
+        for camera, index, number in (key for each in found for key in each.detections):
+            if number >= there[camera, index]:
+                raise InputError(
+                    f"{paths[name]}: speaks of detection {number} of frame {index} of {camera}, which "
+                    f"detections.{name}.jsonl does not have; run 'nir-render perceive {folder}' again"
+                )
+    around = evaluate_sets(sets, truth, calibrations, measurements, detections, lamps, mirrors)
+    summary = dict(result.summary)
+    summary["estimators"] = {
+        name: {**numbers, **around.summary.get(name, {})} for name, numbers in summary["estimators"].items()
+    }
+    return replace(result, summary=summary, around=around)
 
 
 def _preview(

@@ -10,16 +10,21 @@ from nir_render.run.folder import note_seconds
 from nir_render.run.render import Progress
 from perception import (
     ESTIMATORS,
+    Calibration,
     Detection,
     Estimator,
     EstimatorError,
+    FrameRecord,
     detect,
     detection_record,
+    frame_sets,
     load_estimator,
-    read_frame_records,
+    measure_set,
+    measurement_record,
+    mirror_record,
     read_recording,
 )
-from perception.types import FrameKey
+from perception.rig.frame_sets import robot_of
 
 
 def chosen_estimators(names: Sequence[str]) -> dict[str, Estimator]:
@@ -59,29 +64,42 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress:
         The folder is no recording, or one's own estimator fails on a frame.
     """
     started = time.perf_counter()
-    found: dict[str, list[Detection]] = {name: [] for name in estimators}
+    found: dict[str, list[list[Detection]]] = {name: [] for name in estimators}
     try:
         recording = read_recording(folder)
         for done, frame in enumerate(recording.frames()):
             for name, estimator in estimators.items():
-                found[name] += detect(frame, recording.calibrations[frame.camera], estimator)
+                found[name].append(detect(frame, recording.calibrations[frame.camera], estimator))
             progress(done + 1, len(recording.records))
     except EstimatorError as error:
         raise InputError(f"--estimator {error}") from None
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
     for name, detections in found.items():
-        run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, detections))
+        hits = [hit for of_frame in detections for hit in of_frame]
+        run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, hits))
+        _measure_sets(folder, name, recording.records, detections, recording.calibrations)
     note_seconds(folder, "perceive", started)
-    return {name: len(detections) for name, detections in found.items()}
+    return {name: sum(map(len, detections)) for name, detections in found.items()}
 
 
-def frame_keys(folder: Path) -> list[FrameKey]:
-    """Return camera and index of all frames of a recording; raise InputError where it has none."""
-    keys = [(record.camera, record.index) for record in read_frame_records(folder)]
-    if not keys:
-        raise InputError(f"{folder / run_folder.FRAMES}: names no frame")
-    return keys
+def _measure_sets(
+    folder: Path,
+    name: str,
+    records: Sequence[FrameRecord],
+    detections: Sequence[Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+) -> None:
+    """Write what each robot's cameras measure together, set by set, and the mirrors that show in it."""
+    of_frame = {(record.camera, record.index): hits for record, hits in zip(records, detections, strict=True)}
+    measurements, mirrors = [], []
+    for frames in frame_sets(records):
+        seen = measure_set(frames, [of_frame[frame.camera, frame.index] for frame in frames], calibrations)
+        measurements += [measurement_record(each) for each in seen.measurements]
+        robot, time_s = robot_of(frames[0].camera), frames[0].time_s
+        mirrors += [mirror_record(plane, robot, time_s) for plane in seen.planes]
+    run_folder.write_lines(folder / f"measurements.{name}.jsonl", measurements)
+    run_folder.write_lines(folder / f"mirrors.{name}.jsonl", mirrors)
 
 
 def unknown_camera(folder: Path, camera: str, known: Collection[str]) -> InputError:

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nir_render.camera.beams import beam_electrons
 from nir_render.camera.optics.lens import aperture_area_m2, intrinsics_of
@@ -46,7 +47,7 @@ def calibration(world: Scene | Snapshot, camera: str, progress: Progress | None 
     for source in sources:
         flare_spread(device, source, progress)
     known = _of_devices(camera, device, sources)
-    return replace(known, sigma=dict(known.sigma))
+    return replace(known, sigma=dict(known.sigma), own_sources_body_m=_own_sources_body_m(world, camera))
 
 
 def calibration_without_rail(world: Scene | Snapshot, camera: str) -> Calibration:
@@ -68,6 +69,14 @@ def _devices(world: Scene | Snapshot, camera: str) -> tuple[Camera, tuple[Source
     if not sources:
         raise InputError(f"{snapshot.origin}: robots: no robot has a source, so there is no range constant")
     return device, tuple(sources)
+
+
+def _own_sources_body_m(world: Scene | Snapshot, camera: str) -> NDArray[np.float64]:
+    """Return where the observer's own sources sit on its body, shape (n, 3)."""
+    snapshot = world.at(0.0) if isinstance(world, Scene) else world
+    own = camera.partition(".")[0] + "."
+    places = [each.source.position_m for name, each in snapshot.sources.items() if name.startswith(own)]
+    return np.array(places, dtype=np.float64).reshape(-1, 3)
 
 
 @lru_cache(maxsize=_KEPT)

@@ -3,7 +3,7 @@
 {"format": 1, "cameras": {name: {...}}}. Fields are named as in `Calibration`, but for the pose, which stands
 as `quaternion_body_camera_xyzw` and `position_body_m`. An entry whose standard deviation is known is written
 as {"value": v, "sigma": s}; that of the quaternion is an angle in radians. `lens_model` and `distortion` may
-be missing: the lens is then rectilinear; `dsnu_e` and `prnu` too: they are then 0.
+be missing: the lens is then rectilinear; `dsnu_e` and `prnu` too: they are then 0; `own_sources_body_m` too.
 """
 
 import math
@@ -74,6 +74,10 @@ CALIBRATION_ENTRIES = (
         "distortion", "list", "the model's coefficients in OpenCV's order; none of a rectilinear lens",
         -1e9, 1e9, default=(), sigma=True,
     ),
+    Entry(
+        "own_sources_body_m", "places", "where the robot's own sources sit, in body axes", -1e6, 1e6,
+        default=(), sigma=True,
+    ),
 )  # fmt: skip
 """The fields of a camera in `calibration.json`."""
 
@@ -120,7 +124,7 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     if math.isnan(calibration.range_constant_paper_dn_m2_per_s):
         record["range_constant_paper_dn_m2_per_s"] = None  # its detector found too little to calibrate with
     record[_QUATERNION] = Rotation.from_matrix(matrix).as_quat(canonical=True).tolist()
-    for name in ("position_body_m", "response_angle_rad", "response_relative"):
+    for name in _ARRAYS:
         record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
     record["lens_model"] = calibration.lens_model
     record["distortion"] = [float(number) for number in calibration.distortion]
@@ -185,6 +189,7 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
     faults.raise_any()
     quaternion = np.array(values.pop(_QUATERNION))
     arrays: dict[str, Any] = {field: np.array(values.pop(field)) for field in _ARRAYS}
+    arrays["own_sources_body_m"] = arrays["own_sources_body_m"].reshape(-1, 3)
     return Calibration(
         camera=name,
         rotation_body_camera=Rotation.from_quat(quaternion).as_matrix(),
@@ -205,7 +210,7 @@ def _told_of(plain: Mapping[str, Any], record: Mapping[str, Any]) -> list[Entry]
 
 
 _NAME = Entry("cameras", "text", "")
-_ARRAYS = ("position_body_m", "response_angle_rad", "response_relative")
+_ARRAYS = ("position_body_m", "response_angle_rad", "response_relative", "own_sources_body_m")
 
 
 def _contradictions(values: Mapping[str, Any], place: Place) -> Iterator[RecordingError]:

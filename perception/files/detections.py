@@ -31,7 +31,15 @@ DETECTION_ENTRIES = (
     Entry("range_m", "number", "distance from the camera's centre", 0.0, _MOST_M, null=_NO_CLAIM),
     Entry("range_sigma_m", "number", "its standard deviation", 0.0, _MOST_M, null=_NO_CLAIM),
     Entry("bearing_body", "bearing", "unit vector from the camera's centre in body axes", -1e6, 1e6, size=3),
-)
+    Entry(
+        "flux_sigma_dn", "number", "the flux's standard deviation", 0.0, _MOST_DN, null=_NO_CLAIM,
+        default=math.nan,
+    ),
+    Entry(
+        "range_sigma_common_m", "number", "the part of `range_sigma_m` that a source's measurements share",
+        0.0, _MOST_M, null=_NO_CLAIM, default=math.nan,
+    ),
+)  # fmt: skip
 """The fields of a line of `detections.NAME.jsonl`; null says that no claim is made."""
 
 

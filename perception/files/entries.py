@@ -7,12 +7,12 @@ no sum or square of what lies inside overflows.
 import difflib
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from perception.files.fields import Faults, Place, check_format, get, shown
 
-Kind = Literal["text", "whole", "number", "flag", "list", "bearing", "choice"]
+Kind = Literal["text", "whole", "number", "flag", "list", "places", "bearing", "choice"]
 
 REQUIRED: Any = object()
 """The default of what has none: the field must be there."""
@@ -147,6 +147,8 @@ def read_entry(value: Any, entry: Entry, place: Place) -> Any:
             return value
         case "list":
             return _list(value, entry, place)
+        case "places":
+            return _places(value, entry, place)
         case "bearing":
             return _bearing(value, entry, place)
         case _:
@@ -161,6 +163,8 @@ def wanted(entry: Entry) -> str:
         return "true or false"
     if entry.kind == "choice":
         return " or ".join(f'"{choice}"' for choice in entry.choices)
+    if entry.kind == "places":
+        return "a list of [x, y, z]"
     if entry.kind in ("list", "bearing"):
         count = "numbers" if entry.size is None else f"{entry.size} numbers"
         return f"a list of {count}{_bounds(entry)}"
@@ -202,7 +206,7 @@ def _number(value: Any, entry: Entry, place: Place, name: str) -> Any:
     kind = int if whole else int | float
     fits = isinstance(value, kind) and not isinstance(value, bool) and entry.least <= value <= entry.most
     if not fits or (entry.above and value == entry.least) or not abs(value) < 2**1023:
-        one = wanted(entry) if entry.kind != "list" else f"a finite number{_bounds(entry)}"
+        one = wanted(entry) if entry.kind not in ("list", "places") else f"a finite number{_bounds(entry)}"
         raise place.error(f"is {shown(value)}", f"Write {one}", name)
     return value if whole else float(value)
 
@@ -217,6 +221,19 @@ def _list(value: Any, entry: Entry, place: Place) -> list[float]:
             numbers.append(_number(part, entry, place, f"{entry.name}[{i}]"))
     faults.raise_any()
     return numbers
+
+
+def _places(value: Any, entry: Entry, place: Place) -> list[list[float]]:
+    """Read a list of places, none among them."""
+    if not isinstance(value, list) or len(value) > _MOST_LIST:
+        raise place.error(f"is {shown(value)}", "Write a list of [x, y, z], in metres", entry.name)
+    one = replace(entry, kind="list", size=3)
+    faults, found = Faults(), []
+    for i, part in enumerate(value):
+        with faults.kept():
+            found.append(_list(part, replace(one, name=f"{entry.name}[{i}]"), place))
+    faults.raise_any()
+    return found
 
 
 def _bearing(value: Any, entry: Entry, place: Place) -> tuple[float, ...]:

@@ -71,6 +71,9 @@ def _field(entry: Entry) -> dict[str, Any]:
             number = {"type": ["number", "null"]}
         value = {"type": "array", "items": number, "minItems": entry.size or (0 if not entry.required else 1)}
         value |= {"maxItems": entry.size} if entry.size else {}
+    elif entry.kind == "places":
+        place = {"type": "array", "items": {"type": "number", **_bounds(entry)}, "minItems": 3, "maxItems": 3}
+        value = {"type": "array", "items": place}
     else:
         value = {"type": _KINDS[entry.kind], **_bounds(entry)}
         value |= {"enum": list(entry.choices)} if entry.choices else {}

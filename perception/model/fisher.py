@@ -229,7 +229,7 @@ def _limits(
     for index, (_, _, range_m, flux_e) in enumerate(place.tolist()):
         own = inverse[index * step : (index + 1) * step, index * step : (index + 1) * step]
         slack = np.zeros(()) if layout.has_slack else None
-        _, log_sigma = camera.log_range(np.zeros(()), slack, own[2:, 2:])
+        _, log_sigma, _ = camera.log_range(np.zeros(()), slack, own[2:, 2:])
         u_sigma, v_sigma, l_sigma = np.sqrt(np.diagonal(own)[:3]).tolist()
         # Without a range constant there is no range to be had from whatever is seen.
         range_sigma_m = range_m * float(log_sigma) if ranged else math.inf

@@ -74,11 +74,14 @@ class Camera:
         width_px, prnu = float(calibration.psf_sigma_px), float(calibration.prnu)
         return Known(width_px, float(tie_spread), float(self.width_spread), float(clip_e), prnu)
 
-    def log_range(self, photometric: Array, slack: Array | None, covariance: Array) -> tuple[Array, Array]:
-        """Return the logarithms of sources' ranges, and their standard deviations.
+    def log_range(
+        self, photometric: Array, slack: Array | None, covariance: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return the logarithms of sources' ranges, their standard deviations, and the common part of these.
 
         What was assumed of flux and radius is told apart by their spreads: of the slack found, flux is to
-        blame for σ_φ²/σ_t parts, σ_φ = σ_K/2K; what that leaves open of the flux is part of σ.
+        blame for σ_φ²/σ_t parts, σ_φ = σ_K/2K; what that leaves open of the flux is part of σ. The common
+        part is what comes of K, flux and radius alone: it is the same each time that a source is measured.
 
         Parameters
         ----------
@@ -89,13 +92,17 @@ class Camera:
         """
         by_flux = 0.5 * self.flux_spread
         if slack is None:
-            return photometric, np.sqrt(covariance[..., 0, 0] + by_flux**2)
+            common = np.full(np.shape(photometric), by_flux)
+            return photometric, np.sqrt(covariance[..., 0, 0] + by_flux**2), common
         lean = by_flux**2 / self.tie_spread
         left_open = (by_flux * self.radius_spread / self.tie_spread) ** 2
         variance = (
             covariance[..., 0, 0] - 2.0 * lean * covariance[..., 0, 1] + lean**2 * covariance[..., 1, 1]
         )
-        return photometric - lean * slack, np.sqrt(variance + left_open)
+        # A fit with priors answers an error a of what it assumed by −C P a; the prior precision of a is 1.
+        answer = covariance[..., 0, 1] - lean * covariance[..., 1, 1]
+        sigma = np.sqrt(variance + left_open)
+        return photometric - lean * slack, sigma, np.minimum(np.sqrt(answer**2 + left_open), sigma)
 
 
 def _share(sigma: float, value: float) -> float:

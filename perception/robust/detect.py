@@ -7,7 +7,7 @@ import numpy as np
 from perception.model.bearing import bearing_body
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import brightest, candidates, clusters, is_extended
-from perception.robust.measure import Measurement, measure
+from perception.robust.measure import MeasuredFlare, measure
 from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
 from perception.robust.search.cutout import ring_median
 from perception.robust.search.frame import filtered
@@ -118,7 +118,7 @@ def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
 
 def _detection(
     blob: Blob,
-    measured: Measurement,
+    measured: MeasuredFlare,
     bearing: tuple[float, float, float],
     frame: RawFrame,
     calibration: Calibration,
@@ -142,4 +142,6 @@ def _detection(
         range_m=measured.range_m,
         range_sigma_m=measured.range_sigma_m,
         bearing_body=bearing,
+        flux_sigma_dn=measured.flux_sigma_e * gain,
+        range_sigma_common_m=measured.range_sigma_common_m,
     )

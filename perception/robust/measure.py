@@ -41,11 +41,8 @@ MOST_LEFT_ON_EDGES = 0.1
 
 
 @dataclass(frozen=True)
-class Measurement:
-    """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
-
-    `significance` is the flux in units of what noise alone would make of it.
-    """
+class MeasuredFlare:
+    """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel."""
 
     u_px: float
     v_px: float
@@ -56,6 +53,7 @@ class Measurement:
     background_e: float
     range_m: float
     range_sigma_m: float
+    range_sigma_common_m: float = math.nan
     saturated: bool = False
     misfit: bool = False
     on_texture: bool = False
@@ -75,7 +73,7 @@ class Measurement:
 
 def measure(
     found: Sequence[Cluster], prepared: PreparedFrame, apart: bool = False
-) -> list[tuple[Blob, Measurement]]:
+) -> list[tuple[Blob, MeasuredFlare]]:
     """Measure clusters, and leave out what is no source.
 
     Flares of known size and strength are fitted to each window. What a fit leaves over may be more flares
@@ -101,7 +99,7 @@ def measure(
     odd = [index for index, solution in enumerate(solutions) if solution is not None and _is_odd(solution)]
     of_odd = of_free_size([solution for k in odd if (solution := solutions[k]) is not None], camera)
     free = dict(zip(odd, of_odd, strict=True))
-    measured: list[tuple[Blob, Measurement]] = []
+    measured: list[tuple[Blob, MeasuredFlare]] = []
     again: list[Candidate] = []
     for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True)):
         other_size = (
@@ -248,7 +246,9 @@ def _is_odd(solution: Solution) -> bool:
     return solution.count == 1 and not solution.left_over.is_good
 
 
-def _judged(cluster: Cluster, solution: Solution, prepared: PreparedFrame) -> list[tuple[Blob, Measurement]]:
+def _judged(
+    cluster: Cluster, solution: Solution, prepared: PreparedFrame
+) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a solution into measurements, if it is one of sources."""
     left = solution.left_over
     misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
@@ -271,7 +271,7 @@ def _judged(cluster: Cluster, solution: Solution, prepared: PreparedFrame) -> li
 
 def _measurement(
     solution: Solution, index: int, blob: Blob, misfit: bool, prepared: PreparedFrame
-) -> Measurement:
+) -> MeasuredFlare:
     """Turn one flare of a solution into a measurement, its sigmas wider where the fit is bad."""
     left = solution.left_over
     widening = math.sqrt(max(left.chi2 / max(left.pixels, 1), 1.0)) if misfit else 1.0
@@ -291,7 +291,7 @@ def _measurement(
     saturated = bool(clips.any())
     bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
     unknown = math.nan
-    return Measurement(
+    return MeasuredFlare(
         u_px=u_px,
         v_px=v_px,
         u_sigma_px=unknown if bound_only else float(solution.u_sigma_px[index]) * widening,
@@ -301,6 +301,7 @@ def _measurement(
         background_e=solution.background_e,
         range_m=range_m,
         range_sigma_m=unknown if bound_only else range_m * log_sigma,
+        range_sigma_common_m=unknown if bound_only else range_m * float(solution.log_range_common[index]),
         saturated=saturated,
         misfit=misfit,
         on_texture=solution.window.structure_e > 0.0,
@@ -308,7 +309,7 @@ def _measurement(
     )
 
 
-def _by_apertures(cluster: Cluster, prepared: PreparedFrame) -> list[tuple[Blob, Measurement]]:
+def _by_apertures(cluster: Cluster, prepared: PreparedFrame) -> list[tuple[Blob, MeasuredFlare]]:
     members = [cluster.members[k] for k in cluster.wanted]
     return [
         (member.blob, _from_aperture(member, cluster, prepared))
@@ -317,7 +318,7 @@ def _by_apertures(cluster: Cluster, prepared: PreparedFrame) -> list[tuple[Blob,
     ]
 
 
-def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame) -> Measurement:
+def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame) -> MeasuredFlare:
     """Sum what exceeds a ring around the blob, at its centroid."""
     blob, window = member.blob, cluster.window
     frame, calibration = prepared.frame, prepared.calibration
@@ -334,6 +335,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         window.usable & ~dilated(lit, 2),
     )
     gain = gain_dn_per_e(frame, calibration)
+    camera = Camera(calibration, frame.exposure_s, frame.gain)
     ranged = range_from_flux(
         aperture.flux * gain,
         aperture.flux_sigma * gain,
@@ -345,7 +347,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
     )
     u_sigma_px, v_sigma_px = _centroid_sigmas(member, aperture.flux, prepared)
     unknown = math.nan
-    return Measurement(
+    return MeasuredFlare(
         u_px=member.u_px,
         v_px=member.v_px,
         u_sigma_px=unknown if member.is_clipped else u_sigma_px,
@@ -355,6 +357,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         background_e=aperture.background,
         range_m=ranged.range_m,
         range_sigma_m=unknown if member.is_clipped else ranged.range_sigma_m,
+        range_sigma_common_m=unknown if member.is_clipped else 0.5 * ranged.range_m * camera.flux_spread,
         saturated=member.is_clipped,
         misfit=not member.is_clipped and not member.is_beyond_fit,
     )

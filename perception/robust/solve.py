@@ -87,8 +87,9 @@ class Solution:
         Shape (flares,) each; the last is the range that the flux alone says.
     u_sigma_px, v_sigma_px, flux_sigma_e
         Standard deviations, same shape.
-    log_range, log_range_sigma
-        Range by flux and size together, and its standard deviation, same shape.
+    log_range, log_range_sigma, log_range_common
+        Range by flux and size together, its standard deviation, and the part of that which every measurement
+        of the source shares (`Camera.log_range`), same shape.
     ranged
         Whether a range can be had there, same shape.
     image_radius_px
@@ -115,6 +116,7 @@ class Solution:
     flux_sigma_e: Array
     log_range: Array
     log_range_sigma: Array
+    log_range_common: Array
     ranged: NDArray[np.bool_]
     image_radius_px: Array
     background_e: float
@@ -274,7 +276,7 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
     log_flux_at_1_m = np.concatenate([fit.log_flux_at_1_m for fit in fits])
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     slack = own[:, 3] if fits[0].layout.has_slack else None
-    log_range, log_range_sigma = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
+    log_range, log_range_sigma, log_range_common = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
     flux_e = np.exp(log_flux_at_1_m - 2.0 * own[:, 2])
     flux_sigma_e, ranged = 2.0 * sigma[:, 2] * flux_e, log_flux_at_1_m != 0.0
     solutions, first = [], 0
@@ -298,6 +300,7 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
                 flux_sigma_e=flux_sigma_e[these],
                 log_range=log_range[these],
                 log_range_sigma=log_range_sigma[these],
+                log_range_common=log_range_common[these],
                 ranged=ranged[these],
                 image_radius_px=fit.image_radius_px,
                 background_e=background_e,

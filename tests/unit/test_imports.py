@@ -31,6 +31,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.randomness": (),
     "nir_render.geometry": (),
     "nir_render.errors": (),
+    "perception.rig": (),
     "perception.calibration": (),
     "perception.estimators": (),
     "perception.paper": (),

@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from perception import RecordingError, calibration_document, parse_calibration_document
 from tests.unit.perception.simulation import calibration
 
-ARRAYS = ("rotation_body_camera", "position_body_m", "response_angle_rad", "response_relative")
+ARRAYS = (
+    "rotation_body_camera", "position_body_m", "response_angle_rad", "response_relative", "own_sources_body_m",
+)  # fmt: skip
 FULL = calibration(
     rotation_body_camera=Rotation.from_euler("xyz", [0.3, -1.2, 2.1]).as_matrix(),
     response_angle_rad=np.array([0.0, 0.1, 1.0 / 3.0]),
@@ -25,6 +27,7 @@ FULL = calibration(
         "dsnu_e": 0.1,
         "prnu": 2e-4,
     },
+    own_sources_body_m=np.array([[0.0, 1.0 / 3.0, 0.28], [0.1, 0.0, 0.0]]),
     dsnu_e=4.0 + 1.0 / 3.0,
     prnu=0.009,
     lens_model="brown_conrady",

@@ -1,11 +1,15 @@
 """A frame with something of everything, so that loops are compiled before the first frame that matters."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from perception.model.fisher import flare_limit
 from perception.model.flare import PixelBox, flare_image
+from perception.rig.measure_set import measure_set
 from perception.robust.detect import detect_robust
-from perception.types import Calibration, RawFrame
+from perception.types import Calibration, Detection, RawFrame
 
 _ROWS, _COLUMNS = 256, 320
 
@@ -20,6 +24,49 @@ def warm_up() -> None:
     detect_robust(frame, calibration)
     flare_limit(calibration, 40.3, 60.2, 4.0, 9e3, 20.0)
     flare_image(40.3, 60.2, 0.0025, PixelBox(50, 30, 21, 21), calibration)
+    _measure_sample_set(calibration)
+
+
+def _measure_sample_set(calibration: Calibration) -> None:
+    """Measure a set of two cameras side by side, before which three robots and their mirror images stand."""
+    side = replace(calibration, camera="side", position_body_m=np.array([0.1, 0.0, 0.0]))
+    robots = np.array([[-0.5, 0.3, 2.0], [0.4, -0.2, 3.0], [0.1, 0.5, 4.0]])
+    images = robots * [1.0, 1.0, -1.0] + [
+        0.0,
+        0.0,
+        12.0,
+    ]  # in a mirror at z = 6 m, which takes a fifth of light
+    places = [(place, 1.0) for place in robots] + [(place, 1.12) for place in images]
+    frames, detections = [], []
+    for camera in (calibration, side):
+        frames.append(RawFrame(camera.camera, 0, 0.0, 1e-3, np.zeros((1, 1), dtype=np.uint16), 64.0))
+        own = []
+        for place, longer in places:
+            x, y, z = (place - camera.position_body_m).tolist()
+            range_m = math.sqrt(x * x + y * y + z * z)
+            own.append(
+                Detection(
+                    camera=camera.camera,
+                    index=0,
+                    time_s=0.0,
+                    u_px=camera.cx_px + camera.fx_px * x / z,
+                    v_px=camera.cy_px + camera.fy_px * y / z,
+                    u_sigma_px=0.05,
+                    v_sigma_px=0.05,
+                    flux_dn=1e4,
+                    mean_dn=100.0,
+                    background_dn=64.0,
+                    area_px=9,
+                    saturated=False,
+                    merged=False,
+                    ghost=False,
+                    range_m=longer * range_m,
+                    range_sigma_m=0.01 * range_m,
+                    bearing_body=(x / range_m, y / range_m, z / range_m),
+                )
+            )
+        detections.append(own)
+    measure_set(frames, detections, {camera.camera: camera for camera in (calibration, side)})
 
 
 def _sample() -> tuple[RawFrame, Calibration]:

@@ -1,0 +1,347 @@
+"""Which measurements are mirror images of robots: by planes that explain several of them at once.
+
+Any two points have a mirror plane, so one pair proves nothing. A plane is a hypothesis with a price: how
+probable a mirror is, how well it must be placed to explain what is seen, and how often the robots of the set
+would stand so by chance. What it gains is the density of the images where it says they are, over the density
+of robots there. Robots in a symmetric formation look like a mirror that loses no light: that is a hypothesis
+of its own, in which nothing is a ghost.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.rig.mirror_model import (
+    CONSTANT,
+    PANE,
+    SURFACE,
+    Flares,
+    best_seeds,
+    fit_plane,
+    matched,
+    seeds_of_kind,
+)
+from perception.rig.mirror_seeds import seeds_of_constant
+from perception.types import Ghost, Measurement, MirrorPlane, bearing_axes
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+KINDS: tuple[Literal["constant", "surface", "pane"], ...] = ("constant", "surface", "pane")
+
+MIRROR_PROBABILITY = 0.1
+"""That a set shows a flat mirror at all, before it is looked at."""
+
+SYMMETRY_PROBABILITY = 0.01
+"""That robots stand in a formation that is its own mirror image, …"""
+
+FORMATION_SIGMAS_M = (0.0, 0.01, 0.03)
+"""… to one of these."""
+
+SEEN_PROBABILITY = 0.5
+"""That a robot before a mirror has its image in it: mirrors have edges, and things stand before them."""
+
+YES, POSSIBLE = 0.98, 0.01
+"""Probabilities of a ghost from which a measurement is called one, or possibly one."""
+
+LEAST_PLANE_DISTANCE_M, MOST_PLANE_DISTANCE_M = 0.05, 20.0
+LOSS_PRIOR, LOSS_SIGMA = math.log(0.15), 1.2
+"""−½ ln R of a mirror of constant reflectance is log-normal: 0.15 is R = 0.74, 0.05 and 0.5 lie in 1 σ."""
+
+INDEX_PRIOR, INDEX_SIGMA = 1.5, 0.08
+
+_GATE_CHI2 = 25.0
+_MOST_FLARES = 40
+_MOST_SEEDS, _MOST_TRIED = 2000, 6
+_CLEAR = 10.0
+_MOST_PAIRS_OF_PAIRS = 40_000
+_MOST_PLANES = 4
+_SEED_INDICES = (1.4, 1.45, 1.5, 1.55, 1.6)
+_DIM_RATIO = 1.5
+_HEIGHT_SIGMA_M = 0.02
+_SAME_HEIGHT = 0.8
+_LOG_RANGE_SPAN = math.log(100.0)
+_OWN_SIGMA_M = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A plane, its kind and covariance, whom each image shows, and ln of its odds against none."""
+
+    plane: Array
+    kind: int
+    covariance: Array
+    parents: Indices
+    images: Indices
+    log_odds: float
+
+
+def told_ghosts(
+    measurements: Sequence[Measurement], own_sources_body_m: Array, planes: Sequence[MirrorPlane] = ()
+) -> tuple[tuple[Measurement, ...], tuple[MirrorPlane, ...]]:
+    """Tell mirror images from robots.
+
+    Parameters
+    ----------
+    measurements
+        Of one set.
+    own_sources_body_m
+        Where the observer's own sources sit, shape (n, 3): their images tell most.
+    planes
+        Mirrors that are known already, in today's body axes; their reflectance stays free within their
+        covariance.
+
+    Returns
+    -------
+    The measurements with `ghost` and its probability, and the mirrors.
+    """
+    usable = [k for k, each in enumerate(measurements) if each.ghost == "no" and each.range_m > 0.0]
+    usable = sorted(usable, key=lambda k: measurements[k].range_m)[:_MOST_FLARES]
+    probability = np.zeros(len(measurements))
+    if not usable or len(usable) + len(own_sources_body_m) < 2:
+        return tuple(measurements), ()
+    flares = _flares_of([measurements[k] for k in usable], own_sources_body_m)
+    log_chance = _log_chance(flares, len(usable))
+    robots = np.arange(len(flares.place_m))
+    images = np.arange(len(usable))
+    found: list[_Found] = []
+    known = list(planes)
+    while len(found) < _MOST_PLANES and len(images):
+        best = _best_plane(flares, robots, images, log_chance, known)
+        if best is None:
+            break
+        own = 1.0 / (1.0 + math.exp(-min(best.log_odds, 700.0)))
+        of_images = probability[[usable[j] for j in best.images]]
+        probability[[usable[j] for j in best.images]] = np.maximum(of_images, own)
+        if own < YES:
+            break
+        found.append(best)
+        robots = np.setdiff1d(robots, best.images)
+        images = np.setdiff1d(images, np.union1d(best.images, best.parents))
+    lone = _lone_probability([measurements[k].range_m for k in usable], len(own_sources_body_m), bool(found))
+    for place, k in enumerate(usable):
+        probability[k] = max(probability[k], lone[place])
+    told = tuple(
+        each if each.ghost != "no" else replace(each, ghost=_called(p), ghost_probability=p)
+        for each, p in zip(measurements, probability.tolist(), strict=True)
+    )
+    return told, tuple(_mirror(one) for one in found)
+
+
+def _called(probability: float) -> Ghost:
+    return "yes" if probability >= YES else "possible" if probability >= POSSIBLE else "no"
+
+
+def _flares_of(measurements: Sequence[Measurement], own_sources_body_m: Array) -> Flares:
+    own = len(own_sources_body_m)
+    axes = bearing_axes(np.array([each.bearing_body for each in measurements]))
+    range_m = np.array([each.range_m for each in measurements])
+    origin_m = np.array([each.origin_body_m for each in measurements])
+    covariance = np.array([each.covariance for each in measurements])
+    unclaimed = ~np.isfinite(covariance).all(axis=(1, 2))
+    covariance[unclaimed] = np.diag([1e-3**2, 1e-3**2, 0.0])
+    covariance[unclaimed, 2, 2] = (0.1 * range_m[unclaimed]) ** 2
+    common = np.nan_to_num([each.range_sigma_common_m for each in measurements]) / range_m
+    noise = np.sqrt(np.maximum(covariance[:, 2, 2] / range_m**2 - common**2, 1e-8))
+    scaled = axes * range_m[:, None, None]
+    inner = np.zeros((len(measurements), 3, 3))
+    inner[:, :2, :2] = covariance[:, :2, :2]
+    inner[:, 2, 2] = noise**2
+    return Flares(
+        origin_m=np.concatenate([origin_m, np.zeros((own, 3))]),
+        place_m=np.concatenate([origin_m + range_m[:, None] * axes[:, 2], own_sources_body_m]),
+        axes=np.concatenate([axes, np.tile(np.eye(3), (own, 1, 1))]),
+        angular_rad2=np.concatenate([covariance[:, :2, :2], np.zeros((own, 2, 2))]),
+        noise=np.concatenate([noise, np.zeros(own)]),
+        noise_m2=np.concatenate(
+            [np.swapaxes(scaled, 1, 2) @ inner @ scaled, np.tile(_OWN_SIGMA_M**2 * np.eye(3), (own, 1, 1))]
+        ),
+        common=np.concatenate([common, np.zeros(own)]),
+    )
+
+
+def _log_chance(flares: Flares, count: int) -> Array:
+    """Return ln of the density of robots where each flare is, per rad² and unit of ln range, shape (count,).
+
+    As many as there are flares, in any direction about the vertical and at any range alike; four of five as
+    high as the others, as on a floor.
+    """
+    apart_m = flares.place_m[:count] - flares.origin_m[:count]
+    range_m = np.linalg.norm(apart_m, axis=1)
+    height_m = flares.place_m[:count, 2]
+    middle_m = float(np.median(flares.place_m[:, 2]))
+    spread_m = max(_HEIGHT_SIGMA_M, 1.5 * float(np.median(abs(flares.place_m[:, 2] - middle_m))))
+    sigma_rad = np.hypot(spread_m / range_m, np.sqrt(flares.angular_rad2[:count, 1, 1]))
+    off = (height_m - middle_m) / range_m / sigma_rad
+    level = np.exp(-0.5 * off**2) / (math.sqrt(2.0 * math.pi) * sigma_rad)
+    cosine = np.sqrt(np.maximum(1.0 - (apart_m[:, 2] / range_m) ** 2, 1e-6))
+    elevation = _SAME_HEIGHT * level + (1.0 - _SAME_HEIGHT) * 0.5 * cosine
+    return np.asarray(np.log(count * elevation / (2.0 * math.pi * cosine) / _LOG_RANGE_SPAN))
+
+
+def _best_plane(
+    flares: Flares, robots: Indices, images: Indices, log_chance: Array, known: list[MirrorPlane]
+) -> _Found | None:
+    """Return the plane that explains most, of those that are known first; it is taken from them."""
+    for plane in list(known):
+        known.remove(plane)
+        prior = np.array([*plane.normal_body, plane.distance_m, plane.parameter])
+        kind = KINDS.index(plane.kind)
+        if kind == CONSTANT:
+            prior[4] = -0.5 * math.log(plane.parameter)
+        precision = np.asarray(np.linalg.inv(plane.covariance + 1e-12 * np.eye(4)), dtype=np.float64)
+        one = _fitted(flares, robots, images, log_chance, prior, kind, prior, precision)
+        if one is not None:
+            return one
+    parents, shown = _plausible_pairs(flares, robots, images)
+    trials = []
+    for kind, seeds in _seeds(flares, parents, shown):
+        chosen, explained = best_seeds(flares, robots, images, seeds, kind, _MOST_TRIED)
+        trials += [(count, kind, seed) for count, seed in zip(explained.tolist(), chosen, strict=True)]
+    best: _Found | None = None
+    for count, kind, seed in sorted(trials, key=lambda each: -each[0]):
+        if count < 2 or (best is not None and best.log_odds > _CLEAR and count < len(best.images)):
+            break
+        prior, precision = seed.copy(), np.zeros((4, 4))
+        prior[4] = INDEX_PRIOR if kind != CONSTANT else seed[4]
+        precision[3, 3] = 1.0 / INDEX_SIGMA**2 if kind != CONSTANT else 0.0
+        one = _fitted(flares, robots, images, log_chance, seed, kind, prior, precision)
+        if one is not None and (best is None or one.log_odds > best.log_odds):
+            best = one
+    return best
+
+
+def _plausible_pairs(flares: Flares, robots: Indices, images: Indices) -> tuple[Indices, Indices]:
+    """Return whom each flare may show: an image is farther than what it shows, from anywhere before it."""
+    i, j = (grid.ravel() for grid in np.meshgrid(robots, images, indexing="ij"))
+    near_m = np.linalg.norm(flares.place_m[i] - flares.origin_m[j], axis=1)
+    far_m = np.linalg.norm(flares.place_m[j] - flares.origin_m[j], axis=1)
+    usable = (i != j) & (far_m > near_m)
+    return i[usable], j[usable]
+
+
+def _seeds(flares: Flares, parents: Indices, images: Indices) -> list[tuple[int, Array]]:
+    """Return guesses of planes, by kind of reflectance."""
+    pairs = len(parents)
+    stride = max(1, pairs * (pairs - 1) // 2 // _MOST_PAIRS_OF_PAIRS)
+    seeds = [(CONSTANT, seeds_of_constant(flares, parents, images, stride, _MOST_SEEDS))]
+    # A dielectric takes more than half of the light but at grazing angles.
+    near_m = np.linalg.norm(flares.place_m[parents] - flares.origin_m[images], axis=1)
+    dim = np.linalg.norm(flares.place_m[images] - flares.origin_m[images], axis=1) > _DIM_RATIO * near_m
+    parents, images = parents[dim], images[dim]
+    for kind in (SURFACE, PANE):
+        of_kind = [seeds_of_kind(flares, parents, images, kind, index) for index in _SEED_INDICES]
+        seeds.append((kind, np.concatenate(of_kind)))
+    return [(kind, planes) for kind, planes in seeds if len(planes)]
+
+
+def _fitted(
+    flares: Flares,
+    robots: Indices,
+    images: Indices,
+    log_chance: Array,
+    start: Array,
+    kind: int,
+    prior: Array,
+    precision: Array,
+) -> _Found | None:
+    """Fit a plane to the pairs that it explains, and weigh it; None where it explains too few."""
+    plane = start.copy()
+    is_known = bool(precision[0, 0] > 0.0)
+    parents, shown, _ = matched(flares, robots, images, plane, kind, 0.0)
+    result = None
+    for _ in range(4):
+        if len(parents) < (1 if is_known else 2):
+            return None
+        chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane, kind, prior, precision)
+        if not (np.diagonal(covariance) > 0.0).all() or not plane[3] > LEAST_PLANE_DISTANCE_M:
+            return None
+        result = parents, shown, chi2, log_peak, covariance
+        again, whom, _ = matched(flares, robots, images, plane, kind, _GATE_CHI2)
+        if set(zip(again, whom, strict=True)) == set(zip(parents, shown, strict=True)):
+            break
+        parents, shown = again, whom
+    else:
+        return None
+    parents, shown, chi2, log_peak, covariance = result
+    log_gain = log_peak - 0.5 * chi2 - float(log_chance[shown].sum())
+    log_gain += _log_seen(flares, robots, parents, plane, kind, len(log_chance))
+    log_volume = 0.5 * (np.linalg.slogdet(2.0 * math.pi * covariance)[1])
+    if is_known:
+        log_prior = 0.5 * (np.linalg.slogdet(precision / (2.0 * math.pi))[1])
+        return _Found(plane, kind, covariance, parents, shown, log_gain + log_volume + log_prior)
+    log_prior = -math.log(4.0 * math.pi) - math.log(MOST_PLANE_DISTANCE_M)
+    log_odds = math.log(MIRROR_PROBABILITY / len(KINDS)) + log_gain + log_volume + log_prior
+    log_odds += _log_parameter_prior(plane[4], math.sqrt(covariance[3, 3]), kind)
+    by_symmetry = _log_symmetry(flares, parents, shown, plane, log_gain + 0.5 * chi2 - log_peak, log_prior)
+    # Against there being neither a mirror nor a formation.
+    against = math.log1p(math.exp(min(by_symmetry, 700.0)))
+    return _Found(plane, kind, covariance, parents, shown, log_odds - against)
+
+
+def _log_parameter_prior(parameter: float, sigma: float, kind: int) -> float:
+    if kind != CONSTANT:  # the fit has counted its χ²
+        return -math.log(INDEX_SIGMA * math.sqrt(2.0 * math.pi))
+    loss = max(parameter, 0.5 * sigma, 1e-3)
+    off = (math.log(loss) - LOSS_PRIOR) / LOSS_SIGMA
+    return -0.5 * off**2 - math.log(loss * LOSS_SIGMA * math.sqrt(2.0 * math.pi))
+
+
+def _log_symmetry(
+    flares: Flares, parents: Indices, images: Indices, plane: Array, log_others: float, log_prior: float
+) -> float:
+    """Return ln of the odds of robots that stand as images would, with all of their light."""
+    precision = np.zeros((4, 4))
+    precision[3, 3] = 1e10
+    log_odds = -math.inf
+    for off_m in FORMATION_SIGMAS_M:
+        whole = plane.copy()
+        whole[4] = 0.0
+        loose = flares._replace(noise_m2=flares.noise_m2 + off_m**2 * np.eye(3))
+        chi2, log_peak, covariance = fit_plane(
+            loose, parents, images, whole, CONSTANT, whole.copy(), precision
+        )
+        if (np.diagonal(covariance)[:3] > 0.0).all():
+            log_volume = 0.5 * float(np.linalg.slogdet(2.0 * math.pi * covariance[:3, :3])[1])
+            log_odds = np.logaddexp(log_odds, log_peak - 0.5 * chi2 + log_volume)
+    return float(log_odds) + math.log(SYMMETRY_PROBABILITY) + log_others + log_prior
+
+
+def _log_seen(
+    flares: Flares, robots: Indices, parents: Indices, plane: Array, kind: int, count: int
+) -> float:
+    """Return ln of the probability that these have images and the others none that is bright enough."""
+    farthest_m = float(np.linalg.norm(flares.place_m[:count] - flares.origin_m[:count], axis=1).max())
+    others = np.setdiff1d(robots, parents)
+    beyond_m = plane[3] - flares.place_m[others] @ plane[:3]
+    image_m = flares.place_m[others] + 2.0 * beyond_m[:, None] * plane[:3]
+    seems_m = np.linalg.norm(image_m, axis=1) * math.exp(plane[4] if kind == CONSTANT else 1.3)
+    unseen = int(((beyond_m > 0.0) & (seems_m < farthest_m)).sum())
+    return len(parents) * math.log(SEEN_PROBABILITY) + unseen * math.log(1.0 - SEEN_PROBABILITY)
+
+
+def _lone_probability(ranges_m: Sequence[float], own: int, has_mirror: bool) -> list[float]:
+    """Return of each flare, the nearest first, the probability that it is the lone image of a nearer one.
+
+    Nothing speaks for or against it but that other robots before that mirror have no image.
+    """
+    count = len(ranges_m)
+    odds = 0.0 if has_mirror else MIRROR_PROBABILITY * SEEN_PROBABILITY / count
+    odds *= (1.0 - SEEN_PROBABILITY) ** max(count + own - 2, 0)
+    return [min(odds * (nearer + own), 0.5) for nearer in range(count)]
+
+
+def _mirror(found: _Found) -> MirrorPlane:
+    x, y, z = found.plane[:3].tolist()
+    parameter, covariance = float(found.plane[4]), found.covariance
+    if found.kind == CONSTANT:  # −½ ln R → R
+        parameter = min(math.exp(-2.0 * parameter), 1.0)
+        scale = np.diag([1.0, 1.0, 1.0, -2.0 * parameter])
+        covariance = scale @ covariance @ scale
+    return MirrorPlane(
+        (x, y, z), float(found.plane[3]), KINDS[found.kind], parameter, covariance, len(found.images)
+    )

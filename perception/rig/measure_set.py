@@ -1,0 +1,67 @@
+"""The one call from a set of frames to who stands where."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from perception.estimators import Estimator, detect_frames
+from perception.rig.frame_sets import Exposed, robot_of
+from perception.rig.fusion import associated, fused
+from perception.rig.ghosts import told_ghosts
+from perception.rig.sightings import sightings_of
+from perception.types import Calibration, Detection, MirrorPlane, RawFrame, SetMeasurements
+
+
+def detect_set(
+    frames: Sequence[RawFrame],
+    calibrations: Mapping[str, Calibration],
+    estimator: str | Estimator = "robust",
+    planes: Sequence[MirrorPlane] = (),
+) -> SetMeasurements:
+    """Find the sources around a robot in a set of its cameras' frames.
+
+    Parameters
+    ----------
+    frames
+        Of one robot, taken within half a period (`frame_sets`): one of each camera, or several exposures.
+    calibrations
+        Of each camera, by its name.
+    estimator
+        As for `detect`.
+    planes
+        Mirrors known from earlier sets, in the body axes of today.
+
+    Returns
+    -------
+    SetMeasurements
+        Every source once, however many cameras see it, with whether it is a mirror image (`told_ghosts`).
+
+    Raises
+    ------
+    ValueError
+        As for `detect`, if a camera has no calibration, or the frames are of several robots.
+    """
+    return measure_set(frames, detect_frames(frames, calibrations, estimator), calibrations, planes)
+
+
+def measure_set(
+    frames: Sequence[Exposed],
+    detections: Sequence[Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+    planes: Sequence[MirrorPlane] = (),
+) -> SetMeasurements:
+    """As `detect_set`, from the detections of each frame, or record of a frame.
+
+    Raises
+    ------
+    ValueError
+        If a camera has no calibration, or the frames are of several robots.
+    """
+    robots = sorted({robot_of(frame.camera) for frame in frames})
+    if len(robots) > 1:
+        raise ValueError(f"a set is of one robot's frames, not of {', '.join(robots)}: see frame_sets")
+    found = sightings_of(frames, detections, calibrations)
+    own_sources_body_m = calibrations[frames[0].camera].own_sources_body_m if frames else np.empty((0, 3))
+    measurements = fused(found, associated(found))
+    told, shown = told_ghosts(measurements, own_sources_body_m, planes)
+    return SetMeasurements(told, tuple(map(tuple, detections)), shown)

@@ -1,0 +1,138 @@
+"""What the detections of a set say, as arrays: where from, whither, how far, when, and how sure."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.bearing import bearing_body
+from perception.rig.frame_sets import Exposed
+from perception.rig.rays import UNKNOWN_RANGE, Rays
+from perception.types import Calibration, Detection, bearing_axes
+
+Array = NDArray[np.float64]
+
+UNCLAIMED_PX = 1.0
+"""Standard deviation that the place of a detection is given in association where none is claimed."""
+
+UNCLAIMED_RANGE = 0.3
+"""As for a range, relatively."""
+
+_STEPS_PX = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """The detections of a set, n of them.
+
+    Attributes
+    ----------
+    keys
+        Camera, index and number among the detections of its frame.
+    frame
+        Which frame of the set, shape (n,).
+    rays
+        What they say of the source's place.
+    claimed
+        Whether the estimator claims the standard deviations, shape (n,).
+    saturated, merged, ghost
+        As of the detection, shape (n,).
+    """
+
+    keys: tuple[tuple[str, int, int], ...]
+    frame: NDArray[np.int64]
+    rays: Rays
+    claimed: NDArray[np.bool_]
+    saturated: NDArray[np.bool_]
+    merged: NDArray[np.bool_]
+    ghost: NDArray[np.bool_]
+
+
+def sightings_of(
+    frames: Sequence[Exposed],
+    detections: Sequence[Sequence[Detection]],
+    calibrations: Mapping[str, Calibration],
+) -> Sightings:
+    """Return what the detections of each frame say.
+
+    Parameters
+    ----------
+    frames
+        The frames of a set, or their records.
+    detections
+        Those of each frame.
+    calibrations
+        Of each camera, by its name. What their `sigma` says of `rotation_body_camera` (rad) and
+        `position_body_m` counts as uncertainty of each bearing.
+    """
+    hits = [hit for found in detections for hit in found]
+    frame = np.repeat(np.arange(len(frames)), [len(found) for found in detections])
+    columns = np.array(
+        [
+            [
+                hit.u_px, hit.v_px, hit.u_sigma_px, hit.v_sigma_px, hit.range_m, hit.range_sigma_m,
+                hit.range_sigma_common_m, hit.saturated, hit.merged, hit.ghost, *hit.bearing_body,
+            ]
+            for hit in hits
+        ]
+    ).reshape(-1, 13).T  # fmt: skip
+    u_px, v_px, u_sigma_px, v_sigma_px, range_m, sigma_m, common_m = columns[:7]
+    saturated, merged, ghost = columns[7:10].astype(bool)
+    axes = bearing_axes(columns[10:].T)
+    ranged = range_m > 0.0
+    # Of a clipped flare that was not recovered the range is but a bound.
+    bound = saturated & ~np.isfinite(sigma_m)
+    known = ranged & ~bound
+    claimed = known & np.isfinite(sigma_m)
+    at_m = np.where(known, range_m, 1.0)
+    common = np.where(claimed, np.nan_to_num(common_m) / at_m, 0.0)
+    noise2 = np.where(claimed, np.nan_to_num(sigma_m) / at_m, 0.0) ** 2 - common**2
+    noise = np.where(claimed, np.sqrt(np.maximum(noise2, 1e-12)), UNCLAIMED_RANGE)
+    origin_m, time_s, angular_rad2 = (
+        np.empty((len(hits), 3)),
+        np.empty(len(hits)),
+        np.empty((len(hits), 2, 2)),
+    )
+    sigmas_px = np.column_stack([u_sigma_px, v_sigma_px])
+    sigmas_px = np.where(np.isfinite(sigmas_px), sigmas_px, UNCLAIMED_PX)
+    end = 0
+    for taken, found in zip(frames, detections, strict=True):
+        these = slice(end, end := end + len(found))
+        if not found:
+            continue
+        calibration = calibrations[taken.camera]
+        origin_m[these] = calibration.position_body_m
+        time_s[these] = taken.time_s + 0.5 * taken.exposure_s + taken.line_time_s * v_px[these]
+        places_px = np.column_stack([u_px[these], v_px[these]])
+        angular_rad2[these] = _angular_rad2(places_px, sigmas_px[these], axes[these], calibration)
+        turned_rad = calibration.sigma.get("rotation_body_camera", 0.0)
+        moved_rad = calibration.sigma.get("position_body_m", 0.0) / at_m[these]
+        angular_rad2[these] += (turned_rad**2 + moved_rad**2)[:, None, None] * np.eye(2)
+    return Sightings(
+        keys=tuple(
+            (hit.camera, hit.index, number) for found in detections for number, hit in enumerate(found)
+        ),
+        frame=frame,
+        rays=Rays(
+            origin_m,
+            axes,
+            angular_rad2,
+            np.where(known, range_m, np.nan),
+            np.where(known, noise, UNKNOWN_RANGE),
+            common,
+            time_s,
+        ),
+        claimed=np.isfinite(u_sigma_px + v_sigma_px) & (claimed | ~known),
+        saturated=saturated,
+        merged=merged,
+        ghost=ghost,
+    )
+
+
+def _angular_rad2(places_px: Array, sigmas_px: Array, axes: Array, calibration: Calibration) -> Array:
+    """Return the covariance of bearings' angles to the left and upwards, shape (n, 2, 2)."""
+    around = bearing_body((places_px[:, None, :] + _STEPS_PX).reshape(-1, 2), calibration).reshape(-1, 4, 3)
+    turn = around[:, 1::2] - around[:, 0::2]  # by a pixel along u, and along v
+    slope = axes[:, :2] @ np.swapaxes(turn, 1, 2) * sigmas_px[:, None, :]
+    return np.asarray(slope @ np.swapaxes(slope, 1, 2))
