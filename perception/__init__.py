@@ -26,11 +26,13 @@ from perception.calibration.range_constant import (
     regress_range_constant,
 )
 from perception.calibration.result import RailCalibration
+from perception.command_estimator import CommandEstimator, CommandProcess, load_command
 from perception.estimators import (
     ESTIMATORS,
     Estimator,
     EstimatorError,
     OwnEstimator,
+    OwnSetEstimator,
     detect,
     detect_frames,
     load_estimator,
@@ -67,6 +69,8 @@ from perception.types import Calibration, Detection, Measurement, MirrorPlane, R
 __all__ = [
     "ESTIMATORS",
     "Calibration",
+    "CommandEstimator",
+    "CommandProcess",
     "Detection",
     "Estimator",
     "EstimatorError",
@@ -75,6 +79,7 @@ __all__ = [
     "Measurement",
     "MirrorPlane",
     "OwnEstimator",
+    "OwnSetEstimator",
     "PaperRegression",
     "Picture",
     "RailCalibration",
@@ -95,6 +100,7 @@ __all__ = [
     "flare_limits",
     "frame_record",
     "frame_sets",
+    "load_command",
     "load_estimator",
     "measure_set",
     "measurement_record",

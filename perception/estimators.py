@@ -1,11 +1,12 @@
 """The one call from a frame to its flares, by an estimator that the caller names or brings.
 
-One's own is a function in a Python file, `file.py:function`. Whatever goes wrong in code that somebody is
-still writing becomes one line that says where.
+One's own is a function in a Python file, `file.py:function`, of one frame or of a set of frames. Whatever
+goes wrong in code that somebody is still writing becomes one line that says where.
 """
 
 import dataclasses
 import importlib.util
+import inspect
 import math
 import operator
 import os
@@ -125,7 +126,7 @@ def detect_frames(
 
 
 class EstimatorError(ValueError):
-    """An estimator cannot be loaded, or failed on a frame; the text is one line."""
+    """An estimator cannot be loaded, or failed on a frame; a command's text ends with its standard error."""
 
 
 @dataclass(frozen=True)
@@ -154,37 +155,77 @@ class OwnEstimator:
         """
         where = f"{self.reference}: frame {frame.index} of {frame.camera}"
         copied = dataclasses.replace(frame, data_dn=frame.data_dn.copy())
-        try:
-            # A generator raises only while it is being read.
-            found = self.function(copied, calibration)
-            listed = list(found) if isinstance(found, Iterable) else None
-        except Exception as error:
-            raise EstimatorError(f"{where}: {_error_line(error, self.path)}") from error
-        if listed is None:
-            raise EstimatorError(f"{where}: returned {_kind(found)}; wanted a list of detections")
-        return [_checked_detection(detection, frame, where) for detection in listed]
+        found = _listed(lambda: self.function(copied, calibration), self.path, where)
+        return [_checked_detection(detection, [frame], where) for detection in found]
 
 
-def load_estimator(reference: str) -> OwnEstimator:
+@dataclass(frozen=True)
+class OwnSetEstimator:
+    """One's own function of a set of frames: what the cameras of one robot took at about the same time.
+
+    It is called by the names of its parameters, `frames`, `calibrations` and, if it has it, `odometry`.
+    """
+
+    name: str
+    reference: str
+    path: Path
+    function: Callable[..., Iterable[Detection]]
+
+    def __call__(
+        self, frames: Sequence[RawFrame], calibrations: Mapping[str, Calibration], odometry: None = None
+    ) -> list[Detection]:
+        """Find the flares of a set of frames; otherwise as `OwnEstimator`.
+
+        Parameters
+        ----------
+        frames
+            Of one robot, of several cameras or exposures, by time.
+        calibrations
+            Of each camera, by its name.
+        odometry
+            What the robot knows of its own motion: nothing yet, None.
+
+        Raises
+        ------
+        EstimatorError
+            If the function raises, or returns anything but detections of these frames.
+        """
+        first = frames[0]
+        where = f"{self.reference}: set of frame {first.index} of {first.camera}"
+        given = {
+            "frames": [dataclasses.replace(frame, data_dn=frame.data_dn.copy()) for frame in frames],
+            "calibrations": dict(calibrations),
+            "odometry": odometry,
+        }
+        taken = inspect.signature(self.function).parameters
+        found = _listed(
+            lambda: self.function(**{name: value for name, value in given.items() if name in taken}),
+            self.path,
+            where,
+        )
+        return [_checked_detection(detection, frames, where) for detection in found]
+
+
+def load_estimator(reference: str) -> OwnEstimator | OwnSetEstimator:
     """Load the function that `file.py:function` names.
 
-    The file may import modules that lie beside it.
+    The file may import modules that lie beside it. A function with a parameter `frames` wants sets of frames.
 
     Parameters
     ----------
     reference
         Path of a Python file, a colon, and the name of a function in it that takes a frame and its
-        calibration and returns detections.
+        calibration, or `frames`, `calibrations` and `odometry` by these names, and returns detections.
 
     Returns
     -------
-    OwnEstimator
+    OwnEstimator, or OwnSetEstimator for a function of sets.
 
     Raises
     ------
     EstimatorError
         If there is no such file or function, it cannot be called, the file raises while it is imported,
-        or the function's name cannot name a file of detections.
+        the function's name cannot name a file of detections, or its parameters are neither kind's.
     """
     file, _, name = reference.rpartition(":")
     if not (file and name.isidentifier()):
@@ -202,7 +243,44 @@ def load_estimator(reference: str) -> OwnEstimator:
     function = contents[name]
     if not callable(function):
         raise EstimatorError(f"{reference}: {name!r} is {_kind(function)}, which cannot be called")
+    if _wants_sets(function, reference):
+        return OwnSetEstimator(name, reference, path, function)
     return OwnEstimator(name, reference, path, function)
+
+
+def _wants_sets(function: Callable[..., Any], reference: str) -> bool:
+    """Tell a function of sets by the names of its parameters."""
+    try:
+        parameters = inspect.signature(function).parameters
+    except (TypeError, ValueError):  # of a compiled function, say
+        return False
+    if "frames" not in parameters:
+        return False
+    named = {
+        name: one
+        for name, one in parameters.items()
+        if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD, one.POSITIONAL_ONLY)
+    }
+    needed = {name for name, one in named.items() if one.default is one.empty} | {"frames", "calibrations"}
+    if not needed <= named.keys() or needed - {"frames", "calibrations", "odometry"}:
+        raise EstimatorError(
+            f"{reference}: takes ({', '.join(parameters)}); wanted (frame, calibration), or for sets of "
+            "frames (frames, calibrations, odometry), by these names"
+        )
+    return True
+
+
+def _listed(call: Callable[[], Any], path: Path, where: str) -> list[Any]:
+    """Return what a user's function gives, as a list; whatever goes wrong becomes an EstimatorError."""
+    try:
+        # A generator raises only while it is being read.
+        found = call()
+        listed = list(found) if isinstance(found, Iterable) else None
+    except Exception as error:
+        raise EstimatorError(f"{where}: {_error_line(error, path)}") from error
+    if listed is None:
+        raise EstimatorError(f"{where}: returned {_kind(found)}; wanted a list of detections")
+    return listed
 
 
 def _import_file(path: Path, reference: str) -> dict[str, Any]:
@@ -236,11 +314,11 @@ def _importing_from(folder: Path) -> Iterator[None]:
         sys.path.remove(entry)
 
 
-def _checked_detection(detection: object, frame: RawFrame, where: str) -> Detection:
+def _checked_detection(detection: object, frames: Sequence[RawFrame], where: str) -> Detection:
     """Return a detection with plain numbers, or say what about it is wrong."""
     if not isinstance(detection, Detection):
         raise EstimatorError(f"{where}: returned {_kind(detection)} among its detections; wanted a Detection")
-    if (detection.camera, detection.index) != (frame.camera, frame.index):
+    if (detection.camera, detection.index) not in {(frame.camera, frame.index) for frame in frames}:
         raise EstimatorError(
             f"{where}: returned a detection of frame {detection.index} of {detection.camera}; "
             "give it this frame's camera and index"

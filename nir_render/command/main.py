@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from nir_render.command import recordings, regress, runs, scenes, stress
+from nir_render.command.compare import compare
 from nir_render.errors import InputError
 
 app = typer.Typer(
@@ -42,6 +43,7 @@ def options(
 
 for command in (
     *(runs.run, runs.render, runs.perceive, runs.evaluate, runs.calibrate, runs.report),
+    compare,
     stress.stress,
     *(scenes.new, scenes.validate, scenes.schema, scenes.doctor),
 ):

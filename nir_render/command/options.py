@@ -10,9 +10,9 @@ import typer
 from nir_render.errors import InputError
 
 if TYPE_CHECKING:
+    from nir_render.run.perceive import RunEstimator
     from nir_render.scene.scene import Scene
     from nir_render.transport.cache import LightCache
-    from perception import Estimator
 
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="A scene file (YAML).")]
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")]
@@ -36,7 +36,14 @@ Estimators = Annotated[
     typer.Option(
         "--estimator",
         metavar="NAME",
-        help="paper, robust, or one's own as file.py:function; paper and robust by default. Repeatable.",
+        help="paper, robust, or one's own as file.py:function or 'cmd: PROGRAM'; paper and robust by "
+        "default. Repeatable.",
+    ),
+]
+TimeLimit = Annotated[
+    float,
+    typer.Option(
+        "--time-limit", metavar="S", help="Seconds that an estimator 'cmd: …' may take for a frame."
     ),
 ]
 KeepLight = Annotated[
@@ -70,12 +77,14 @@ def read_scene(path: Path, settings: list[str] | None, seed: int | None) -> "Sce
     return load_scene(path, overrides if seed is None else {**overrides, "seed": seed})
 
 
-def chosen_estimators(names: list[str] | None) -> "dict[str, Estimator]":
+def chosen_estimators(names: list[str] | None, time_limit_s: float) -> "dict[str, RunEstimator]":
     """Return the estimators that `--estimator` names; paper and robust if none is named."""
     from nir_render.run.perceive import chosen_estimators
     from perception import ESTIMATORS
 
-    return chosen_estimators(names or list(ESTIMATORS))
+    if not (math.isfinite(time_limit_s) and time_limit_s > 0.0):
+        raise InputError(f"--time-limit {time_limit_s:g}: wanted seconds above 0, such as 60")
+    return chosen_estimators(names or list(ESTIMATORS), time_limit_s)
 
 
 def light_cache(folder: Path | None, limit_gib: float) -> "LightCache":

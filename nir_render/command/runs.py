@@ -18,11 +18,13 @@ from nir_render.command.options import (
     Seed,
     Settings,
     Threads,
+    TimeLimit,
     chosen_estimators,
     light_cache,
     read_scene,
     use_threads,
 )
+from nir_render.errors import InputError
 
 if TYPE_CHECKING:
     from nir_render.evaluate.metrics import Evaluation
@@ -35,6 +37,7 @@ def run(
     output: Output = None,
     settings: Settings = None,
     estimators: Estimators = None,
+    time_limit_s: TimeLimit = 60.0,
     overwrite: Overwrite = False,
     seed: Seed = None,
     threads: Threads = None,
@@ -49,16 +52,20 @@ def run(
     from nir_render.run.perceive import perceive_run
     from nir_render.run.report import report_run
 
-    chosen = chosen_estimators(estimators)
+    chosen = chosen_estimators(estimators, time_limit_s)
     cache = light_cache(light_folder, light_gib)
     folder = _render(read_scene(scene, settings, seed), output, overwrite, threads, keep_light, cache)
     with progress_bar("perceive") as progress:
-        perceive_run(folder, estimators=chosen, progress=progress)
+        perceived = perceive_run(folder, estimators=chosen, progress=progress)
+    if not perceived.detections:
+        raise InputError(*perceived.problems)
     result = evaluate_run(folder)
     page = report_run(folder, result)
     _show_evaluation(result, folder, as_json)
     if not as_json:
         typer.echo(f"open {page}")
+    if perceived.failures:
+        raise InputError(*perceived.problems)
 
 
 def render(
@@ -93,19 +100,28 @@ def render(
         typer.echo(f"{frames} frames in {folder}; next: nir-render perceive {folder}")
 
 
-def perceive(folder: FolderArgument, estimators: Estimators = None, as_json: Json = False) -> None:
+def perceive(
+    folder: FolderArgument,
+    estimators: Estimators = None,
+    time_limit_s: TimeLimit = 60.0,
+    as_json: Json = False,
+) -> None:
     """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
     from nir_render.command.console import print_json
     from nir_render.command.progress import progress_bar
     from nir_render.run.perceive import perceive_run
 
+    chosen = chosen_estimators(estimators, time_limit_s)
     with progress_bar("perceive") as progress:
-        counts = perceive_run(folder, estimators=chosen_estimators(estimators), progress=progress)
+        perceived = perceive_run(folder, estimators=chosen, progress=progress)
     if as_json:
-        print_json({"folder": str(folder), "detections": counts})
+        failed = {"failed": dict(perceived.failures)} if perceived.failures else {}
+        print_json({"folder": str(folder), "detections": dict(perceived.detections), **failed})
     else:
-        for name, count in counts.items():
+        for name, count in perceived.detections.items():
             typer.echo(f"{name}: {count} detections in {folder / f'detections.{name}.jsonl'}")
+    if perceived.failures:
+        raise InputError(*perceived.problems)
 
 
 def evaluate(folder: FolderArgument, as_json: Json = False) -> None:

@@ -121,7 +121,7 @@ def whole_pictures(
             name: [alarm for alarm in alarms if (alarm.camera, alarm.index) == key]
             for name, alarms in result.false_alarms.items()
         }
-        pictures.append(_whole(load(key), calibrations[key[0]], scores, false_alarms))
+        pictures.append(shown_frame(load(key), calibrations[key[0]], scores, false_alarms))
     return pictures
 
 
@@ -134,7 +134,7 @@ def close_ups(
     )
     names = list(result.summary["estimators"])
     return [
-        _close_up(load(key_of(score)), calibrations[score.truth.camera], score, names)
+        close_up(load(key_of(score)), calibrations[score.truth.camera], score, names)
         for score in spread(counting, _CLOSE_UPS)
     ]
 
@@ -186,12 +186,13 @@ def png_uri(picture: NDArray[np.uint8]) -> str:
     return data_uri(_encoded(picture, ".png"), "image/png")
 
 
-def _whole(
+def shown_frame(
     frame: RawFrame,
     calibration: Calibration,
     scores: Sequence[Score],
     false_alarms: Mapping[str, Sequence[Detection]],
 ) -> WholePicture:
+    """Show a whole frame: sources, ghosts, and what the estimators of `scores` and `false_alarms` found."""
     rows, columns = frame.data_dn.shape
     block_px = max(1, round(columns / _WHOLE_WIDTH_PX))
     grey = whole_picture(frame, calibration, block_px)
@@ -245,7 +246,17 @@ def _hint_and_label(score: Score) -> tuple[str, str]:
     return hint + faint, f"{truth.robot} {metres(truth.range_m)}"
 
 
-def _close_up(frame: RawFrame, calibration: Calibration, score: Score, names: Sequence[str]) -> CloseUp:
+def close_up(
+    frame: RawFrame,
+    calibration: Calibration,
+    score: Score,
+    names: Sequence[str],
+    among: Sequence[str] | None = None,
+) -> CloseUp:
+    """Show the surroundings of a source, and what the estimators of these names said of it.
+
+    `among` are all estimators of the page, by which each has its look; these alone by default.
+    """
     truth = score.truth
     radius_px = image_radius_px(truth, calibration)
     half = max(_CLOSE_UP_HALF_PX, round(1.5 * radius_px))
@@ -267,7 +278,10 @@ def _close_up(frame: RawFrame, calibration: Calibration, score: Score, names: Se
         ),
         lines=(
             Line(f"true {truth.range_m:.3f} m", TRUTH),
-            *(Line(f"{name} {_range_text(score, name)}", look(name, names).colour) for name in names),
+            *(
+                Line(f"{name} {_range_text(score, name)}", look(name, among or names).colour)
+                for name in names
+            ),
         ),
         frame=f"{truth.camera} {truth.index}",
     )

@@ -62,7 +62,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         }
         lamps_path = folder / run_folder.LAMPS
         lamps = parse_lines(lamps_path, parse_lamp) if lamps_path.is_file() else []
-        _check_frames_known(keys, truth, lamps, detections, calibrations, folder)
+        check_frames_known(keys, truth, lamps, detections, calibrations, folder)
         result = evaluate(keys, truth, calibrations, detections, lamps)
         result = _with_sets(folder, result, truth, calibrations, detections, lamps)
         preview = _preview(folder, keys, calibrations, result)
@@ -76,7 +76,7 @@ def evaluate_run(folder: Path) -> Evaluation:
     return result
 
 
-def _check_frames_known(
+def check_frames_known(
     keys: Sequence[FrameKey],
     truth: Sequence[SourceTruth],
     lamps: Sequence[LampTruth],

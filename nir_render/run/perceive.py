@@ -1,7 +1,10 @@
 """The stage `perceive`: the frames of any folder become detections, by one or several estimators."""
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from nir_render.errors import InputError
@@ -11,76 +14,214 @@ from nir_render.run.render import Progress
 from perception import (
     ESTIMATORS,
     Calibration,
+    CommandEstimator,
     Detection,
     Estimator,
     EstimatorError,
     FrameRecord,
+    OwnSetEstimator,
+    RawFrame,
+    Recording,
     detect,
     detection_record,
     frame_sets,
+    load_command,
     load_estimator,
     measure_set,
     measurement_record,
     mirror_record,
+    read_frame_records,
     read_recording,
 )
+from perception.command_estimator import LIMIT_S, is_command
 from perception.rig.frame_sets import robot_of
+from perception.types import FrameKey
+
+RunEstimator = Estimator | OwnSetEstimator | CommandEstimator
+"""What can be run over a folder: a function of a frame, a function of a set of frames, or a command."""
+
+Found = dict[FrameKey, list[Detection]]
 
 
-def chosen_estimators(names: Sequence[str]) -> dict[str, Estimator]:
-    """Return the estimators of these names, by name; `file.py:function` loads one of the user's own.
+@dataclass(frozen=True)
+class Perceived:
+    """How many detections each estimator made, and what went wrong with those that failed, by name."""
+
+    detections: Mapping[str, int]
+    failures: Mapping[str, str]
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What to tell the user, a text for each estimator that failed."""
+        return tuple(f"--estimator {text}" for text in self.failures.values())
+
+
+def chosen_estimators(names: Sequence[str], limit_s: float = LIMIT_S) -> dict[str, RunEstimator]:
+    """Return the estimators of these names, by name.
+
+    `file.py:function` loads one of the user's own, `cmd: …` and `NAME=cmd: …` are programs, which may take
+    `limit_s` for a frame.
 
     Raises
     ------
     InputError
         An estimator is unknown or cannot be loaded, or two of them have the same name.
     """
-    chosen: dict[str, Estimator] = {}
+    chosen: dict[str, RunEstimator] = {}
     for name in dict.fromkeys(names):
         if name in ESTIMATORS:
             chosen[name] = ESTIMATORS[name]
             continue
         if ":" not in name and not name.endswith(".py"):
             known = ", ".join(ESTIMATORS)
-            raise InputError(f"--estimator {name}: unknown; known: {known}, or one's own as file.py:function")
+            raise InputError(
+                f"--estimator {name}: unknown; known: {known}, or one's own as file.py:function or "
+                "'cmd: PROGRAM'"
+            )
         try:
-            own = load_estimator(name)
+            own = load_command(name, limit_s) if is_command(name) else load_estimator(name)
         except EstimatorError as error:
             raise InputError(f"--estimator {error}") from None
         if own.name in chosen:
-            raise InputError(
-                f"--estimator {name}: another estimator is called {own.name!r} too; rename one of them"
+            mend = (
+                f"write OTHER=cmd: …{name.partition('cmd:')[2]}" if is_command(name) else "rename one of them"
             )
+            raise InputError(f"--estimator {name}: another estimator is called {own.name!r} too; {mend}")
         chosen[own.name] = own
     return chosen
 
 
-def perceive_run(folder: Path, *, estimators: Mapping[str, Estimator], progress: Progress) -> dict[str, int]:
-    """Run estimators over the frames of a folder; returns the number of detections by estimator.
+def frame_estimators(names: Sequence[str]) -> dict[str, Estimator]:
+    """Return the estimators of these names that read one frame by itself, in this process.
 
     Raises
     ------
     InputError
-        The folder is no recording, or one's own estimator fails on a frame.
+        As `chosen_estimators`, or one of them is a command or wants sets of frames.
+    """
+    chosen: dict[str, Estimator] = {}
+    for name, estimator in chosen_estimators(names).items():
+        if isinstance(estimator, OwnSetEstimator | CommandEstimator):
+            kind = "a command" if isinstance(estimator, CommandEstimator) else "a function of sets of frames"
+            raise InputError(
+                f"--estimator {estimator.reference}: is {kind}, which only 'nir-render run' and 'perceive' "
+                "take; give a function (frame, calibration) here"
+            )
+        chosen[name] = estimator
+    return chosen
+
+
+def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progress: Progress) -> Perceived:
+    """Run estimators over the frames of a folder; write the detections of each that reads them all.
+
+    One's own that fails on a frame is left out from there on, and the others go on. Of it nothing is written;
+    detections of an earlier call stay.
+
+    Raises
+    ------
+    InputError
+        The folder is no recording.
     """
     started = time.perf_counter()
-    found: dict[str, list[list[Detection]]] = {name: [] for name in estimators}
     try:
         recording = read_recording(folder)
-        for done, frame in enumerate(recording.frames()):
-            for name, estimator in estimators.items():
-                found[name].append(detect(frame, recording.calibrations[frame.camera], estimator))
-            progress(done + 1, len(recording.records))
-    except EstimatorError as error:
-        raise InputError(f"--estimator {error}") from None
+        records, calibrations = recording.records, recording.calibrations
+        found, failures = _read_all(recording, estimators, progress)
+    except InputError:
+        raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
-    for name, detections in found.items():
-        hits = [hit for of_frame in detections for hit in of_frame]
-        run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, hits))
-        _measure_sets(folder, name, recording.records, detections, recording.calibrations)
-    note_seconds(folder, "perceive", started)
-    return {name: sum(map(len, detections)) for name, detections in found.items()}
+    keys = dict.fromkeys((record.camera, record.index) for record in records)
+    counts = {}
+    for name, of_frames in found.items():
+        listed = [detection for key in keys for detection in of_frames.get(key, [])]
+        run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, listed))
+        by_record = [of_frames.get((record.camera, record.index), []) for record in records]
+        _measure_sets(folder, name, records, by_record, calibrations)
+        counts[name] = len(listed)
+    for name, text in failures.items():
+        if (folder / f"detections.{name}.jsonl").is_file():
+            failures[name] = f"{text}\ndetections.{name}.jsonl is of an earlier call, and stays as it was"
+    if counts:
+        note_seconds(folder, "perceive", started)
+    return Perceived(counts, failures)
+
+
+def _read_all(
+    recording: Recording,
+    estimators: Mapping[str, RunEstimator],
+    progress: Progress,
+) -> tuple[dict[str, Found], dict[str, str]]:
+    """Return what each estimator found that came to the end, and what went wrong with the others."""
+    records, calibrations = recording.records, recording.calibrations
+    found: dict[str, Found] = {}
+    failures: dict[str, str] = {}
+    sets = any(isinstance(estimator, OwnSetEstimator) for estimator in estimators.values())
+    groups = frame_sets(records) if sets else [[record] for record in records]
+    done = 0
+    with ExitStack() as stack:
+        readers: dict[str, _Reader] = {}
+
+        def attempt(name: str, work: Callable[[], None]) -> None:
+            try:
+                work()
+            except EstimatorError as error:
+                failures[name] = str(error)
+                found.pop(name, None)
+
+        def start(name: str, estimator: RunEstimator) -> None:
+            readers[name] = _Reader.of(estimator, calibrations, stack)
+            found[name] = {}
+
+        def read(name: str, frames: Sequence[RawFrame], files: Sequence[Path]) -> None:
+            for detection in readers[name].read(frames, files):
+                found[name].setdefault((detection.camera, detection.index), []).append(detection)
+
+        for name, estimator in estimators.items():
+            attempt(name, partial(start, name, estimator))
+        for group in groups:
+            if not found:
+                break
+            frames = [recording.frame(record) for record in group]
+            files = [recording.folder / record.file for record in group]
+            for name in list(found):
+                attempt(name, partial(read, name, frames, files))
+            done += len(group)
+            progress(done, len(records))
+        for name in list(found):
+            attempt(name, readers[name].finish)
+    return found, failures
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """An estimator at work: what reads the frames of a group, whose PNGs are given too, and what ends it."""
+
+    read: Callable[[Sequence[RawFrame], Sequence[Path]], list[Detection]]
+    finish: Callable[[], None] = lambda: None
+
+    @staticmethod
+    def of(estimator: RunEstimator, calibrations: Mapping[str, Calibration], stack: ExitStack) -> "_Reader":
+        """Set an estimator to work; a process that this starts ends with the stack."""
+        if isinstance(estimator, CommandEstimator):
+            process = stack.enter_context(estimator.started(calibrations))
+            return _Reader(
+                lambda frames, files: [
+                    detection
+                    for frame, file in zip(frames, files, strict=True)
+                    for detection in process.detect(frame, file)
+                ],
+                process.finish,
+            )
+        if isinstance(estimator, OwnSetEstimator):
+            return _Reader(lambda frames, _: estimator(frames, calibrations))
+        return _Reader(
+            lambda frames, _: [
+                detection
+                for frame in frames
+                for detection in detect(frame, calibrations[frame.camera], estimator)
+            ]
+        )
 
 
 def _measure_sets(
@@ -100,6 +241,14 @@ def _measure_sets(
         mirrors += [mirror_record(plane, robot, time_s) for plane in seen.planes]
     run_folder.write_lines(folder / f"measurements.{name}.jsonl", measurements)
     run_folder.write_lines(folder / f"mirrors.{name}.jsonl", mirrors)
+
+
+def frame_keys(folder: Path) -> list[FrameKey]:
+    """Return camera and index of all frames of a recording; raise InputError where it has none."""
+    keys = [(record.camera, record.index) for record in read_frame_records(folder)]
+    if not keys:
+        raise InputError(f"{folder / run_folder.FRAMES}: names no frame")
+    return keys
 
 
 def unknown_camera(folder: Path, camera: str, known: Collection[str]) -> InputError:

@@ -268,15 +268,17 @@ def _clashes(axes: list[Axis], settings: Mapping[str, Any]) -> list[str]:
 
 def _beside(file: Path, estimator: str) -> str:
     """Return an estimator's name; one's own, `file.py:function`, counts from the campaign's folder."""
-    return str(file.parent / estimator) if ".py" in estimator else estimator
+    from perception.command_estimator import is_command
+
+    return str(file.parent / estimator) if ".py" in estimator and not is_command(estimator) else estimator
 
 
 def _not_estimators(names: Sequence[str]) -> list[str]:
     """Return what is wrong with estimators: unknown ones, files that cannot be loaded, two of one name."""
-    from nir_render.run.perceive import chosen_estimators
+    from nir_render.run.perceive import frame_estimators
 
     try:
-        chosen_estimators(names)
+        frame_estimators(names)
     except InputError as error:
         return [problem.removeprefix("--estimator ") for problem in error.problems]
     return []

@@ -12,7 +12,7 @@ from typing import Any
 
 from nir_render.errors import InputError
 from nir_render.run.manifest import versions as run_versions
-from nir_render.run.perceive import chosen_estimators
+from nir_render.run.perceive import frame_estimators
 from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
 from nir_render.transport.fingerprint import code_hash
@@ -121,7 +121,7 @@ def _made_by(campaign: Campaign) -> tuple[str, ...]:
     from nir_render.transport.backend.variant import backend
     from nir_render.transport.cache_key import versions
 
-    estimators = chosen_estimators(campaign.estimators)
+    estimators = frame_estimators(campaign.estimators)
     own_files = [
         estimator.path.resolve() for estimator in estimators.values() if isinstance(estimator, OwnEstimator)
     ]

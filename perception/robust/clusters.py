@@ -30,7 +30,7 @@ _CROWD_NEIGHBOURS = 3
 _TOUCHING_PX = 4
 _KEPT_PX = 2
 
-MAX_IMAGE_RADIUS_PX = 20.0
+MAX_IMAGE_RADIUS_PX = 28.0
 """Sources that look larger are measured by aperture: as good for them, and far cheaper than the fit."""
 
 # Few sizes of windows, as what texture looks like is reckoned once for each.

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.model.bearing import direction_camera
 from perception.model.layout import UNUSABLE
 from perception.robust.clusters import Candidate
 from perception.robust.goodness import MODEL_ERROR
@@ -22,6 +23,7 @@ _DISC_FILLS = (0.88, 1.12)
 _MOST_ASPECT = 1.5
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _LEAST_PX, _LEAST_SHARE = 1.0, 0.15
+_PIXEL_STEPS = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
 _FLANK_PX, _FLANK_SHARE = 3.0, 0.25
 
 
@@ -123,23 +125,26 @@ def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) 
 def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     """Tell whether a blob too large to be fitted is no source: by its outline, its brightness, its range.
 
-    The image of a sphere is an ellipse, hardly longer than wide, and as bright at any range: its flux at one
-    metre over the area of its image there.
+    The image of a sphere is an ellipse, hardly longer than wide but as the lens stretches it, and as bright
+    at any range: its flux at one metre over the solid angle that it fills there, times that of a pixel.
     """
     box, calibration = member.blob.box, prepared.calibration
     rows, columns = prepared.shape
     cut = box.top == 0 or box.left == 0 or box.top + box.height == rows or box.left + box.width == columns
+    around = direction_camera(np.array([member.u_px, member.v_px]) + _PIXEL_STEPS, calibration)
+    long_rad, short_rad = np.linalg.svd(around[1::2] - around[::2], compute_uv=False).tolist()
+    most_aspect = _MOST_ASPECT * long_rad / short_rad
     fill = member.blob.area_px / (0.25 * math.pi * box.height * box.width)
     aspect = max(box.height, box.width) / min(box.height, box.width)
     # What the frame's edge cuts off a disc leaves no rectangle.
-    if fill > _DISC_FILLS[1] or (not cut and (fill < _DISC_FILLS[0] or aspect > _MOST_ASPECT)):
+    if fill > _DISC_FILLS[1] or (not cut and (fill < _DISC_FILLS[0] or aspect > most_aspect)):
         return True
     radius_px = 0.5 * math.sqrt(box.height * box.width)
     if calibration.fx_px * calibration.source_radius_m / radius_px < LEAST_RANGE_M:
         return True
     if not member.at_one_metre_e > 0.0:
         return False
-    disc_e = member.at_one_metre_e / (math.pi * (calibration.fx_px * calibration.source_radius_m) ** 2)
+    disc_e = member.at_one_metre_e * long_rad * short_rad / (math.pi * calibration.source_radius_m**2)
     seen_e = float(np.median(prepared.excess_e[box.slices][member.blob.pixels]))
     if disc_e > seen_e:
         return not member.is_clipped and disc_e > _MOST_BRIGHTNESS_FACTOR * seen_e

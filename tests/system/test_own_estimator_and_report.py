@@ -97,6 +97,21 @@ def test_run_refuses_a_bad_estimator_before_it_renders(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_run_goes_on_with_the_estimators_that_work(tmp_path: Path) -> None:
+    broken = f"broken=cmd: {sys.executable} -c 'import sys; sys.exit(\"no model\")'"
+    both = ("--estimator", broken, "--estimator", "paper", "--json")
+    done = nir_render("run", SCENE, "-o", "run", *QUICK, *both, cwd=tmp_path)
+    assert done.returncode == 2
+    assert list(json.loads(done.stdout)["estimators"]) == ["paper"]
+    assert done.stderr.count("error:") == 1
+    assert "exit status 1; its standard error ended with\n    no model" in done.stderr
+    assert (tmp_path / "run" / "report.html").is_file()
+    compared = nir_render("compare", "run", "run", "--json", cwd=tmp_path)
+    assert compared.returncode == 0, compared.stderr
+    assert json.loads(compared.stdout)["estimators"][0]["identical"] is True
+    assert "compare.html" in json.loads((tmp_path / "run" / "manifest.json").read_text())["sha256"]
+
+
 def test_two_estimators_of_one_name_are_refused(recording: Path) -> None:
     for folder in ("a", "b"):
         (recording / folder).mkdir()

@@ -22,7 +22,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.scheduler import KilledWorker
 
 from nir_render.errors import InputError
-from nir_render.run.perceive import chosen_estimators
+from nir_render.run.perceive import frame_estimators
 from nir_render.scene.scene import Scene
 from nir_render.stress.execute import execute
 from nir_render.stress.jobs import Job
@@ -194,7 +194,7 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
         if self._estimators is None:  # here, not at the start: Mitsuba's variant belongs to this thread
             set_threads(self.work.threads)
             cv2.setNumThreads(self.work.threads)
-            self._estimators = chosen_estimators(self.work.estimators)
+            self._estimators = frame_estimators(self.work.estimators)
             self._cache = LightCache(
                 self.work.light,
                 limit_bytes=self.work.light_limit_bytes,

@@ -110,6 +110,8 @@ def expected_e(
         )
         rows = slice(max(0, top), min(camera.height_px, top + size))
         columns = slice(max(0, left), min(camera.width_px, left + size))
+        if rows.stop <= rows.start or columns.stop <= columns.start:
+            continue
         image[rows, columns] += (
             flux * share[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
         )

@@ -1,5 +1,6 @@
 """Estimators by name and of one's own: what works, and the one line that each mistake gets."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -54,14 +55,20 @@ from perception.robust.detect import detect_robust
 """
 
 
+def _of_frames(reference: str) -> perception.OwnEstimator:
+    estimator = load_estimator(reference)
+    assert isinstance(estimator, perception.OwnEstimator)
+    return estimator
+
+
 def _load(tmp_path: Path, body: str, name: str = "mine") -> perception.OwnEstimator:
     (tmp_path / "own.py").write_text(HEAD + body, encoding="utf-8")
-    return load_estimator(f"{tmp_path / 'own.py'}:{name}")
+    return _of_frames(f"{tmp_path / 'own.py'}:{name}")
 
 
 def test_the_example_ranges_a_source_within_its_claims() -> None:
     """A source 2 m away; the claim is about 3 % of the limit's flux, so 4 σ is a few centimetres."""
-    (hit,) = load_estimator(f"{EXAMPLE}:brightest_spot")(FRAME, CAMERA)
+    (hit,) = _of_frames(f"{EXAMPLE}:brightest_spot")(FRAME, CAMERA)
     assert abs(hit.range_m - 2.0) < 4.0 * hit.range_sigma_m < 0.1
     assert abs(hit.u_px - 60.3) < 0.1
     assert abs(hit.v_px - 49.8) < 0.1
@@ -70,7 +77,7 @@ def test_the_example_ranges_a_source_within_its_claims() -> None:
 def test_the_example_says_nothing_about_a_dark_frame() -> None:
     dark = expose(np.full((100, 120), 1.0), CAMERA, random(72), 2.4e-4)
     flat = perception.RawFrame("r1.front", 0, 0.0, 1e-3, np.full((100, 120), 64, dtype=np.uint16), 64.0)
-    estimator = load_estimator(f"{EXAMPLE}:brightest_spot")
+    estimator = _of_frames(f"{EXAMPLE}:brightest_spot")
     assert estimator(dark, CAMERA) == []
     assert estimator(flat, CAMERA) == []
 
@@ -180,3 +187,73 @@ def test_a_range_that_is_unknown_stays_unknown(tmp_path: Path) -> None:
     (hit,) = _load(tmp_path, f"def mine(frame, calibration):\n    {body}\n")(FRAME, CAMERA)
     assert math.isnan(hit.range_m)
     assert hit.u_px == detect_robust(FRAME, CAMERA)[0].u_px
+
+
+# --- one's own, of sets of frames ---
+
+
+def _load_set(tmp_path: Path, body: str) -> perception.OwnSetEstimator:
+    (tmp_path / "own.py").write_text(HEAD + body, encoding="utf-8")
+    estimator = load_estimator(f"{tmp_path / 'own.py'}:mine")
+    assert isinstance(estimator, perception.OwnSetEstimator)
+    return estimator
+
+
+OTHER = dataclasses.replace(FRAME, camera="r1.left", index=FRAME.index + 4)
+
+
+def test_a_function_of_sets_gets_all_frames_and_calibrations_by_name(tmp_path: Path) -> None:
+    """Parameters may stand in any order; odometry is None for now; detections are of any frame of the set."""
+    estimator = _load_set(
+        tmp_path,
+        """
+def mine(odometry, calibrations, frames):
+    assert odometry is None
+    for frame in frames:
+        yield from detect_robust(frame, calibrations[frame.camera])
+        frame.data_dn[:] = 0
+""",
+    )
+    cameras = {"r1.front": CAMERA, "r1.left": dataclasses.replace(CAMERA, camera="r1.left")}
+    before = FRAME.data_dn.copy()
+    first, second = estimator([FRAME, OTHER], cameras)
+    assert (first.camera, first.index) == ("r1.front", FRAME.index)
+    assert (second.camera, second.index) == ("r1.left", FRAME.index + 4)
+    assert first.range_m == second.range_m == detect_robust(FRAME, CAMERA)[0].range_m
+    assert np.array_equal(FRAME.data_dn, before)
+
+
+def test_a_function_of_sets_may_do_without_odometry(tmp_path: Path) -> None:
+    assert _load_set(tmp_path, "def mine(frames, calibrations, strict=True): return []\n")([FRAME], {}) == []
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("def mine(frames, calibration): ...", "takes (frames, calibration); wanted (frame, calibration), or"),
+        ("def mine(frames, calibrations, odometry, gyro): ...", "takes (frames, calibrations, odometry, gyro); wanted"),
+        ("def mine(frames, /, calibrations): ...", "wanted (frame, calibration), or for sets of frames"),
+    ],
+)  # fmt: skip
+def test_parameters_that_are_neither_kinds(tmp_path: Path, body: str, said: str) -> None:
+    with pytest.raises(EstimatorError) as raised:
+        _load_set(tmp_path, body + "\n")
+    assert said in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        ("[1 / 0]", "set of frame 3 of r1.front: ZeroDivisionError: division by zero (own.py, line 5)"),
+        ("None", "returned None; wanted a list"),
+        ("[3]", "returned an object of type int among its detections"),
+        ("[dataclasses.replace(h, index=9) for h in detect_robust(frames[0], calibrations['r1.front'])]",
+         "returned a detection of frame 9 of r1.front; give it"),
+    ],
+)  # fmt: skip
+def test_a_function_of_sets_that_fails_gets_one_line(tmp_path: Path, returned: str, said: str) -> None:
+    estimator = _load_set(tmp_path, f"def mine(frames, calibrations, odometry): return {returned}\n")
+    with pytest.raises(EstimatorError) as raised:
+        estimator([FRAME, OTHER], {"r1.front": CAMERA})
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)

@@ -61,7 +61,7 @@ def frames_of(
     for camera in cameras.values():
         mean_e = np.full((camera.height_px, camera.width_px), 20.0)
         for place, factor in zip(places_m, flux or [1.0] * len(places_m), strict=True):
-            if (seen := seen_by(camera, place, -20.0)) is not None:
+            if (seen := seen_by(camera, place, -60.0)) is not None:
                 mean_e += simulation.expected_e(camera, [seen], exposure_s, gain_fault=factor)
         frames.append(simulation.expose(mean_e, camera, rng, exposure_s))
     return frames

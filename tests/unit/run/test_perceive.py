@@ -1,0 +1,155 @@
+"""The stage `perceive`: estimators of all kinds side by side, and what becomes of the others where one fails."""
+
+import dataclasses
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from nir_render.errors import InputError
+from nir_render.run.perceive import chosen_estimators, frame_estimators, perceive_run
+from perception import (
+    calibration_document,
+    encode_png16,
+    frame_record,
+    frame_sets,
+    parse_frame_record,
+)
+from tests.system.command import nir_render
+from tests.unit.perception.simulation import calibration, expected_e, expose, random
+
+FRONT = calibration(width_px=120, height_px=100, cx_px=59.5, cy_px=49.5)
+LEFT = dataclasses.replace(FRONT, camera="r1.left")
+FRAME = expose(expected_e(FRONT, [(60.3, 49.8, 2.0)], 2.4e-4, 1.0), FRONT, random(71), 2.4e-4)
+HEAD = "import json, sys\ninput()\nfor line in sys.stdin:\n    frame = json.loads(line)\n    "
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Two cameras, three times; the left camera is a millisecond late, and its frames stand behind."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    frames = [
+        dataclasses.replace(FRAME, camera=camera, index=index, time_s=0.1 * index + late_s)
+        for camera, late_s in (("r1.front", 0.0), ("r1.left", 1e-3))
+        for index in range(3)
+    ]
+    lines = []
+    for frame in frames:
+        name = f"{frame.camera}-{frame.index}.png"
+        (folder / name).write_bytes(encode_png16(frame.data_dn))
+        lines.append(json.dumps(frame_record(frame, name)))
+    (folder / "frames.jsonl").write_text("\n".join(lines))
+    (folder / "calibration.json").write_text(json.dumps(calibration_document([FRONT, LEFT])))
+    return folder
+
+
+def _command(folder: Path, name: str, body: str) -> str:
+    (folder.parent / f"{name}.py").write_text(body)
+    return f"{name}=cmd: {shlex.join([sys.executable, '-I', '-S', str(folder.parent / f'{name}.py')])}"
+
+
+def _found(folder: Path, name: str) -> list[tuple[str, int]]:
+    lines = (folder / f"detections.{name}.jsonl").read_text().splitlines()
+    return [(record["camera"], record["index"]) for record in map(json.loads, lines)]
+
+
+ALL = [(camera, index) for camera in ("r1.front", "r1.left") for index in range(3)]
+
+
+def test_sets_are_what_a_robots_cameras_took_within_half_a_period(recording: Path) -> None:
+    records = [
+        parse_frame_record(json.loads(line)) for line in (recording / "frames.jsonl").read_text().splitlines()
+    ]
+    other = dataclasses.replace(records[0], camera="r2.front")
+    sets = [[(one.camera, one.index) for one in each] for each in frame_sets([*records, other])]
+    pairs = [[("r1.front", index), ("r1.left", index)] for index in range(3)]
+    assert sorted(sets) == sorted([*pairs, [("r2.front", 0)]])
+    assert [len(each) for each in frame_sets(records, period_s=1.0)] == [6]
+
+
+def test_estimators_of_sets_and_commands_run_beside_the_others(recording: Path) -> None:
+    """Whatever the order in which sets and programs are asked, lines stand in the order of the frames."""
+    (recording.parent / "own.py").write_text(
+        "from perception import detect\n"
+        "def sets(frames, calibrations, odometry):\n"
+        "    assert [frame.camera for frame in frames] == ['r1.front', 'r1.left']\n"
+        "    return [hit for frame in reversed(frames) for hit in detect(frame, calibrations[frame.camera])]\n"
+    )
+    fixed = _command(
+        recording,
+        "fixed",
+        HEAD + "print(json.dumps({'detections': [{'u_px': 60, 'v_px': frame['index']}]}), flush=True)",
+    )
+    steps: list[tuple[int, int]] = []
+    chosen = chosen_estimators(["robust", f"{recording.parent / 'own.py'}:sets", fixed])
+    done = perceive_run(recording, estimators=chosen, progress=lambda now, total: steps.append((now, total)))
+    assert (done.detections, done.failures) == ({"robust": 6, "sets": 6, "fixed": 6}, {})
+    assert [_found(recording, name) for name in chosen] == [ALL] * 3
+    assert (recording / "detections.sets.jsonl").read_bytes() == (
+        recording / "detections.robust.jsonl"
+    ).read_bytes()
+    assert steps == [(2, 6), (4, 6), (6, 6)]
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (HEAD + "if frame['index'] == 1: sys.exit('out of memory')\n    print('{\"detections\": []}', flush=True)",
+         "frame 1 of r1.front: ended with exit status 1; its standard error ended with\n    out of memory"),
+        (HEAD + "print('{\"detections\": [{}]}', flush=True)", "frame 0 of r1.front: detection 0: u_px is None"),
+        (HEAD + "import time; time.sleep(60)", "frame 0 of r1.front: no answer within 0.5 s"),
+    ],
+)  # fmt: skip
+def test_one_that_fails_takes_no_other_along(recording: Path, body: str, said: str) -> None:
+    broken = _command(recording, "broken", body)
+    (recording / "detections.broken.jsonl").write_text("")  # of an earlier call
+    done = nir_render(
+        *("perceive", str(recording), "--estimator", broken, "--estimator", "robust"),
+        *("--time-limit", "0.5", "--json"),
+        cwd=recording,
+    )
+    assert done.returncode == 2
+    answer = json.loads(done.stdout)
+    assert answer["detections"] == {"robust": 6}
+    assert said in answer["failed"]["broken"]
+    assert f"error: --estimator {broken}: {said}" in done.stderr
+    assert "detections.broken.jsonl is of an earlier call, and stays as it was" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert _found(recording, "robust") == ALL
+
+
+def test_a_function_that_fails_takes_no_other_along_either(recording: Path) -> None:
+    (recording.parent / "own.py").write_text("def mine(frame, calibration): return 1 / 0\n")
+    own = f"{recording.parent / 'own.py'}:mine"
+    done = nir_render(
+        "perceive", str(recording), "--estimator", own, "--estimator", "paper", cwd=recording.parent
+    )
+    assert done.returncode == 2
+    assert "ZeroDivisionError" in done.stderr
+    assert _found(recording, "paper") == ALL
+    assert not (recording / "detections.mine.jsonl").exists()
+
+
+def test_two_commands_of_one_name_are_refused() -> None:
+    with pytest.raises(InputError, match=r"another estimator is called 'a' too; write OTHER=cmd: "):
+        chosen_estimators([f"a=cmd: {sys.executable} x", f"a=cmd: {sys.executable} y"])
+
+
+def test_what_cannot_read_a_frame_by_itself_is_no_estimator_of_a_campaign(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("def sets(frames, calibrations, odometry): ...\n")
+    for reference, kind in (
+        (f"a=cmd: {sys.executable}", "is a command"),
+        (f"{tmp_path / 'own.py'}:sets", "sets of frames"),
+    ):
+        with pytest.raises(InputError, match=kind):
+            frame_estimators([reference])
+
+
+@pytest.mark.parametrize("limit", ["0", "-1", "nan", "inf"])
+def test_a_limit_that_is_none(recording: Path, limit: str) -> None:
+    done = nir_render("perceive", str(recording), "--time-limit", limit, cwd=recording)
+    assert done.returncode == 2
+    assert "wanted seconds above 0, such as 60" in done.stderr
