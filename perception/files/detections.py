@@ -28,7 +28,9 @@ DETECTION_ENTRIES = (
     Entry("saturated", "flag", "whether pixels of it clipped"),
     Entry("merged", "flag", "whether it does not look like one source"),
     Entry("ghost", "flag", "whether it is taken for a mirror image"),
-    Entry("range_m", "number", "distance from the camera's centre", 0.0, _MOST_M, null=_NO_CLAIM),
+    Entry(
+        "range_m", "number", "distance from the camera's centre", 0.0, _MOST_M, above=True, null=_NO_CLAIM
+    ),
     Entry("range_sigma_m", "number", "its standard deviation", 0.0, _MOST_M, null=_NO_CLAIM),
     Entry("bearing_body", "bearing", "unit vector from the camera's centre in body axes", -1e6, 1e6, size=3),
     Entry(
