@@ -46,16 +46,18 @@ from perception.files.measurements import (
     parse_measurement,
     parse_mirror,
 )
+from perception.files.pictures import Picture, encode_png16, read_picture
 from perception.files.ranges import encode_ranges, read_ranges
 from perception.files.recording import (
     FrameRecord,
-    encode_png16,
+    Recording,
     frame_record,
     parse_frame_record,
     read_calibrations,
     read_frame,
     read_frame_records,
     read_frames,
+    read_recording,
 )
 from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
@@ -79,9 +81,11 @@ __all__ = [
     "OwnEstimator",
     "OwnSetEstimator",
     "PaperRegression",
+    "Picture",
     "RailCalibration",
     "RangeConstantFit",
     "RawFrame",
+    "Recording",
     "RecordingError",
     "SetMeasurements",
     "calibrate_rail",
@@ -110,7 +114,9 @@ __all__ = [
     "read_frame",
     "read_frame_records",
     "read_frames",
+    "read_picture",
     "read_ranges",
+    "read_recording",
     "regress_paper_range_constant",
     "regress_range_constant",
     "warm_up",

@@ -344,6 +344,8 @@ def _vector(values: Any) -> tuple[float, float, float]:
     numbers = [_number(value) for value in values]
     if len(numbers) != 3:
         raise ValueError("wanted three numbers")
+    if abs(math.hypot(*numbers) - 1.0) > 1e-3:  # NaN, where there is no bearing, passes
+        raise ValueError("wanted a vector of length 1, or NaN in all its places")
     return numbers[0], numbers[1], numbers[2]
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from nir_render.command import regress, runs, scenes, stress
+from nir_render.command import recordings, regress, runs, scenes, stress
 from nir_render.command.compare import compare
 from nir_render.errors import InputError
 
@@ -48,6 +48,8 @@ for command in (
     *(scenes.new, scenes.validate, scenes.schema, scenes.doctor),
 ):
     app.command()(command)
+app.command("new-recording")(recordings.new_recording)
+app.command("import")(recordings.import_recording)
 app.add_typer(regress.app, name="regress")
 
 

@@ -158,12 +158,14 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
 
 
 def report(folder: FolderArgument, as_json: Json = False) -> None:
-    """Evaluate a run, and show it on a page that opens from disk: report.html."""
+    """Evaluate a run, and show it on a page that opens from disk: report.html; also one without truth."""
     from nir_render.command.console import print_json
     from nir_render.run.evaluate import evaluate_run
+    from nir_render.run.recording.report import report_recording
     from nir_render.run.report import report_run
 
-    page = report_run(folder, evaluate_run(folder))
+    has_truth = (folder / "truth.jsonl").is_file()
+    page = report_run(folder, evaluate_run(folder)) if has_truth else report_recording(folder)
     if as_json:
         print_json({"folder": str(folder), "report": str(page)})
     else:

@@ -1,13 +1,17 @@
 """The commands of scene files and of the machine that renders them: new, validate, schema, doctor."""
 
 import shlex
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nir_render.command.options import Json
 from nir_render.errors import InputError
+
+if TYPE_CHECKING:
+    from typing import Any
 
 
 def new(
@@ -52,17 +56,48 @@ def validate(
         raise InputError(*problems)
 
 
+class Format(StrEnum):
+    """What there is a schema of."""
+
+    SCENE = "scene"
+    CAMPAIGN = "campaign"
+    RECORDING = "recording"
+    CALIBRATION = "calibration"
+    FRAMES = "frames"
+    DETECTIONS = "detections"
+
+
 def schema(
-    campaign: Annotated[bool, typer.Option("--campaign", help="That of campaigns instead.")] = False,
+    of: Annotated[Format, typer.Argument(metavar="FORMAT", help=", ".join(Format))] = Format.SCENE,
+    campaign: Annotated[bool, typer.Option("--campaign", help="As FORMAT campaign.")] = False,
 ) -> None:
-    """Print the JSON Schema of scene files, for editors."""
+    """Print the JSON Schema of scene files, for editors, or of another format."""
     import json
 
-    if campaign:
-        from nir_render.stress.campaign import campaign_schema as written_schema
-    else:
-        from nir_render.scene.schema import scene_schema as written_schema
-    typer.echo(json.dumps(written_schema(), indent=2))
+    typer.echo(json.dumps(_schema_of(Format.CAMPAIGN if campaign else of), indent=2))
+
+
+def _schema_of(of: Format) -> "dict[str, Any]":
+    if of is Format.CAMPAIGN:
+        from nir_render.stress.campaign import campaign_schema
+
+        return campaign_schema()
+    if of is Format.RECORDING:
+        from nir_render.run.recording.document import recording_schema
+
+        return recording_schema()
+    if of is Format.SCENE:
+        from nir_render.scene.schema import scene_schema
+
+        return scene_schema()
+    from perception.files.schema import calibration_schema, detections_schema, frames_schema
+
+    by_name = {
+        Format.CALIBRATION: calibration_schema,
+        Format.FRAMES: frames_schema,
+        Format.DETECTIONS: detections_schema,
+    }
+    return by_name[of]()
 
 
 def doctor(as_json: Json = False) -> None:

@@ -14,7 +14,7 @@ from nir_render.evaluate.metrics import Evaluation, evaluate
 from nir_render.evaluate.sets import evaluate_sets
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds, parse_lines
-from nir_render.run.perceive import frame_keys, unknown_camera
+from nir_render.run.perceive import unknown_camera
 from nir_render.truth.lamps import LampTruth, parse_lamp
 from nir_render.truth.sources import SourceTruth, parse_truth
 from perception import (
@@ -25,9 +25,9 @@ from perception import (
     parse_detection,
     parse_measurement,
     parse_mirror,
-    read_calibrations,
     read_frame,
     read_frame_records,
+    read_recording,
 )
 from perception.rig.frame_sets import robot_of
 from perception.types import FrameKey
@@ -52,8 +52,9 @@ def evaluate_run(folder: Path) -> Evaluation:
     if not paths:
         raise InputError(f"{folder}: there are no detections; run 'nir-render perceive {folder}' first")
     try:
-        calibrations = read_calibrations(folder)
-        keys = frame_keys(folder)
+        recording = read_recording(folder)
+        calibrations = recording.calibrations
+        keys = [(record.camera, record.index) for record in recording.records]
         truth = parse_lines(truth_path, parse_truth)
         detections = {
             path.name.removeprefix("detections.").removesuffix(".jsonl"): parse_lines(path, parse_detection)

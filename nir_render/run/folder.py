@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from nir_render.errors import InputError
+from perception.files.fields import Place, RecordingError, first_of, parse_json
 
 MANIFEST = "manifest.json"
 CALIBRATION = "calibration.json"
@@ -134,24 +135,23 @@ def read_json(path: Path) -> Any:
 
 def read_lines(path: Path) -> list[Any]:
     """Read one JSON object per line; raise InputError where the file is missing or a line broken."""
-    return [record for _, record in _numbered_lines(path)]
-
-
-def _numbered_lines(path: Path) -> list[tuple[int, Any]]:
-    lines = _read(path).splitlines()
-    return [
-        (number, _parse(line, f"{path}:{number}")) for number, line in enumerate(lines, 1) if line.strip()
-    ]
+    return parse_lines(path, lambda record: record)
 
 
 def parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
-    """Parse a file of JSON lines; raise InputError with file and line where one is broken."""
-    items = []
-    for number, record in _numbered_lines(path):
+    """Parse a file of JSON lines; raise InputError with all that is wrong, by file and line."""
+    items: list[Item] = []
+    problems: list[str] = []
+    for number, line in enumerate(_read(path).split("\n"), 1):
+        if not line.strip():
+            continue
         try:
-            items.append(parse(record))
+            items.append(parse(parse_json(line, Place(""))))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{path}, line {number}: {error}") from None
+            told = getattr(error, "problems", (str(error),))
+            problems += [f"{path}, line {number}: {problem}" for problem in told]
+    if problems:
+        raise InputError("\n".join(first_of(problems)))
     return items
 
 
@@ -188,7 +188,7 @@ def disk_error(path: Path, error: OSError) -> InputError:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -197,9 +197,9 @@ def _read(path: Path) -> str:
 
 def _parse(text: str, name: str) -> Any:
     try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{name}: is not JSON ({error})") from None
+        return parse_json(text, Place(name))
+    except RecordingError as error:
+        raise InputError(str(error)) from None
 
 
 def _hashes(folder: Path) -> dict[str, str]:

@@ -21,6 +21,7 @@ from perception import (
     FrameRecord,
     OwnSetEstimator,
     RawFrame,
+    Recording,
     detect,
     detection_record,
     frame_sets,
@@ -29,9 +30,8 @@ from perception import (
     measure_set,
     measurement_record,
     mirror_record,
-    read_calibrations,
-    read_frame,
     read_frame_records,
+    read_recording,
 )
 from perception.command_estimator import LIMIT_S, is_command
 from perception.rig.frame_sets import robot_of
@@ -124,10 +124,9 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progre
     """
     started = time.perf_counter()
     try:
-        calibrations = read_calibrations(folder)
-        records = read_frame_records(folder)
-        frame_keys(folder)
-        found, failures = _read_all(folder, records, calibrations, estimators, progress)
+        recording = read_recording(folder)
+        records, calibrations = recording.records, recording.calibrations
+        found, failures = _read_all(recording, estimators, progress)
     except InputError:
         raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
@@ -149,13 +148,12 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progre
 
 
 def _read_all(
-    folder: Path,
-    records: Sequence[FrameRecord],
-    calibrations: Mapping[str, Calibration],
+    recording: Recording,
     estimators: Mapping[str, RunEstimator],
     progress: Progress,
 ) -> tuple[dict[str, Found], dict[str, str]]:
     """Return what each estimator found that came to the end, and what went wrong with the others."""
+    records, calibrations = recording.records, recording.calibrations
     found: dict[str, Found] = {}
     failures: dict[str, str] = {}
     sets = any(isinstance(estimator, OwnSetEstimator) for estimator in estimators.values())
@@ -184,11 +182,8 @@ def _read_all(
         for group in groups:
             if not found:
                 break
-            for record in group:
-                if record.camera not in calibrations:
-                    raise unknown_camera(folder, record.camera, calibrations)
-            frames = [read_frame(folder, record) for record in group]
-            files = [folder / record.file for record in group]
+            frames = [recording.frame(record) for record in group]
+            files = [recording.folder / record.file for record in group]
             for name in list(found):
                 attempt(name, partial(read, name, frames, files))
             done += len(group)

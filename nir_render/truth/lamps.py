@@ -4,6 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from nir_render.errors import InputError, shown
+
+_MOST_PX = 1e6
+
 Outline = tuple[tuple[float, float], ...]
 
 
@@ -32,15 +36,22 @@ def parse_lamp(record: Mapping[str, Any]) -> LampTruth:
 
     Raises
     ------
-    ValueError
-        A field is missing, or of another kind than it should be.
+    InputError
+        All fields that are missing, or of another kind than they should be.
     """
-    for name, kind in (("camera", str), ("index", int), ("lamp", str), ("outline_px", list)):
-        if not isinstance(record.get(name), kind):
-            raise ValueError(f"{name} is {record.get(name)!r}; wanted a {_KINDS[kind]}")
-    corners = record["outline_px"]
-    if len(corners) < 3 or not all(_is_corner(corner) for corner in corners):
-        raise ValueError("outline_px: wanted at least three corners [u, v], numbers in pixels")
+    if not isinstance(record, Mapping):
+        raise InputError(f"wanted an object with fields such as 'camera' and 'lamp', not {shown(record)}")
+    problems = [
+        f"{name} is {shown(record.get(name))}; wanted a {_KINDS[kind]}"
+        for name, kind in (("camera", str), ("index", int), ("lamp", str), ("outline_px", list))
+        if not isinstance(record.get(name), kind) or isinstance(record.get(name), bool)
+    ]
+    corners = record.get("outline_px")
+    if isinstance(corners, list) and (len(corners) < 3 or not all(map(_is_corner, corners))):
+        problems.append("outline_px: wanted at least three corners [u, v], numbers in pixels")
+    if problems:
+        raise InputError(*problems)
+    assert corners is not None
     outline = tuple((float(u_px), float(v_px)) for u_px, v_px in corners)
     return LampTruth(record["camera"], record["index"], record["lamp"], outline)
 
@@ -49,4 +60,8 @@ _KINDS = {str: "text", int: "whole number", list: "list"}
 
 
 def _is_corner(corner: Any) -> bool:
-    return isinstance(corner, list) and len(corner) == 2 and all(isinstance(at, int | float) for at in corner)
+    return isinstance(corner, list) and len(corner) == 2 and all(map(_is_place, corner))
+
+
+def _is_place(at: Any) -> bool:
+    return isinstance(at, int | float) and not isinstance(at, bool) and -_MOST_PX <= at <= _MOST_PX

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any
 
+from nir_render.errors import InputError, shown
+
 Vector = tuple[float, float, float]
 
 
@@ -65,12 +67,21 @@ class SourceTruth:
 
 
 _UNIT_SLACK = 1e-3  # of the length of a bearing
-_NOT_NEGATIVE = (0.0, math.inf)
+# Bounds are far beyond what any camera sees: what lies outside is a slip.
+_NOT_NEGATIVE = (0.0, 1e30)
+_MOST = 1e30
 _ELECTRONS = ("direct_e", "mirrored_e", "scattered_e", "background_e", "dark_e")
 _BOUNDS = {
-    **dict.fromkeys(("range_m", "peak_snr", "index", *_ELECTRONS), _NOT_NEGATIVE),
+    **dict.fromkeys(("peak_snr", *_ELECTRONS), _NOT_NEGATIVE),
+    "range_m": (0.0, 1e9),
+    "depth_z_m": (-1e9, 1e9),
+    "index": (0, 2**63 - 1),
+    "time_s": (-1e12, 1e12),
+    "saturated_px": (0, 2**53),
+    **dict.fromkeys(("u_px", "v_px"), (-1e6, 1e6)),
+    "flare_share": (0.0, 1e3),
     **dict.fromkeys(("visible_fraction", "on_fraction"), (0.0, 1.0)),
-    "gain": (1e-6, math.inf),
+    "gain": (1e-6, 1e6),
 }
 _VECTORS = ("bearing_camera", "bearing_body", "position_body_m")
 
@@ -80,23 +91,28 @@ def parse_truth(record: Mapping[str, Any]) -> SourceTruth:
 
     Raises
     ------
-    ValueError
-        A field is missing, unknown, or of another kind than it should be.
+    InputError
+        All fields that are missing, unknown, of another kind than they should be, or out of bounds.
     """
     if not isinstance(record, Mapping):
-        raise ValueError(f"wanted an object with fields such as 'camera' and 'index', not {record!r}")
+        raise InputError(f"wanted an object with fields such as 'camera' and 'index', not {shown(record)}")
+    problems = []
     if record.get("format", 1) != 1:
-        raise ValueError(f"format is {record['format']!r}; this program reads format 1")
+        problems.append(f"format is {shown(record['format'])}; this program reads format 1")
     given = {name: value for name, value in record.items() if name != "format"}
     known = {field.name: field for field in fields(SourceTruth)}
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise ValueError(f"there is no field {unknown[0]!r}; known: {', '.join(known)}")
+        problems.append(f"there is no field {shown(unknown[0])}; known: {', '.join(known)}")
     missing = [name for name, field in known.items() if field.default is MISSING and name not in given]
-    if missing:
-        raise ValueError(f"the field {missing[0]!r} is missing")
-    for name, value in given.items():
-        given[name] = _checked(name, str(known[name].type), value)
+    problems += [f"the field {name!r} is missing" for name in missing]
+    for name in given.keys() & known.keys():
+        try:
+            given[name] = _checked(name, str(known[name].type), given[name])
+        except ValueError as error:
+            problems.append(str(error))
+    if problems:
+        raise InputError(*problems)
     return SourceTruth(**given)
 
 
@@ -105,21 +121,24 @@ def _checked(name: str, kind: str, value: Any) -> Any:
     if value is None and "None" in kind:
         return value
     if name in _VECTORS:
-        numbers = isinstance(value, list | tuple) and all(isinstance(part, int | float) for part in value)
-        if not numbers or len(value) != 3 or not all(map(math.isfinite, value)):
-            raise ValueError(f"{name} is {value!r}; wanted a list of three finite numbers")
+        if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(_is_number, value)):
+            raise ValueError(f"{name} is {shown(value)}; wanted a list of three finite numbers")
         if name != "position_body_m" and abs(math.hypot(*value) - 1.0) > _UNIT_SLACK:
-            raise ValueError(f"{name} is {value!r}; wanted a vector of length 1")
+            raise ValueError(f"{name} is {shown(value)}; wanted a vector of length 1")
         return tuple(map(float, value))
     if "str" in kind:
-        if isinstance(value, str):
+        if isinstance(value, str) and value.isprintable():
             return value
-        raise ValueError(f"{name} is {value!r}; wanted a text")
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not number or ("int" in kind and not isinstance(value, int)):
+        raise ValueError(f"{name} is {shown(value)}; wanted a text of one line")
+    if not _is_number(value) or ("int" in kind and not isinstance(value, int)):
         wanted = "whole number" if "int" in kind else "finite number"
-        raise ValueError(f"{name} is {value!r}; wanted a {wanted}")
-    least, most = _BOUNDS.get(name, (-math.inf, math.inf))
+        raise ValueError(f"{name} is {shown(value)}; wanted a {wanted}")
+    least, most = _BOUNDS.get(name, (-_MOST, _MOST))
     if not least <= value <= most:
-        raise ValueError(f"{name} is {value!r}; wanted a number from {least:g} to {most:g}")
+        raise ValueError(f"{name} is {shown(value)}; wanted a number from {least:g} to {most:g}")
     return value if "int" in kind else float(value)
+
+
+def _is_number(value: Any) -> bool:
+    """Tell whether a value is a number that sums and squares of stay finite."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -_MOST <= value <= _MOST

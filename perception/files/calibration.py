@@ -7,56 +7,83 @@ be missing: the lens is then rectilinear; `dsnu_e` and `prnu` too: they are then
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from perception.files.fields import (
-    Place,
-    Reader,
-    check_format,
-    get,
-    integer,
-    not_negative,
-    number,
-    number_or_nan,
-    numbers,
-    positive,
-)
+from perception.files.entries import Entry, check_names, read_entries, read_entry
+from perception.files.fields import Faults, Place, RecordingError, check_format, get, shown
 from perception.model.lens import COEFFICIENTS
 from perception.types import Calibration
 
-_WHOLE = ("width_px", "height_px", "saturation_dn", "bit_depth")
-_POSITIVE = ("fx_px", "fy_px", "system_gain_dn_per_e", "psf_sigma_px", "wavelength_m")
-_REAL = (
-    "cx_px",
-    "cy_px",
-    "read_noise_e",
-    "black_level_dn",
-    "range_constant_dn_m2_per_s",
-    "range_constant_paper_dn_m2_per_s",
-    "source_radius_m",
-)
-_FIXED_PATTERN = ("dsnu_e", "prnu")
 _QUATERNION = "quaternion_body_camera_xyzw"
-_READERS: dict[str, Reader] = {
-    **dict.fromkeys(_WHOLE, integer),
-    **dict.fromkeys(_POSITIVE, positive),
-    **dict.fromkeys(_REAL, number),
-    **dict.fromkeys((*_FIXED_PATTERN, "read_noise_e", "source_radius_m"), not_negative),
-    "range_constant_paper_dn_m2_per_s": number_or_nan,
-}
-_NUMBERS = (*_WHOLE, *_POSITIVE, *_REAL, *_FIXED_PATTERN)
-_LISTS = (
-    _QUATERNION,
-    "position_body_m",
-    "response_angle_rad",
-    "response_relative",
-    "distortion",
-    "own_sources_body_m",
-)
+_MOST_DN = 65535.0
+_MOST_E = 1e6
+_MOST_CONSTANT = 1e30
+
+CALIBRATION_ENTRIES = (
+    Entry("width_px", "whole", "columns of a frame", 1, 65535, sigma=True),
+    Entry("height_px", "whole", "rows of a frame", 1, 65535, sigma=True),
+    Entry("saturation_dn", "whole", "a pixel at or above this count is clipped", 1, _MOST_DN, sigma=True),
+    Entry("bit_depth", "whole", "bits of a count: full scale is 2^bit_depth − 1", 1, 16, sigma=True),
+    Entry("fx_px", "number", "focal length in columns", 1e-3, 1e6, above=True, sigma=True),
+    Entry("fy_px", "number", "focal length in rows", 1e-3, 1e6, above=True, sigma=True),
+    Entry(
+        "system_gain_dn_per_e", "number", "counts per electron", 1e-9, _MOST_E, above=True, sigma=True
+    ),
+    Entry(
+        "psf_sigma_px", "number", "σ of the Gaussian point spread, without the pixel's own aperture",
+        1e-3, 1e3, sigma=True,
+    ),
+    Entry("wavelength_m", "number", "centre wavelength", 1e-7, 1e-4, sigma=True),
+    Entry("cx_px", "number", "column of the optical axis", -1e5, 1e5, sigma=True),
+    Entry("cy_px", "number", "row of the optical axis", -1e5, 1e5, sigma=True),
+    Entry("read_noise_e", "number", "σ of a dark pixel from frame to frame", 0.0, _MOST_E, sigma=True),
+    Entry("black_level_dn", "number", "mean count of a dark pixel", -_MOST_DN, _MOST_DN, sigma=True),
+    Entry(
+        "range_constant_dn_m2_per_s", "number",
+        "K of flux_dn = K · exposure · cos θ · response(θ) / range²", 1e-9, _MOST_CONSTANT,
+        above=True, sigma=True,
+    ),
+    Entry(
+        "range_constant_paper_dn_m2_per_s", "number", "K of the paper's mean grey value, its eq. 1",
+        -_MOST_CONSTANT, _MOST_CONSTANT, null="it is not known", default=math.nan, sigma=True,
+    ),
+    Entry("source_radius_m", "number", "radius of a source, a sphere", 0.0, 1e3, sigma=True),
+    Entry("dsnu_e", "number", "σ of the pixels' fixed offsets", 0.0, _MOST_E, default=0.0, sigma=True),
+    Entry("prnu", "number", "σ of the pixels' relative responses", 0.0, 1.0, default=0.0, sigma=True),
+    Entry(
+        _QUATERNION, "list", "unit quaternion from camera axes to body axes; its σ is an angle in radians",
+        -1e6, 1e6, size=4, sigma=True,
+    ),
+    Entry("position_body_m", "list", "the camera's centre in body axes", -1e6, 1e6, size=3, sigma=True),
+    Entry(
+        "response_angle_rad", "list", "field angles of the response, increasing from 0", 0.0, 3.2, sigma=True
+    ),
+    Entry(
+        "response_relative", "list",
+        "response there, relative to the axis: filter and vignetting, without the lens's cos θ", 0.0, 1e3,
+        sigma=True,
+    ),
+    Entry(
+        "lens_model", "choice", "how angles become pixels", choices=tuple(COEFFICIENTS), default="rectilinear"
+    ),
+    Entry(
+        "distortion", "list", "the model's coefficients in OpenCV's order; none of a rectilinear lens",
+        -1e9, 1e9, default=(), sigma=True,
+    ),
+    Entry(
+        "own_sources_body_m", "places", "where the robot's own sources sit, in body axes", -1e6, 1e6,
+        default=(), sigma=True,
+    ),
+)  # fmt: skip
+"""The fields of a camera in `calibration.json`."""
+
+_BY_NAME = {entry.name: entry for entry in CALIBRATION_ENTRIES}
+_NUMBERS = tuple(entry.name for entry in CALIBRATION_ENTRIES if entry.kind in ("number", "whole"))
+_SIGMA = Entry("sigma", "number", "", 0.0, 1e30)
 
 
 def calibration_document(calibrations: Iterable[Calibration]) -> dict[str, Any]:
@@ -97,7 +124,7 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     if math.isnan(calibration.range_constant_paper_dn_m2_per_s):
         record["range_constant_paper_dn_m2_per_s"] = None  # its detector found too little to calibrate with
     record[_QUATERNION] = Rotation.from_matrix(matrix).as_quat(canonical=True).tolist()
-    for name in ("position_body_m", "response_angle_rad", "response_relative", "own_sources_body_m"):
+    for name in _ARRAYS:
         record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
     record["lens_model"] = calibration.lens_model
     record["distortion"] = [float(number) for number in calibration.distortion]
@@ -128,76 +155,117 @@ def parse_calibration_document(
     Raises
     ------
     RecordingError
-        If a field is missing, of the wrong type, or contradicts another.
+        All fields that are missing, of the wrong type, out of bounds, or contradict another.
     """
-    place = Place(file)
-    check_format(document, place)
-    cameras = get(document, "cameras", place)
-    if not isinstance(cameras, dict):
-        raise place.error(f"is {cameras!r}", "Write an object of cameras by name", "cameras")
-    return {name: _calibration(name, cameras[name], place.within(f"cameras.{name}")) for name in cameras}
+    place, faults = Place(file), Faults()
+    with faults.kept():
+        check_format(document, place)
+    cameras: Any = {}
+    with faults.kept():
+        cameras = get(document, "cameras", place)
+        if not isinstance(cameras, dict):
+            cameras, found = {}, cameras
+            raise place.error(f"is {shown(found)}", "Write an object of cameras by name", "cameras")
+    calibrations = {}
+    for name, record in cameras.items():
+        with faults.kept():
+            calibrations[name] = _calibration(name, record, place.within(f"cameras.{name}"))
+    faults.raise_any()
+    return calibrations
 
 
 def _calibration(name: str, record: Any, place: Place) -> Calibration:
     from scipy.spatial.transform import Rotation
 
     if not isinstance(record, dict):
-        raise place.error(f"is {record!r}", "Write an object with the entries of one camera")
-    values, sigma = _split_sigmas(record, place)
-    quaternion = np.array(numbers(values, _QUATERNION, place, 4))
-    length = float(np.linalg.norm(quaternion))
-    if abs(length - 1.0) > 1e-6:
-        raise place.error(f"has length {length:.9g}", "Write a unit quaternion x, y, z, w", _QUATERNION)
-    angles = np.array(numbers(values, "response_angle_rad", place))
-    if angles[0] != 0.0 or np.any(np.diff(angles) <= 0.0):
-        raise place.error("does not increase from 0", "Sort the angles, the first is 0", "response_angle_rad")
-    response = np.array(numbers(values, "response_relative", place, len(angles)))
-    values = {**dict.fromkeys(_FIXED_PATTERN, 0.0), **values}
-    lens_model, distortion = _lens(values, place)
+        raise place.error(f"is {shown(record)}", "Write an object with the entries of one camera")
+    faults = Faults()
+    with faults.kept():
+        read_entry(name, _NAME, Place(place.file))
+    plain, sigma = _split_sigmas(record, place, faults)
+    values = read_entries(plain, _told_of(plain, record), place, faults)
+    for problem in _contradictions(values, place):
+        faults.problems += problem.problems
+    faults.raise_any()
+    quaternion = np.array(values.pop(_QUATERNION))
+    arrays: dict[str, Any] = {field: np.array(values.pop(field)) for field in _ARRAYS}
+    arrays["own_sources_body_m"] = arrays["own_sources_body_m"].reshape(-1, 3)
     return Calibration(
         camera=name,
         rotation_body_camera=Rotation.from_quat(quaternion).as_matrix(),
-        position_body_m=np.array(numbers(values, "position_body_m", place, 3)),
-        response_angle_rad=angles,
-        response_relative=response,
-        own_sources_body_m=_own_sources(values, place),
         sigma=sigma,
-        lens_model=lens_model,
-        distortion=distortion,
-        **{field: _READERS[field](values, field, place) for field in _NUMBERS},
+        distortion=tuple(values.pop("distortion", ())),
+        **arrays,
+        **values,
     )
 
 
-def _own_sources(values: Mapping[str, Any], place: Place) -> NDArray[np.float64]:
-    """Return where the robot's own sources sit; without, none."""
-    rows = values.get("own_sources_body_m", [])
-    if not isinstance(rows, list):
-        raise place.error(f"is {rows!r}", "Write a list of [x, y, z], in metres", "own_sources_body_m")
-    parts = {f"own_sources_body_m[{i}]": row for i, row in enumerate(rows)}
-    return np.array([numbers(parts, name, place, 3) for name in parts]).reshape(-1, 3)
+def _told_of(plain: Mapping[str, Any], record: Mapping[str, Any]) -> list[Entry]:
+    """Return the entries to read: all but those whose value is missing beside their σ."""
+    return [
+        entry
+        for entry in CALIBRATION_ENTRIES
+        if entry.name in plain or not isinstance(record.get(entry.name), dict)
+    ]
 
 
-def _lens(values: Mapping[str, Any], place: Place) -> tuple[str, tuple[float, ...]]:
-    """Return lens model and coefficients; without, rectilinear."""
-    model = values.get("lens_model", "rectilinear")
-    if model not in COEFFICIENTS:
-        raise place.error(f"is {model!r}", f"Known are {', '.join(COEFFICIENTS)}", "lens_model")
-    distortion = values.get("distortion", [])
-    if not isinstance(distortion, list) or len(distortion) not in COEFFICIENTS[model]:
-        wanted = " or ".join(str(count) for count in COEFFICIENTS[model])
-        problem = f"is {distortion!r}"
-        raise place.error(problem, f"A {model} lens takes {wanted} numbers in OpenCV's order", "distortion")
-    return model, tuple(numbers(values, "distortion", place)) if distortion else ()
+_NAME = Entry("cameras", "text", "")
+_ARRAYS = ("position_body_m", "response_angle_rad", "response_relative", "own_sources_body_m")
 
 
-def _split_sigmas(record: Mapping[str, Any], place: Place) -> tuple[dict[str, Any], dict[str, float]]:
+def _contradictions(values: Mapping[str, Any], place: Place) -> Iterator[RecordingError]:
+    """Yield what is wrong between values that are each right."""
+    if _QUATERNION in values:
+        length = math.hypot(*values[_QUATERNION])
+        if abs(length - 1.0) > 1e-6:
+            yield place.error(f"has length {length:.9g}", "Write a unit quaternion x, y, z, w", _QUATERNION)
+    angles = values.get("response_angle_rad")
+    if angles and (angles[0] != 0.0 or any(b <= a for a, b in pairwise(angles))):
+        remedy = "Sort the angles, the first is 0"
+        yield place.error("does not increase from 0", remedy, "response_angle_rad")
+    response = values.get("response_relative", angles)
+    if angles and response and len(response) != len(angles):
+        yield place.error(
+            f"has {len(response)} numbers", f"Write a list of {len(angles)} numbers, one for each angle",
+            "response_relative",
+        )  # fmt: skip
+    if "lens_model" in values and (coefficients := values.get("distortion", ())) is not None:
+        model = values["lens_model"]
+        if len(coefficients) not in COEFFICIENTS[model]:
+            counts = " or ".join(str(count) for count in COEFFICIENTS[model])
+            remedy = f"A {model} lens takes {counts} numbers in OpenCV's order"
+            yield place.error(f"is {shown(list(coefficients))}", remedy, "distortion")
+    if "saturation_dn" in values and "bit_depth" in values:
+        full_scale_dn = 2 ** values["bit_depth"] - 1
+        if values["saturation_dn"] > full_scale_dn:
+            yield place.error(
+                f"is {values['saturation_dn']}, beyond full scale, {full_scale_dn} DN at "
+                f"{values['bit_depth']} bits", f"Write {full_scale_dn} or less", "saturation_dn",
+            )  # fmt: skip
+    black_dn, saturation_dn = values.get("black_level_dn", -math.inf), values.get("saturation_dn", math.inf)
+    if black_dn >= saturation_dn:
+        problem = f"is {black_dn:g}, not below saturation_dn = {saturation_dn}"
+        yield place.error(problem, "Write the mean count of a frame taken in the dark", "black_level_dn")
+
+
+def _split_sigmas(
+    record: Mapping[str, Any], place: Place, faults: Faults
+) -> tuple[dict[str, Any], dict[str, float]]:
     """Take {"value": v, "sigma": s} apart."""
     values, sigma = dict(record), {}
-    for name in (*_NUMBERS, *_LISTS):
-        entry = record.get(name)
-        if not isinstance(entry, dict):
+    if values.get("distortion") == []:  # how a lens that has no coefficients is written
+        del values["distortion"]
+    for entry in CALIBRATION_ENTRIES:
+        given = record.get(entry.name)
+        if not entry.sigma or not isinstance(given, dict):
             continue
-        values[name] = get(entry, "value", place.within(name))
-        field = "rotation_body_camera" if name == _QUATERNION else name
-        sigma[field] = not_negative(entry, "sigma", place.within(name))
+        del values[entry.name]
+        inside = place.within(entry.name)
+        with faults.kept():
+            values[entry.name] = get(given, "value", inside)
+        with faults.kept():
+            field = "rotation_body_camera" if entry.name == _QUATERNION else entry.name
+            sigma[field] = read_entry(get(given, "sigma", inside), _SIGMA, inside)
+        with faults.kept():
+            check_names(given, ("value", "sigma"), inside)
     return values, sigma

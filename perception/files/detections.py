@@ -5,19 +5,44 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from perception.files.fields import (
-    Place,
-    Reader,
-    check_format,
-    flag,
-    get,
-    integer,
-    number,
-    number_or_nan,
-    read_fields,
-    text,
-)
+from perception.files.entries import MOST_INDEX, MOST_PX, MOST_TIME_S, Entry, read_record
+from perception.files.fields import Place
 from perception.types import Detection
+
+_NO_CLAIM = "no claim"
+_MOST_DN = 1e15
+_MOST_M = 1e9
+
+DETECTION_ENTRIES = (
+    Entry("camera", "text", "the camera, as in `frames.jsonl`"),
+    Entry("index", "whole", "the frame, as there", 0, MOST_INDEX),
+    Entry("time_s", "number", "start of the frame's exposure", -MOST_TIME_S, MOST_TIME_S),
+    Entry("u_px", "number", "place, to the right", -MOST_PX, MOST_PX),
+    Entry("v_px", "number", "place, downwards", -MOST_PX, MOST_PX),
+    Entry("u_sigma_px", "number", "its standard deviation", 0.0, MOST_PX, null=_NO_CLAIM),
+    Entry("v_sigma_px", "number", "its standard deviation", 0.0, MOST_PX, null=_NO_CLAIM),
+    Entry("flux_dn", "number", "integral above the background", -_MOST_DN, _MOST_DN, null=_NO_CLAIM),
+    Entry("mean_dn", "number", "mean grey value, black level included", -_MOST_DN, _MOST_DN, null=_NO_CLAIM),
+    Entry("background_dn", "number", "background there, as read", -_MOST_DN, _MOST_DN, null=_NO_CLAIM),
+    Entry("area_px", "whole", "pixels that it covers", 0, 2**53),
+    Entry("saturated", "flag", "whether pixels of it clipped"),
+    Entry("merged", "flag", "whether it does not look like one source"),
+    Entry("ghost", "flag", "whether it is taken for a mirror image"),
+    Entry(
+        "range_m", "number", "distance from the camera's centre", 0.0, _MOST_M, above=True, null=_NO_CLAIM
+    ),
+    Entry("range_sigma_m", "number", "its standard deviation", 0.0, _MOST_M, null=_NO_CLAIM),
+    Entry("bearing_body", "bearing", "unit vector from the camera's centre in body axes", -1e6, 1e6, size=3),
+    Entry(
+        "flux_sigma_dn", "number", "the flux's standard deviation", 0.0, _MOST_DN, null=_NO_CLAIM,
+        default=math.nan,
+    ),
+    Entry(
+        "range_sigma_common_m", "number", "the part of `range_sigma_m` that a source's measurements share",
+        0.0, _MOST_M, null=_NO_CLAIM, default=math.nan,
+    ),
+)  # fmt: skip
+"""The fields of a line of `detections.NAME.jsonl`; null says that no claim is made."""
 
 
 def detection_record(detection: Detection) -> dict[str, Any]:
@@ -36,9 +61,7 @@ def detection_record(detection: Detection) -> dict[str, Any]:
     }
 
 
-def parse_detection(
-    record: Mapping[str, Any], file: str = "detections.jsonl", line: int | None = None
-) -> Detection:
+def parse_detection(record: Mapping[str, Any], file: str = "", line: int | None = None) -> Detection:
     """Read one object of `detections.NAME.jsonl`.
 
     Parameters
@@ -51,32 +74,10 @@ def parse_detection(
     Raises
     ------
     RecordingError
-        If a field is missing or of the wrong type.
+        All that is missing, of the wrong type or out of bounds.
     """
-    place = Place(file, line)
-    check_format(record, place)
-    return Detection(**read_fields(Detection, {**_OPTIONAL, **record}, place, _READERS))
-
-
-def _bearing(record: Mapping[str, Any], field: str, place: Place) -> tuple[float, ...]:
-    bearing = get(record, field, place)
-    if not isinstance(bearing, list) or len(bearing) != 3:
-        raise place.error(f"is {bearing!r}", "Write a list of 3 numbers", field)
-    parts = {f"{field}[{i}]": value for i, value in enumerate(bearing)}
-    return tuple(number_or_nan(parts, name, place) for name in parts)
-
-
-_READERS: dict[Any, Reader] = {
-    str: text,
-    int: integer,
-    bool: flag,
-    float: number_or_nan,
-    "time_s": number,
-    "bearing_body": _bearing,
-}
-
-
-_OPTIONAL = {"flux_sigma_dn": None, "range_sigma_common_m": None}
+    values = read_record(record, DETECTION_ENTRIES, Place(file, line))
+    return Detection(**values)
 
 
 def _null_for_nan(name: str, value: float) -> float | None:

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.files.fields import (
-    Place,
+from perception.files.fields import Place, check_format, get, shown
+from perception.files.readers import (
     Reader,
-    check_format,
     flag,
-    get,
     integer,
     number,
     number_or_nan,
@@ -43,9 +41,7 @@ def measurement_record(measurement: Measurement) -> dict[str, Any]:
     return {name: _plain(name, value) for name, value in record.items()}
 
 
-def parse_measurement(
-    record: Mapping[str, Any], file: str = "measurements.jsonl", line: int | None = None
-) -> Measurement:
+def parse_measurement(record: Mapping[str, Any], file: str = "", line: int | None = None) -> Measurement:
     """Read one object of `measurements.NAME.jsonl`.
 
     Raises
@@ -65,7 +61,7 @@ def mirror_record(mirror: MirrorPlane, robot: str, time_s: float) -> dict[str, A
 
 
 def parse_mirror(
-    record: Mapping[str, Any], file: str = "mirrors.jsonl", line: int | None = None
+    record: Mapping[str, Any], file: str = "", line: int | None = None
 ) -> tuple[str, float, MirrorPlane]:
     """Read one object of `mirrors.NAME.jsonl`: whose it is, when, and the mirror.
 
@@ -101,7 +97,7 @@ def _matrix(size: int) -> Reader:
     def read(record: Mapping[str, Any], field: str, place: Place) -> NDArray[np.float64]:
         rows = get(record, field, place)
         if not isinstance(rows, list) or [len(row) for row in rows if isinstance(row, list)] != [size] * size:
-            raise place.error(f"is {rows!r}", f"Write {size} lists of {size} numbers", field)
+            raise place.error(f"is {shown(rows)}", f"Write {size} lists of {size} numbers", field)
         cells = [each for row in rows for each in row]
         flat = {f"{field}[{k // size}][{k % size}]": each for k, each in enumerate(cells)}
         return np.array([number_or_nan(flat, name, place) for name in flat]).reshape(size, size)
@@ -113,7 +109,7 @@ def _one_of(words: tuple[str, ...]) -> Reader:
     def read(record: Mapping[str, Any], field: str, place: Place) -> str:
         word = text(record, field, place)
         if word not in words:
-            raise place.error(f"is {word!r}", f"Write one of {', '.join(words)}", field)
+            raise place.error(f"is {shown(word)}", f"Write one of {', '.join(words)}", field)
         return word
 
     return read
@@ -122,14 +118,14 @@ def _one_of(words: tuple[str, ...]) -> Reader:
 def _cameras(record: Mapping[str, Any], field: str, place: Place) -> tuple[str, ...]:
     names = get(record, field, place)
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise place.error(f"is {names!r}", "Write a list of cameras' names", field)
+        raise place.error(f"is {shown(names)}", "Write a list of cameras' names", field)
     return tuple(names)
 
 
 def _detections(record: Mapping[str, Any], field: str, place: Place) -> tuple[tuple[str, int, int], ...]:
     rows = get(record, field, place)
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
-        raise place.error(f"is {rows!r}", "Write a list of [camera, index, number]", field)
+        raise place.error(f"is {shown(rows)}", "Write a list of [camera, index, number]", field)
     parts = [
         {"camera": row[0], "index": row[1], "number": row[2]} for row in rows
     ]  # each checked as fields of its own

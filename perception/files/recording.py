@@ -1,6 +1,7 @@
-"""Recorded frames: `frames.jsonl`, one JSON object per frame, beside raw 16-bit PNG files.
+"""Recorded frames: `frames.jsonl`, one JSON object per frame, beside pictures of raw counts.
 
-This module only encodes and parses; what writes files to disk safely lives elsewhere.
+A recording is read as a whole: what is wrong in its files, or between them, is said at once. This module only
+encodes and parses; what writes files to disk safely lives elsewhere.
 """
 
 from collections.abc import Iterator, Mapping
@@ -8,26 +9,30 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from perception.files.calibration import parse_calibration_document
-from perception.files.fields import (
-    Place,
-    Reader,
-    check_format,
-    integer,
-    number,
-    parse_object,
-    positive,
-    read_fields,
-    read_text,
-    text,
-)
-from perception.types import Calibration, RawFrame
+from perception.files.entries import MOST_INDEX, MOST_TIME_S, Entry, read_record
+from perception.files.fields import Faults, Place, RecordingError, parse_object, read_text, shown
+from perception.files.pictures import Picture, read_picture
+from perception.model.sensor import saturation_dn
+from perception.types import Calibration, FrameKey, RawFrame
 
 FRAMES_FILE = "frames.jsonl"
 CALIBRATION_FILE = "calibration.json"
+
+FRAME_ENTRIES = (
+    Entry("camera", "text", "name of the camera, `robot.camera`; calibration.json has the same"),
+    Entry("index", "whole", "number of the frame, once per camera", 0, MOST_INDEX),
+    Entry(
+        "time_s", "number", "start of the exposure of row 0; within a camera it never goes back",
+        -MOST_TIME_S, MOST_TIME_S,
+    ),
+    Entry("exposure_s", "number", "exposure time", 1e-12, 1e4, above=True),
+    Entry("line_time_s", "number", "delay from row to row; 0 of a global shutter", 0.0, 10.0),
+    Entry("gain", "number", "factor on the calibrated system gain; 1 as calibrated", 1e-6, 1e6, above=True),
+    Entry("black_level_dn", "number", "mean count of a dark pixel in this frame", -65535.0, 65535.0),
+    Entry("file", "text", "the picture, from the recording's folder, with forward slashes; once"),
+)  # fmt: skip
+"""The fields of a line of `frames.jsonl`."""
 
 
 @dataclass(frozen=True)
@@ -73,30 +78,26 @@ def parse_frame_record(
     Raises
     ------
     RecordingError
-        If a field is missing or of the wrong type, or the file leaves the recording's folder.
+        All fields that are missing, of the wrong type or out of bounds; a file that leaves the folder.
     """
     place = Place(file, line)
-    check_format(record, place)
-    return FrameRecord(**read_fields(FrameRecord, record, place, _READERS))
-
-
-def _path_within(record: Mapping[str, Any], field: str, place: Place) -> str:
-    path = text(record, field, place)
-    if PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts or "\\" in path or ":" in path:
-        raise place.error(
-            f"is {path!r}", "Write a path within the recording's folder, with forward slashes", field
+    faults = Faults()
+    values: dict[str, Any] = {}
+    with faults.kept():
+        values = read_record(record, FRAME_ENTRIES, place)
+    if isinstance(path := record.get("file"), str) and _leaves(path):
+        problem = place.error(
+            f"is {shown(path)}", "Write a path within the recording's folder, with forward slashes", "file"
         )
-    return path
+        faults.problems += problem.problems
+    faults.raise_any()
+    return FrameRecord(**values)
 
 
-_READERS: dict[Any, Reader] = {
-    str: text,
-    int: integer,
-    float: number,
-    "exposure_s": positive,
-    "gain": positive,
-    "file": _path_within,
-}
+def _leaves(path: str) -> bool:
+    """Tell whether a path may lead out of the recording's folder, here or on another system."""
+    pure = PurePosixPath(path)
+    return pure.is_absolute() or ".." in pure.parts or "\\" in path or ":" in path
 
 
 def read_frame_records(folder: str | Path) -> list[FrameRecord]:
@@ -105,14 +106,180 @@ def read_frame_records(folder: str | Path) -> list[FrameRecord]:
     Raises
     ------
     RecordingError
-        If the file is missing or a line is broken.
+        If the file is missing; else all lines that are broken, name a frame or a file that another one
+        names, or go back in time.
     """
-    path = Path(folder) / FRAMES_FILE
-    return [
-        parse_frame_record(parse_object(content, Place(str(path), line)), str(path), line)
-        for line, content in enumerate(read_text(path).splitlines(), start=1)
-        if content.strip()
-    ]
+    faults = Faults()
+    records = _right_records(Path(folder) / FRAMES_FILE, faults)
+    faults.raise_any()
+    return records
+
+
+def _right_records(path: Path, faults: Faults) -> list[FrameRecord]:
+    """Return the lines of `frames.jsonl` that are right by themselves."""
+    records: dict[int, FrameRecord] = {}
+    for line, content in enumerate(read_text(path).split("\n"), start=1):
+        if content.strip():
+            with faults.kept():
+                record = parse_object(content, Place(str(path), line))
+                records[line] = parse_frame_record(record, str(path), line)
+    for problem in _clashes(records, str(path)):
+        faults.problems += problem.problems
+    return list(records.values())
+
+
+def _clashes(records: Mapping[int, FrameRecord], file: str) -> Iterator[RecordingError]:
+    """Yield what is wrong between the lines."""
+    key_at: dict[FrameKey, int] = {}
+    file_at: dict[str, int] = {}
+    last: dict[str, tuple[int, float]] = {}
+    for line, record in records.items():
+        place, key = Place(file, line), (record.camera, record.index)
+        if key in key_at:
+            yield place.error(
+                f"frame {record.index} of {record.camera} stands in line {key_at[key]} already",
+                "Give each frame of a camera an index of its own", "index",
+            )  # fmt: skip
+        if (name := str(PurePosixPath(record.file))) in file_at:
+            yield place.error(
+                f"{shown(record.file)} stands in line {file_at[name]} already",
+                "Name each picture once",
+                "file",
+            )
+        before, time_s = last.get(record.camera, (line, record.time_s))
+        if record.time_s < time_s:
+            yield place.error(
+                f"is {record.time_s!r}, before the {time_s!r} of line {before}",
+                f"Sort the frames of {record.camera} by time, in seconds of one clock", "time_s",
+            )  # fmt: skip
+        key_at.setdefault(key, line)
+        file_at.setdefault(name, line)
+        last[record.camera] = line, record.time_s
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording whose files are right and fit together: its frames without pixels, its calibrations."""
+
+    folder: Path
+    records: tuple[FrameRecord, ...]
+    calibrations: Mapping[str, Calibration]
+
+    def frames(self) -> Iterator[RawFrame]:
+        """Read the frames one by one, in the order of `frames.jsonl`.
+
+        Raises
+        ------
+        RecordingError
+            At its frame, if a picture is damaged, or is none that its calibration describes.
+        """
+        return (self.frame(record) for record in self.records)
+
+    def frame(self, record: FrameRecord) -> RawFrame:
+        """Read one frame; errors as `frames`."""
+        path = self.folder / record.file
+        picture = read_picture(path)
+        check_picture(picture, self.calibrations[record.camera], record.gain, Place(str(path)))
+        return _raw_frame(record, picture)
+
+
+def read_recording(folder: str | Path) -> Recording:
+    """Read what a recording's folder holds, but for the pixels.
+
+    Raises
+    ------
+    RecordingError
+        All that is wrong in `frames.jsonl` and `calibration.json` and between them: cameras without
+        calibration, pictures that are not there, black levels beyond saturation.
+    """
+    folder, faults = Path(folder), Faults()
+    records: list[FrameRecord] = []
+    calibrations: dict[str, Calibration] | None = None
+    with faults.kept():
+        calibrations = read_calibrations(folder)
+    with faults.kept():
+        told = len(faults.problems)
+        records = _right_records(folder / FRAMES_FILE, faults)
+        if not records and len(faults.problems) == told:
+            raise Place(str(folder / FRAMES_FILE)).error("names no frame", "Write one line per frame")
+    for problem in _contradictions(folder, records, calibrations):
+        faults.problems += problem.problems
+    faults.raise_any()
+    return Recording(folder, tuple(records), calibrations or {})
+
+
+def _contradictions(
+    folder: Path, records: list[FrameRecord], calibrations: Mapping[str, Calibration] | None
+) -> Iterator[RecordingError]:
+    """Yield what is wrong between frames, calibrations and pictures."""
+    file = Place(str(folder / FRAMES_FILE))
+    for camera in dict.fromkeys(record.camera for record in records):
+        if calibrations is not None and camera not in calibrations:
+            yield Place(str(folder / CALIBRATION_FILE)).error(
+                f"knows no camera {camera!r}, which {FRAMES_FILE} names; known: "
+                f"{', '.join(calibrations) or 'none'}",
+                "Name the camera so, or calibrate it",
+            )
+    for record in records:
+        known = (calibrations or {}).get(record.camera)
+        if known is not None and record.black_level_dn >= saturation_dn(known, record.gain):
+            yield file.error(
+                f"frame {record.index} of {record.camera} has black_level_dn = {record.black_level_dn:g}, "
+                f"not below its saturation at {saturation_dn(known, record.gain)} DN",
+                "Write the mean count of a frame taken in the dark",
+            )
+    missing = [record.file for record in records if not (folder / record.file).is_file()]
+    if missing:
+        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        yield file.error(
+            f"names {', '.join(map(shown, missing[:3]))}{more}, which "
+            f"{'is' if len(missing) == 1 else 'are'} not there",
+            f"Put the PNG there, or remove it from {FRAMES_FILE}",
+        )
+
+
+def check_picture(picture: Picture, calibration: Calibration, gain: float, place: Place) -> None:
+    """Refuse a picture that its calibration does not describe.
+
+    Raises
+    ------
+    RecordingError
+        If its size is another, it holds fewer bits than the calibration says or counts beyond full scale, or
+        its compression costs more than the noise that the calibration has.
+    """
+    faults = Faults()
+    rows, columns = picture.data_dn.shape
+    if (rows, columns) != (calibration.height_px, calibration.width_px):
+        with faults.kept():
+            raise place.error(
+                f"has {columns} × {rows} pixels, its calibration says "
+                f"{calibration.width_px} × {calibration.height_px}",
+                "Take the calibration of this camera as it recorded: binned or cropped it is another",
+            )
+    full_scale_dn = 2**calibration.bit_depth - 1
+    if picture.bits < calibration.bit_depth:
+        with faults.kept():
+            raise place.error(
+                f"holds {picture.bits}-bit counts, its calibration says bit_depth = {calibration.bit_depth}",
+                f"Write bit_depth {picture.bits} and gain, black level and saturation in these counts",
+            )
+    elif (most_dn := int(picture.data_dn.max(initial=0))) > full_scale_dn:
+        with faults.kept():
+            raise place.error(
+                f"holds the count {most_dn}, beyond full scale, {full_scale_dn} DN at "
+                f"{calibration.bit_depth} bits",
+                "Write the bit depth of the counts as stored; some programs shift them up to 16 bits",
+            )
+    noise_dn = calibration.read_noise_e * calibration.system_gain_dn_per_e * gain
+    if picture.lossy_sigma_dn > 1.001 * noise_dn:
+        needed_e = picture.lossy_sigma_dn / (calibration.system_gain_dn_per_e * gain)
+        with faults.kept():
+            raise place.error(
+                f"is a JPEG whose compression alone has a σ of {picture.lossy_sigma_dn:.3g} DN in a pixel, "
+                f"and the calibrated read noise is {noise_dn:.3g} DN",
+                f"Add it in quadrature: read_noise_e is {needed_e:.3g} or more; or record PNG or TIFF",
+            )
+    faults.raise_any()
 
 
 def read_frame(folder: str | Path, record: FrameRecord) -> RawFrame:
@@ -121,10 +288,14 @@ def read_frame(folder: str | Path, record: FrameRecord) -> RawFrame:
     Raises
     ------
     RecordingError
-        If its PNG is missing, damaged, or not 16-bit grey.
+        If its picture is missing, damaged, or not grey counts of 8 to 16 bits.
     """
+    return _raw_frame(record, read_picture(Path(folder) / record.file))
+
+
+def _raw_frame(record: FrameRecord, picture: Picture) -> RawFrame:
     taken = {name: value for name, value in asdict(record).items() if name != "file"}
-    return RawFrame(data_dn=_read_png16(Path(folder) / record.file), **taken)
+    return RawFrame(data_dn=picture.data_dn, **taken)
 
 
 def read_frames(folder: str | Path) -> Iterator[RawFrame]:
@@ -133,17 +304,17 @@ def read_frames(folder: str | Path) -> Iterator[RawFrame]:
     Parameters
     ----------
     folder
-        A folder with `frames.jsonl` and the PNG files that it names.
+        A folder with `frames.jsonl` and the pictures that it names.
 
     Returns
     -------
     Iterator of RawFrame
-        A PNG is opened when its frame is asked for.
+        A picture is opened when its frame is asked for.
 
     Raises
     ------
     RecordingError
-        At once if `frames.jsonl` is missing or broken; at its frame for a PNG.
+        At once if `frames.jsonl` is missing or broken; at its frame for a picture.
     """
     records = read_frame_records(folder)
     return (read_frame(folder, record) for record in records)
@@ -159,47 +330,3 @@ def read_calibrations(folder: str | Path) -> dict[str, Calibration]:
     """
     path = Path(folder) / CALIBRATION_FILE
     return parse_calibration_document(parse_object(read_text(path), Place(str(path))), str(path))
-
-
-def encode_png16(data_dn: NDArray[np.uint16]) -> bytes:
-    """Encode counts as a 16-bit grey PNG, as they are: no scaling, no gamma.
-
-    Raises
-    ------
-    ValueError
-        If the counts are not uint16 of shape (rows, columns).
-    """
-    import cv2
-
-    if data_dn.dtype != np.uint16 or data_dn.ndim != 2 or data_dn.size == 0:
-        raise ValueError(
-            f"raw counts are uint16 of shape (rows, columns), not {data_dn.dtype} of shape {data_dn.shape}"
-        )
-    done, buffer = cv2.imencode(".png", data_dn)
-    if not done:
-        raise RuntimeError("OpenCV could not encode the frame as PNG")
-    return buffer.tobytes()
-
-
-def _read_png16(path: Path) -> NDArray[np.uint16]:
-    import cv2
-
-    place = Place(str(path))
-    mend = "Record raw counts as 16-bit grey PNG"
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise place.error(
-            f"the picture cannot be read ({error.strerror})",
-            f"Put the PNG there, or remove it from {FRAMES_FILE}",
-        ) from error
-    # OpenCV writes to standard error about what it cannot decode; the signature is told here instead.
-    if not content.startswith(b"\x89PNG\r\n\x1a\n"):
-        raise place.error("is no PNG", mend)
-    image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise place.error("is a damaged PNG", mend)
-    if image.dtype != np.uint16 or image.ndim != 2:
-        channels = 1 if image.ndim == 2 else image.shape[2]
-        raise place.error(f"holds {image.dtype} with {channels} channel(s), not 16-bit grey", mend)
-    return np.asarray(image, dtype=np.uint16)

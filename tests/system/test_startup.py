@@ -68,5 +68,7 @@ COMMANDS = [
     "validate",
     "schema",
     "doctor",
+    "new-recording",
+    "import",
     "regress",
 ]

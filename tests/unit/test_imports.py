@@ -17,7 +17,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.stress": ("page", "workers"),
     "nir_render.regress": ("stages",),
     "nir_render.compare": (),
-    "nir_render.run": (),
+    "nir_render.run": ("recording",),
     "nir_render.report": (),
     "nir_render.evaluate": (),
     "nir_render.simulation": (),

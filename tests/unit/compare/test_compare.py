@@ -155,7 +155,7 @@ def test_estimators_are_chosen_by_name(runs: tuple[Path, Path]) -> None:
         (["before", "other"], "give --estimators FIRST,SECOND"),
         (["before", "moved"], "not of the same truth: in 8 places a source stands elsewhere; r3.top in frame 0 of r1.front is 4.0000 m"),
         (["before", "later"], "have no frame in common (camera and index): frame 0 of r1.front, frame 1 of r1.front"),
-        (["before", "broken"], "line 1: is not JSON"),
+        (["before", "broken"], "line 1: broken JSON"),
     ],
 )  # fmt: skip
 def test_what_a_careless_user_is_told(

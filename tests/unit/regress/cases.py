@@ -79,7 +79,7 @@ def detection(**fields: Any) -> Detection:
     values: dict[str, Any] = {
         "camera": "r1.front", "index": 0, "time_s": 0.0, "u_px": 12.25, "v_px": 11.5, "u_sigma_px": 0.02, "v_sigma_px": 0.02,
         "flux_dn": 5000.0, "mean_dn": 700.0, "background_dn": 70.0, "area_px": 9, "saturated": False, "merged": False,
-        "ghost": False, "range_m": 1.5, "range_sigma_m": 0.01, "bearing_body": (0.99, 0.1, 0.0),
+        "ghost": False, "range_m": 1.5, "range_sigma_m": 0.01, "bearing_body": (0.995, 0.0998749, 0.0),
     }  # fmt: skip
     return Detection(**(values | fields))
 

@@ -63,7 +63,7 @@ def _set(key: str, value: object) -> Callable[[Path], None]:
         ("small/frames/r1.front/000000.png", _break, "is not what was written there"),
         ("small/reference.json", _set("seed", 4), "is not what was written there"),
         ("manifest.json", Path.unlink, "holds no references; make them: nir-render regress create"),
-        ("manifest.json", _break, "is not JSON"),
+        ("manifest.json", _break, "broken JSON"),
         ("manifest.json", _set("scenes", None), "names no scenes of a suite; give the folder of references with --refs"),
         ("manifest.json", _set("format", 2), "references of format 2, this version reads 1; remove the folder and make"),
     ],

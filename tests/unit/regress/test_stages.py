@@ -229,7 +229,7 @@ def test_electrons_of_light_that_the_scene_has_no_emitter_for(tmp_path: Path) ->
         ({"area_px": 10}, "fail"),
         ({"saturated": True}, "fail"),
         ({"range_m": math.nan}, "fail"),
-        ({"bearing_body": (0.99, 0.1005, 0.0)}, "fail"),
+        ({"bearing_body": (0.995, 0.1003774, 0.0)}, "fail"),
     ],
 )
 def test_detections(change: dict[str, float], verdict: str) -> None:

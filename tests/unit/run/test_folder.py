@@ -108,7 +108,7 @@ def test_not_a_number_is_never_written_as_json(tmp_path: Path) -> None:
 
 def test_broken_lines_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.jsonl").write_text(json.dumps({"a": 1}) + "\n\n{broken\n")
-    with pytest.raises(InputError, match=r"a\.jsonl:3: is not JSON"):
+    with pytest.raises(InputError, match=r"a\.jsonl, line 3: broken JSON"):
         read_lines(tmp_path / "a.jsonl")
     with pytest.raises(InputError, match="there is no such file"):
         read_json(tmp_path / "b.json")

@@ -89,7 +89,7 @@ def test_layout() -> None:
     ("field", "value", "text"),
     [
         ("fx_px", None, "the field is missing"),
-        ("fx_px", -1.0, "above 0"),
+        ("fx_px", -1.0, "above 0.001"),
         ("fx_px", {"value": 480.0}, "sigma"),
         ("fx_px", {"value": 480.0, "sigma": -1.0}, "0 or more"),
         ("fx_px", "480", "finite number"),
