@@ -129,7 +129,8 @@ def _sources(
     joined: list[SetScore] = []
     for row in rows:
         position_m = position_body_m(row, calibrations[row.camera])
-        counts = countable(row, calibrations[row.camera])
+        # Of a mirror image it is whether a source there would count.
+        counts = countable(replace(row, ghost_of=None), calibrations[row.camera])
         for k, other in enumerate(joined):
             same = (row.robot, row.source, row.ghost_of) == (
                 other.truth.robot,
@@ -223,6 +224,7 @@ def _numbers(scores: Sequence[SetScore], name: str, splits: int, alarms: int, se
         "set_robots_called_ghosts": len(found) - len(kept),
         "set_split": splits,
         "set_false_alarms_per_set": alarms / sets if sets else None,
+        "set_ghosts_visible": sum(score.countable for score in scores if score.is_ghost),
         "set_ghosts_found": len(images),
         "set_ghosts_told": images.count("yes"),
         "set_position_rmse_m": _rms(off_m),

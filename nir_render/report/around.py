@@ -54,7 +54,7 @@ def _numbers(summary: Mapping[str, Mapping[str, Any]]) -> Table:
         rows.append([
             name, share(numbers["set_recall"]), str(numbers["set_split"]),
             "–" if alarms is None else f"{alarms:.3f}",
-            f"{numbers['set_ghosts_told']} of {numbers['set_ghosts_found']}",
+            f"{numbers['set_ghosts_told']} of {numbers['set_ghosts_visible']}",
             str(numbers["set_robots_called_ghosts"]), metres(numbers["set_position_rmse_m"]),
             metres(numbers["set_range_rmse_m"]), "–" if nees is None else f"{nees:.2f}",
         ])  # fmt: skip
@@ -73,7 +73,7 @@ def _picture(around: SetEvaluation) -> Drawing | None:
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(7.4)
         axes = figure.subplots()
-        reach_m = _MARGIN * max(float(np.abs(score.position_body_m[:2]).max()) for score in scores)
+        reach_m = _MARGIN * max(0.5, *(float(np.abs(score.position_body_m[:2]).max()) for score in scores))
         for name in names:
             for _, plane in (each for each in around.mirrors.get(name, ()) if each[0] == number):
                 _draw_mirror(axes, plane, reach_m, name)

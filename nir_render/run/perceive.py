@@ -1,5 +1,6 @@
 """The stage `perceive`: the frames of any folder become detections, by one or several estimators."""
 
+import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -231,16 +232,24 @@ def _measure_sets(
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
 ) -> None:
-    """Write what each robot's cameras measure together, set by set, and the mirrors that show in it."""
+    """Write what each robot's cameras measure together, set by set, and the mirrors and the fog in it."""
     of_frame = {(record.camera, record.index): hits for record, hits in zip(records, detections, strict=True)}
-    measurements, mirrors = [], []
+    measurements, mirrors, fog = [], [], []
     for frames in frame_sets(records):
         seen = measure_set(frames, [of_frame[frame.camera, frame.index] for frame in frames], calibrations)
         measurements += [measurement_record(each) for each in seen.measurements]
         robot, time_s = robot_of(frames[0].camera), frames[0].time_s
         mirrors += [mirror_record(plane, robot, time_s) for plane in seen.planes]
+        if math.isfinite(seen.extinction_per_m):
+            told = {
+                "extinction_per_m": seen.extinction_per_m,
+                "extinction_sigma_per_m": seen.extinction_sigma_per_m,
+            }
+            fog.append({"format": 1, "robot": robot, "time_s": time_s, **told})
     run_folder.write_lines(folder / f"measurements.{name}.jsonl", measurements)
     run_folder.write_lines(folder / f"mirrors.{name}.jsonl", mirrors)
+    if fog:
+        run_folder.write_lines(folder / f"fog.{name}.jsonl", fog)
 
 
 def frame_keys(folder: Path) -> list[FrameKey]:

@@ -1,7 +1,7 @@
 """What perception may know about a camera of a scene: its calibration, exact.
 
 The range constants are those of the sources of the other robots (of its own, where there are no others);
-where these differ, their mean, with their spread as σ.
+where these differ, their mean, with their spread as σ. Of fog it says that there may be some, not how much.
 """
 
 import math
@@ -27,6 +27,9 @@ from perception.estimators import detect
 from perception.paper import regress_paper_range_constant
 from perception.types import Calibration, RawFrame
 
+FOG_SIGMA_PER_M = 0.05
+"""What a robot knows of fog where there is some: not how thick it is. 0.05 /m is a visibility of 78 m."""
+
 _KEPT = 64
 _RAIL_M = tuple(float(range_m) for range_m in range(1, 11))
 _RAIL_PEAK = 0.8  # of full scale, at the nearest range: as bright as one would dare
@@ -47,7 +50,11 @@ def calibration(world: Scene | Snapshot, camera: str, progress: Progress | None 
     for source in sources:
         flare_spread(device, source, progress)
     known = _of_devices(camera, device, sources)
-    return replace(known, sigma=dict(known.sigma), own_sources_body_m=_own_sources_body_m(world, camera))
+    snapshot = world.at(0.0) if isinstance(world, Scene) else world
+    sigma = dict(known.sigma)
+    if snapshot.fog is not None and snapshot.fog.extinction_per_m > 0.0:
+        sigma["extinction_per_m"] = FOG_SIGMA_PER_M
+    return replace(known, sigma=sigma, own_sources_body_m=_own_sources_body_m(snapshot, camera))
 
 
 def calibration_without_rail(world: Scene | Snapshot, camera: str) -> Calibration:
@@ -71,9 +78,8 @@ def _devices(world: Scene | Snapshot, camera: str) -> tuple[Camera, tuple[Source
     return device, tuple(sources)
 
 
-def _own_sources_body_m(world: Scene | Snapshot, camera: str) -> NDArray[np.float64]:
+def _own_sources_body_m(snapshot: Snapshot, camera: str) -> NDArray[np.float64]:
     """Return where the observer's own sources sit on its body, shape (n, 3)."""
-    snapshot = world.at(0.0) if isinstance(world, Scene) else world
     own = camera.partition(".")[0] + "."
     places = [each.source.position_m for name, each in snapshot.sources.items() if name.startswith(own)]
     return np.array(places, dtype=np.float64).reshape(-1, 3)

@@ -75,6 +75,10 @@ CALIBRATION_ENTRIES = (
         -1e9, 1e9, default=(), sigma=True,
     ),
     Entry(
+        "extinction_per_m", "number", "of the fog; 0 is clear air, with a σ where it is not known", 0.0, 1e3,
+        default=0.0, sigma=True,
+    ),
+    Entry(
         "own_sources_body_m", "places", "where the robot's own sources sit, in body axes", -1e6, 1e6,
         default=(), sigma=True,
     ),

@@ -41,6 +41,14 @@ DETECTION_ENTRIES = (
         "range_sigma_common_m", "number", "the part of `range_sigma_m` that a source's measurements share",
         0.0, _MOST_M, null=_NO_CLAIM, default=math.nan,
     ),
+    Entry(
+        "range_by_size_m", "number", "what size alone says of the range, where fog is not excluded",
+        0.0, _MOST_M, null=_NO_CLAIM, default=math.nan,
+    ),
+    Entry(
+        "range_by_size_sigma_m", "number", "its standard deviation", 0.0, _MOST_M, null=_NO_CLAIM,
+        default=math.nan,
+    ),
 )  # fmt: skip
 """The fields of a line of `detections.NAME.jsonl`; null says that no claim is made."""
 

@@ -26,6 +26,7 @@ from perception.files.readers import (
 from perception.types import Measurement, MirrorPlane
 
 _GHOST = ("no", "possible", "yes")
+_UNIT_SLACK = 1e-3
 _KINDS = ("constant", "surface", "pane")
 
 
@@ -51,7 +52,19 @@ def parse_measurement(record: Mapping[str, Any], file: str = "", line: int | Non
     """
     place = Place(file, line)
     check_format(record, place)
-    return Measurement(**read_fields(Measurement, record, place, _OF_MEASUREMENT))
+    measurement = Measurement(**read_fields(Measurement, record, place, _OF_MEASUREMENT))
+    if not measurement.detections:
+        raise place.error("names no detection", "Write those that it is made of", "detections")
+    if not 0.0 <= measurement.ghost_probability <= 1.0:
+        raise place.error("is no probability", "Write a number from 0 to 1", "ghost_probability")
+    if measurement.range_m <= 0.0:
+        raise place.error("is not above 0", "Write a range in metres, or null", "range_m")
+    if abs(math.hypot(*measurement.bearing_body) - 1.0) > _UNIT_SLACK:
+        raise place.error("is no unit vector", "Write a vector of length 1", "bearing_body")
+    finite = np.isfinite(measurement.covariance).all()
+    if finite and not (np.linalg.eigvalsh(measurement.covariance) > 0.0).all():
+        raise place.error("is no covariance", "Write a positive definite matrix, or nulls", "covariance")
+    return measurement
 
 
 def mirror_record(mirror: MirrorPlane, robot: str, time_s: float) -> dict[str, Any]:

@@ -1,11 +1,12 @@
 """Which frames of a recording belong together: those that a robot's cameras took within half a period."""
 
-import math
 from collections import defaultdict
 from collections.abc import Iterable
 from itertools import pairwise
 from statistics import median
 from typing import Protocol, TypeVar
+
+_PERIOD_S = 0.1
 
 
 class Timed(Protocol):
@@ -36,7 +37,7 @@ class Exposed(Timed, Protocol):
         """Factor on the calibrated system gain."""
 
 
-Frame = TypeVar("Frame", bound=Timed)
+Frame = TypeVar("Frame", bound=Exposed)
 
 
 def robot_of(camera: str) -> str:
@@ -50,6 +51,8 @@ def robot_of(camera: str) -> str:
 
 def frame_sets(frames: Iterable[Frame], period_s: float | None = None) -> list[list[Frame]]:
     """Divide frames into sets: those of one robot that began within half a period of the set's first.
+
+    A camera's second frame of one exposure opens a set of its own.
 
     Parameters
     ----------
@@ -81,14 +84,17 @@ def _of_one_robot(frames: list[Frame], period_s: float | None) -> list[list[Fram
     half_s = 0.5 * (_period_s(frames) if period_s is None else period_s)
     sets: list[list[Frame]] = []
     for frame in sorted(frames, key=lambda each: each.time_s):
-        if not sets or frame.time_s - sets[-1][0].time_s > half_s:
+        again = bool(sets) and any(
+            (frame.camera, frame.exposure_s) == (other.camera, other.exposure_s) for other in sets[-1]
+        )
+        if not sets or again or frame.time_s - sets[-1][0].time_s > half_s:
             sets.append([])
         sets[-1].append(frame)
     return sets
 
 
 def _period_s(frames: Iterable[Frame]) -> float:
-    """Return the median interval between frames of one camera; infinite where none has two."""
+    """Return the median interval between frames of one camera; a tenth of a second where none has two."""
     times: dict[str, list[float]] = defaultdict(list)
     for frame in frames:
         times[frame.camera].append(frame.time_s)
@@ -98,4 +104,4 @@ def _period_s(frames: Iterable[Frame]) -> float:
         for sooner, later in pairwise(own)
         if later > sooner
     ]
-    return median(intervals_s) if intervals_s else math.inf
+    return median(intervals_s) if intervals_s else _PERIOD_S

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.rig.frame_sets import robot_of
-from perception.rig.rays import chi2_of_pairs, placed
+from perception.rig.rays import Rays, chi2_of_pairs, placed
 from perception.rig.sightings import Sightings
 from perception.types import Measurement, bearing_axes
 
@@ -66,64 +66,127 @@ def associated(sightings: Sightings) -> list[Group]:
     return groups
 
 
-def fused(sightings: Sightings, groups: Sequence[Group]) -> list[Measurement]:
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """A measurement, and what the search for mirrors must know beside it.
+
+    Attributes
+    ----------
+    measurement
+        Of a source.
+    seems_m
+        How far it seems by flux, from the measurement's origin: of a mirror image that is not where it is.
+    noise, common
+        Standard deviations of the logarithm of that.
+    moved_m
+        By how much a flux that is wrong by its σ moves the place, shape (3,).
+    noise_m2
+        Covariance of the place by all else, shape (3, 3).
+    """
+
+    measurement: Measurement
+    seems_m: float
+    noise: float
+    common: float
+    moved_m: Array
+    noise_m2: Array
+
+
+def fused(sightings: Sightings, groups: Sequence[Group]) -> list[Joined]:
     """Return the measurement of each source from its sightings.
 
     Maximum likelihood of its place: bearings by their own covariance, logarithms of ranges by their noise and
     one error that all of them share. A sighting at another time than the mean counts less by how far the
-    source may have moved. Where ranges do not agree with where the rays meet, the most precise sighting alone
-    says where it seems to be.
+    source may have moved. Of several exposures of one camera the most precise counts, and what claims no σ
+    only where nothing does. Where ranges do not agree with where the rays meet, the most precise sighting
+    alone says where it seems to be.
     """
     return [_fused(sightings, group) for group in groups]
 
 
-def _fused(sightings: Sightings, group: Group) -> Measurement:
+def _fused(sightings: Sightings, group: Group) -> Joined:
     rays, members = sightings.rays, group.members
-    if len(members) == 1 or not group.ranges_agree:
-        best = group.best(rays.noise)
+    used = [k for k in members if sightings.claimed[k]] or list(members)
+    best = Group(tuple(used)).best(rays.noise)
+    by_camera: dict[str, int] = {}
+    for k in sorted(used, key=rays.noise.__getitem__):
+        by_camera.setdefault(sightings.keys[k][0], k)
+    if len(by_camera) == 1 or not group.ranges_agree:
+        used = [best]
+        place = _alone(rays, best)
         time_s = float(rays.time_s[best])
-        origin_m, bearing, range_m, covariance, common = _alone(sightings, best)
     else:
-        rows = np.array(sorted(members, key=rays.noise.__getitem__))
+        used = list(by_camera.values())
+        rows = np.array(used)
         weight = 1.0 / np.trace(rays.angular_rad2[rows], axis1=1, axis2=2)
         time_s = float(weight @ rays.time_s[rows] / weight.sum())
-        origin_m, bearing, range_m, covariance, common = _together(sightings, rows, time_s)
+        place = _together(rays, rows, time_s)
     flagged = all(sightings.ghost[k] for k in members)
-    claimed = all(sightings.claimed[k] for k in members)
-    return Measurement(
+    claimed = bool(sightings.claimed[best])
+    measurement = Measurement(
         robot=robot_of(sightings.keys[members[0]][0]),
         time_s=time_s,
         cameras=tuple(dict.fromkeys(sightings.keys[k][0] for k in members)),
         detections=tuple(sightings.keys[k] for k in members),
-        origin_body_m=_vector(origin_m),
-        bearing_body=_vector(bearing),
-        range_m=range_m,
-        covariance=covariance if claimed else np.full((3, 3), math.nan),
-        range_sigma_common_m=common * range_m if claimed else math.nan,
-        saturated=any(sightings.saturated[k] for k in members),
-        merged=any(sightings.merged[k] for k in members),
+        origin_body_m=_vector(place.origin_m),
+        bearing_body=_vector(place.bearing),
+        range_m=place.range_m,
+        covariance=place.covariance if claimed else np.full((3, 3), math.nan),
+        range_sigma_common_m=abs(float(place.moved_m @ place.bearing)) if claimed else math.nan,
+        saturated=all(sightings.saturated[k] for k in used),
+        merged=any(sightings.merged[k] for k in used),
         ghost="yes" if flagged else "no",
         ghost_probability=float(flagged),
     )
+    seems_m = float(rays.range_m[best])
+    at_origin_m = rays.origin_m[best] + seems_m * rays.axes[best, 2] - place.origin_m
+    return Joined(
+        measurement=measurement,
+        seems_m=float(np.linalg.norm(at_origin_m)),
+        noise=float(rays.noise[best]),
+        common=float(rays.common[best]),
+        moved_m=place.moved_m,
+        noise_m2=place.noise_m2,
+    )
 
 
-def _alone(sightings: Sightings, index: int) -> tuple[Array, Array, float, Array, float]:
-    rays = sightings.rays
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a source is, as in `Measurement` and `Joined`."""
+
+    origin_m: Array
+    bearing: Array
+    range_m: float
+    covariance: Array
+    moved_m: Array
+    noise_m2: Array
+
+
+def _alone(rays: Rays, index: int) -> _Place:
     range_m, common = float(rays.range_m[index]), float(rays.common[index])
-    covariance = np.zeros((3, 3))
-    covariance[:2, :2] = rays.angular_rad2[index]
+    covariance, noise = np.zeros((3, 3)), np.zeros((3, 3))
+    covariance[:2, :2] = noise[:2, :2] = rays.angular_rad2[index]
+    noise[2, 2] = rays.noise[index] ** 2
     covariance[2, 2] = range_m**2 * (rays.noise[index] ** 2 + common**2)
     if math.isnan(range_m):
         covariance[2, :] = covariance[:, 2] = math.nan
-    return rays.origin_m[index], rays.axes[index, 2], range_m, covariance, common
+    axes = rays.axes[index]
+    return _Place(
+        origin_m=rays.origin_m[index],
+        bearing=axes[2],
+        range_m=range_m,
+        covariance=covariance,
+        moved_m=common * range_m * axes[2],
+        noise_m2=range_m**2 * axes.T @ noise @ axes,
+    )
 
 
-def _together(
-    sightings: Sightings, rows: NDArray[np.int64], time_s: float
-) -> tuple[Array, Array, float, Array, float]:
+def _together(rays: Rays, rows: NDArray[np.int64], time_s: float) -> _Place:
     """Fuse several; a range that is still open to more than 30 % is none."""
-    rays = sightings.rays
-    place_m, covariance_m2 = placed(rays, rows, time_s, SPEED_SIGMA_M_PER_S)
+    place_m, of_all = placed(rays, rows, time_s, SPEED_SIGMA_M_PER_S)
+    covariance_m2 = of_all[:3, :3]
+    # A fit with a prior of variance 1 answers an error a of what it assumed by −C a.
+    moved_m = -of_all[:3, 3]
     origin_m = rays.origin_m[rows].mean(axis=0)
     range_m = float(np.linalg.norm(place_m - origin_m))
     bearing = (place_m - origin_m) / range_m
@@ -131,9 +194,8 @@ def _together(
     covariance = turn @ covariance_m2 @ turn.T
     if not math.sqrt(covariance[2, 2]) < _KNOWN_RANGE * range_m:
         covariance[2, :] = covariance[:, 2] = range_m = math.nan
-        return origin_m, bearing, range_m, covariance, 0.0
-    weight = 1.0 / rays.noise[rows] ** 2
-    return origin_m, bearing, range_m, covariance, float(weight @ rays.common[rows] / weight.sum())
+    noise_m2 = covariance_m2 - np.outer(moved_m, moved_m)
+    return _Place(origin_m, bearing, range_m, covariance, moved_m, noise_m2)
 
 
 def _vector(values: Array) -> tuple[float, float, float]:

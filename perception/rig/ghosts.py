@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.rig.fusion import Joined
 from perception.rig.mirror_model import (
     CONSTANT,
     PANE,
@@ -36,16 +37,13 @@ KINDS: tuple[Literal["constant", "surface", "pane"], ...] = ("constant", "surfac
 MIRROR_PROBABILITY = 0.1
 """That a set shows a flat mirror at all, before it is looked at."""
 
-SYMMETRY_PROBABILITY = 0.01
+SYMMETRY_PROBABILITY = 0.03
 """That robots stand in a formation that is its own mirror image, …"""
 
-FORMATION_SIGMAS_M = (0.0, 0.01, 0.03)
+FORMATION_SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.04)
 """… to one of these."""
 
-SEEN_PROBABILITY = 0.5
-"""That a robot before a mirror has its image in it: mirrors have edges, and things stand before them."""
-
-YES, POSSIBLE = 0.98, 0.01
+YES, POSSIBLE = 0.98, 0.005
 """Probabilities of a ghost from which a measurement is called one, or possibly one."""
 
 LEAST_PLANE_DISTANCE_M, MOST_PLANE_DISTANCE_M = 0.05, 20.0
@@ -56,8 +54,10 @@ INDEX_PRIOR, INDEX_SIGMA = 1.5, 0.08
 
 _GATE_CHI2 = 25.0
 _MOST_FLARES = 40
-_MOST_SEEDS, _MOST_TRIED = 2000, 6
+_MOST_SEEDS, _MOST_TRIED = 4000, 12
 _CLEAR = 10.0
+_LOG_YES = math.log(YES / (1.0 - YES))
+_UNCLAIMED_RAD = 1e-3
 _MOST_PAIRS_OF_PAIRS = 40_000
 _MOST_PLANES = 4
 _SEED_INDICES = (1.4, 1.45, 1.5, 1.55, 1.6)
@@ -81,14 +81,14 @@ class _Found:
 
 
 def told_ghosts(
-    measurements: Sequence[Measurement], own_sources_body_m: Array, planes: Sequence[MirrorPlane] = ()
+    joined: Sequence[Joined], own_sources_body_m: Array, planes: Sequence[MirrorPlane] = ()
 ) -> tuple[tuple[Measurement, ...], tuple[MirrorPlane, ...]]:
     """Tell mirror images from robots.
 
     Parameters
     ----------
-    measurements
-        Of one set.
+    joined
+        The measurements of one set.
     own_sources_body_m
         Where the observer's own sources sit, shape (n, 3): their images tell most.
     planes
@@ -99,30 +99,41 @@ def told_ghosts(
     -------
     The measurements with `ghost` and its probability, and the mirrors.
     """
+    measurements = [each.measurement for each in joined]
     usable = [k for k, each in enumerate(measurements) if each.ghost == "no" and each.range_m > 0.0]
-    usable = sorted(usable, key=lambda k: measurements[k].range_m)[:_MOST_FLARES]
+    usable = [k for k in usable if joined[k].seems_m > 0.0]
+    usable = sorted(usable, key=lambda k: joined[k].seems_m)
     probability = np.zeros(len(measurements))
     if not usable or len(usable) + len(own_sources_body_m) < 2:
         return tuple(measurements), ()
-    flares = _flares_of([measurements[k] for k in usable], own_sources_body_m)
+    flares = _flares_of([joined[k] for k in usable], own_sources_body_m)
     log_chance = _log_chance(flares, len(usable))
-    robots = np.arange(len(flares.place_m))
-    images = np.arange(len(usable))
+    # The search is among the nearest; what it finds tells the others, too.
+    searched = min(len(usable), _MOST_FLARES)
+    own = np.arange(len(usable), len(flares.place_m))
+    robots, images = np.concatenate([np.arange(searched), own]), np.arange(searched)
     found: list[_Found] = []
     known = list(planes)
     while len(found) < _MOST_PLANES and len(images):
         best = _best_plane(flares, robots, images, log_chance, known)
         if best is None:
             break
-        own = 1.0 / (1.0 + math.exp(-min(best.log_odds, 700.0)))
-        of_images = probability[[usable[j] for j in best.images]]
-        probability[[usable[j] for j in best.images]] = np.maximum(of_images, own)
-        if own < YES:
+        odds = 1.0 / (1.0 + math.exp(-min(best.log_odds, 700.0)))
+        of_images = [usable[j] for j in best.images]
+        probability[of_images] = np.maximum(probability[of_images], odds)
+        if odds < YES:
             break
         found.append(best)
         robots = np.setdiff1d(robots, best.images)
         images = np.setdiff1d(images, np.union1d(best.images, best.parents))
-    lone = _lone_probability([measurements[k].range_m for k in usable], len(own_sources_body_m), bool(found))
+    if found and searched < len(usable):
+        robots = np.concatenate([robots, np.arange(searched, len(usable))])
+        for one in found:
+            _, shown, _ = matched(
+                flares, robots, np.arange(searched, len(usable)), one.plane, one.kind, _GATE_CHI2
+            )
+            probability[[usable[j] for j in shown]] = YES
+    lone = _lone_probability(len(usable), len(own_sources_body_m), bool(found))
     for place, k in enumerate(usable):
         probability[k] = max(probability[k], lone[place])
     told = tuple(
@@ -132,35 +143,61 @@ def told_ghosts(
     return told, tuple(_mirror(one) for one in found)
 
 
+def check_planes(planes: Sequence[MirrorPlane]) -> None:
+    """Refuse mirrors that cannot be.
+
+    Raises
+    ------
+    ValueError
+        If a normal is no unit vector, a kind is unknown, a parameter or covariance is out of bounds.
+    """
+    for number, plane in enumerate(planes):
+        least = 1e-4 if plane.kind == "constant" else 1.0
+        most = 1.0 if plane.kind == "constant" else 5.0
+        covariance = np.asarray(plane.covariance)
+        right = (
+            plane.kind in KINDS
+            and abs(math.hypot(*plane.normal_body) - 1.0) < 1e-6
+            and math.isfinite(plane.distance_m)
+            and least <= plane.parameter <= most
+            and covariance.shape == (4, 4)
+            and bool(np.isfinite(covariance).all())
+            and bool((np.linalg.eigvalsh(covariance) >= -1e-12).all())
+        )
+        if not right:
+            raise ValueError(
+                f"planes[{number}] is {plane}; wanted a unit normal, a kind of {', '.join(KINDS)}, a "
+                "reflectance up to 1 or an index from 1 to 5, and a covariance of shape (4, 4)"
+            )
+
+
 def _called(probability: float) -> Ghost:
     return "yes" if probability >= YES else "possible" if probability >= POSSIBLE else "no"
 
 
-def _flares_of(measurements: Sequence[Measurement], own_sources_body_m: Array) -> Flares:
+def _flares_of(joined: Sequence[Joined], own_sources_body_m: Array) -> Flares:
     own = len(own_sources_body_m)
-    axes = bearing_axes(np.array([each.bearing_body for each in measurements]))
-    range_m = np.array([each.range_m for each in measurements])
+    measurements = [each.measurement for each in joined]
+    bearing = np.array([each.bearing_body for each in measurements])
     origin_m = np.array([each.origin_body_m for each in measurements])
-    covariance = np.array([each.covariance for each in measurements])
-    unclaimed = ~np.isfinite(covariance).all(axis=(1, 2))
-    covariance[unclaimed] = np.diag([1e-3**2, 1e-3**2, 0.0])
-    covariance[unclaimed, 2, 2] = (0.1 * range_m[unclaimed]) ** 2
-    common = np.nan_to_num([each.range_sigma_common_m for each in measurements]) / range_m
-    noise = np.sqrt(np.maximum(covariance[:, 2, 2] / range_m**2 - common**2, 1e-8))
-    scaled = axes * range_m[:, None, None]
-    inner = np.zeros((len(measurements), 3, 3))
-    inner[:, :2, :2] = covariance[:, :2, :2]
-    inner[:, 2, 2] = noise**2
+    range_m = np.array([each.range_m for each in measurements])
+    axes = bearing_axes(bearing)
+    claimed = np.array([np.isfinite(each.covariance).all() for each in measurements])
+    angular_rad2 = np.array([each.covariance[:2, :2] for each in measurements])
+    angular_rad2[~claimed] = _UNCLAIMED_RAD**2 * np.eye(2)
+    noise_m2 = np.array([each.noise_m2 for each in joined])
+    mount_m2 = np.tile(_OWN_SIGMA_M**2 * np.eye(3), (own, 1, 1))
+    common = np.array([each.common for each in joined])
     return Flares(
         origin_m=np.concatenate([origin_m, np.zeros((own, 3))]),
-        place_m=np.concatenate([origin_m + range_m[:, None] * axes[:, 2], own_sources_body_m]),
+        place_m=np.concatenate([origin_m + range_m[:, None] * bearing, own_sources_body_m]),
+        seems_m=np.array([each.seems_m for each in joined] + [1.0] * own),
         axes=np.concatenate([axes, np.tile(np.eye(3), (own, 1, 1))]),
-        angular_rad2=np.concatenate([covariance[:, :2, :2], np.zeros((own, 2, 2))]),
-        noise=np.concatenate([noise, np.zeros(own)]),
-        noise_m2=np.concatenate(
-            [np.swapaxes(scaled, 1, 2) @ inner @ scaled, np.tile(_OWN_SIGMA_M**2 * np.eye(3), (own, 1, 1))]
-        ),
+        angular_rad2=np.concatenate([angular_rad2, np.zeros((own, 2, 2))]),
+        noise=np.concatenate([[each.noise for each in joined], np.zeros(own)]),
+        noise_m2=np.concatenate([noise_m2, mount_m2]),
         common=np.concatenate([common, np.zeros(own)]),
+        moved_m=np.concatenate([[each.moved_m for each in joined], np.zeros((own, 3))]),
     )
 
 
@@ -170,11 +207,12 @@ def _log_chance(flares: Flares, count: int) -> Array:
     As many as there are flares, in any direction about the vertical and at any range alike; four of five as
     high as the others, as on a floor.
     """
-    apart_m = flares.place_m[:count] - flares.origin_m[:count]
-    range_m = np.linalg.norm(apart_m, axis=1)
-    height_m = flares.place_m[:count, 2]
-    middle_m = float(np.median(flares.place_m[:, 2]))
-    spread_m = max(_HEIGHT_SIGMA_M, 1.5 * float(np.median(abs(flares.place_m[:, 2] - middle_m))))
+    range_m = flares.seems_m[:count]
+    apart_m = range_m[:, None] * flares.axes[:count, 2]
+    height_m = flares.origin_m[:count, 2] + apart_m[:, 2]
+    of_all_m = np.concatenate([height_m, flares.place_m[count:, 2]])
+    middle_m = float(np.median(of_all_m))
+    spread_m = max(_HEIGHT_SIGMA_M, 1.5 * float(np.median(abs(of_all_m - middle_m))))
     sigma_rad = np.hypot(spread_m / range_m, np.sqrt(flares.angular_rad2[:count, 1, 1]))
     off = (height_m - middle_m) / range_m / sigma_rad
     level = np.exp(-0.5 * off**2) / (math.sqrt(2.0 * math.pi) * sigma_rad)
@@ -193,9 +231,13 @@ def _best_plane(
         kind = KINDS.index(plane.kind)
         if kind == CONSTANT:
             prior[4] = -0.5 * math.log(plane.parameter)
-        precision = np.asarray(np.linalg.inv(plane.covariance + 1e-12 * np.eye(4)), dtype=np.float64)
+        covariance = np.asarray(plane.covariance, dtype=np.float64)
+        if kind == CONSTANT:
+            scale = np.diag([1.0, 1.0, 1.0, -0.5 / plane.parameter])  # R → −½ ln R
+            covariance = scale @ covariance @ scale
+        precision = np.asarray(np.linalg.inv(covariance + 1e-12 * np.eye(4)), dtype=np.float64)
         one = _fitted(flares, robots, images, log_chance, prior, kind, prior, precision)
-        if one is not None:
+        if one is not None and one.log_odds > _LOG_YES:
             return one
     parents, shown = _plausible_pairs(flares, robots, images)
     trials = []
@@ -219,8 +261,7 @@ def _plausible_pairs(flares: Flares, robots: Indices, images: Indices) -> tuple[
     """Return whom each flare may show: an image is farther than what it shows, from anywhere before it."""
     i, j = (grid.ravel() for grid in np.meshgrid(robots, images, indexing="ij"))
     near_m = np.linalg.norm(flares.place_m[i] - flares.origin_m[j], axis=1)
-    far_m = np.linalg.norm(flares.place_m[j] - flares.origin_m[j], axis=1)
-    usable = (i != j) & (far_m > near_m)
+    usable = (i != j) & (flares.seems_m[j] > near_m)
     return i[usable], j[usable]
 
 
@@ -231,7 +272,7 @@ def _seeds(flares: Flares, parents: Indices, images: Indices) -> list[tuple[int,
     seeds = [(CONSTANT, seeds_of_constant(flares, parents, images, stride, _MOST_SEEDS))]
     # A dielectric takes more than half of the light but at grazing angles.
     near_m = np.linalg.norm(flares.place_m[parents] - flares.origin_m[images], axis=1)
-    dim = np.linalg.norm(flares.place_m[images] - flares.origin_m[images], axis=1) > _DIM_RATIO * near_m
+    dim = flares.seems_m[images] > _DIM_RATIO * near_m
     parents, images = parents[dim], images[dim]
     for kind in (SURFACE, PANE):
         of_kind = [seeds_of_kind(flares, parents, images, kind, index) for index in _SEED_INDICES]
@@ -258,7 +299,8 @@ def _fitted(
         if len(parents) < (1 if is_known else 2):
             return None
         chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane, kind, prior, precision)
-        if not (np.diagonal(covariance) > 0.0).all() or not plane[3] > LEAST_PLANE_DISTANCE_M:
+        before_m = float((plane[3] - flares.origin_m[shown] @ plane[:3]).min())
+        if not (np.diagonal(covariance) > 0.0).all() or not before_m > LEAST_PLANE_DISTANCE_M:
             return None
         result = parents, shown, chi2, log_peak, covariance
         again, whom, _ = matched(flares, robots, images, plane, kind, _GATE_CHI2)
@@ -298,40 +340,55 @@ def _log_symmetry(
     precision = np.zeros((4, 4))
     precision[3, 3] = 1e10
     log_odds = -math.inf
+    # Two robots have two fluxes, each with an error of its own.
+    each_own = flares.moved_m[:, :, None] * flares.moved_m[:, None, :]
+    apart = flares._replace(
+        noise=np.hypot(flares.noise, flares.common),
+        common=np.zeros_like(flares.common),
+        moved_m=np.zeros_like(flares.moved_m),
+    )
     for off_m in FORMATION_SIGMAS_M:
         whole = plane.copy()
         whole[4] = 0.0
-        loose = flares._replace(noise_m2=flares.noise_m2 + off_m**2 * np.eye(3))
+        loose = apart._replace(noise_m2=flares.noise_m2 + each_own + off_m**2 * np.eye(3))
         chi2, log_peak, covariance = fit_plane(
             loose, parents, images, whole, CONSTANT, whole.copy(), precision
         )
         if (np.diagonal(covariance)[:3] > 0.0).all():
             log_volume = 0.5 * float(np.linalg.slogdet(2.0 * math.pi * covariance[:3, :3])[1])
             log_odds = np.logaddexp(log_odds, log_peak - 0.5 * chi2 + log_volume)
-    return float(log_odds) + math.log(SYMMETRY_PROBABILITY) + log_others + log_prior
+    log_share = math.log(SYMMETRY_PROBABILITY / len(FORMATION_SIGMAS_M))
+    return float(log_odds) + log_share + log_others + log_prior
 
 
 def _log_seen(
     flares: Flares, robots: Indices, parents: Indices, plane: Array, kind: int, count: int
 ) -> float:
-    """Return ln of the probability that these have images and the others none that is bright enough."""
-    farthest_m = float(np.linalg.norm(flares.place_m[:count] - flares.origin_m[:count], axis=1).max())
+    """Return ln of the probability that these have images and the others none that is bright enough.
+
+    What share of robots a mirror shows depends on how large it is: any share is as probable beforehand.
+    """
+    farthest_m = float(flares.seems_m[:count].max())
     others = np.setdiff1d(robots, parents)
     beyond_m = plane[3] - flares.place_m[others] @ plane[:3]
     image_m = flares.place_m[others] + 2.0 * beyond_m[:, None] * plane[:3]
     seems_m = np.linalg.norm(image_m, axis=1) * math.exp(plane[4] if kind == CONSTANT else 1.3)
     unseen = int(((beyond_m > 0.0) & (seems_m < farthest_m)).sum())
-    return len(parents) * math.log(SEEN_PROBABILITY) + unseen * math.log(1.0 - SEEN_PROBABILITY)
+    return _log_share(len(parents), unseen)
 
 
-def _lone_probability(ranges_m: Sequence[float], own: int, has_mirror: bool) -> list[float]:
+def _log_share(seen: int, unseen: int) -> float:
+    """Return ln of the probability of just these, of a share between 0 and 1: ∫ s^k (1 − s)^(n−k) ds."""
+    return math.lgamma(seen + 1.0) + math.lgamma(unseen + 1.0) - math.lgamma(seen + unseen + 2.0)
+
+
+def _lone_probability(count: int, own: int, has_mirror: bool) -> list[float]:
     """Return of each flare, the nearest first, the probability that it is the lone image of a nearer one.
 
     Nothing speaks for or against it but that other robots before that mirror have no image.
     """
-    count = len(ranges_m)
-    odds = 0.0 if has_mirror else MIRROR_PROBABILITY * SEEN_PROBABILITY / count
-    odds *= (1.0 - SEEN_PROBABILITY) ** max(count + own - 2, 0)
+    share = math.exp(_log_share(1, max(count + own - 2, 0)))
+    odds = 0.0 if has_mirror else MIRROR_PROBABILITY * share / count
     return [min(odds * (nearer + own), 0.5) for nearer in range(count)]
 
 

@@ -5,12 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from perception.estimators import Estimator, detect_frames
-from perception.rig.extinction import corrected, estimated_extinction
+from perception.rig.extinction import Extinction, corrected, estimated_extinction
 from perception.rig.frame_sets import Exposed, robot_of
 from perception.rig.fusion import associated, fused
-from perception.rig.ghosts import told_ghosts
+from perception.rig.ghosts import check_planes, told_ghosts
 from perception.rig.sightings import sightings_of
 from perception.types import Calibration, Detection, Measurement, MirrorPlane, RawFrame, SetMeasurements
+
+_FOG_PASSES = 3
 
 
 def detect_set(
@@ -36,7 +38,7 @@ def detect_set(
     -------
     SetMeasurements
         Every source once, however many cameras see it, with whether it is a mirror image (`told_ghosts`).
-        Where the calibrations give the extinction a σ it is estimated too, if the set tells it, and ranges are
+        Where calibrations give the extinction a σ it is estimated too, if the set tells it, and ranges are
         corrected (`extinction`).
 
     Raises
@@ -63,11 +65,23 @@ def measure_set(
     robots = sorted({robot_of(frame.camera) for frame in frames})
     if len(robots) > 1:
         raise ValueError(f"a set is of one robot's frames, not of {', '.join(robots)}: see frame_sets")
+    if unknown := sorted({frame.camera for frame in frames} - set(calibrations)):
+        raise ValueError(f"no calibration for {', '.join(unknown)}")
+    check_planes(planes)
     measurements, mirrors = _measured(frames, detections, calibrations, planes)
-    images = {key for each in measurements if each.ghost == "yes" for key in each.detections}
-    extinction = estimated_extinction(frames, detections, calibrations, images)
-    if extinction is not None:
-        detections = corrected(frames, detections, calibrations, extinction)
+    extinction: Extinction | None = None
+    as_found = detections
+    images: set[tuple[str, int, int]] | None = None
+    # Ranges that are corrected show mirrors that ranges in fog did not, whose images are no fog.
+    for _ in range(_FOG_PASSES):
+        shown = {key for each in measurements if each.ghost == "yes" for key in each.detections}
+        if shown == images:
+            break
+        images = shown
+        extinction = estimated_extinction(frames, as_found, calibrations, images)
+        if extinction is None:
+            break
+        detections = corrected(frames, as_found, calibrations, extinction)
         measurements, mirrors = _measured(frames, detections, calibrations, planes)
     return SetMeasurements(
         measurements,

@@ -21,6 +21,7 @@ CONSTANT, SURFACE, PANE = 0, 1, 2
 
 NEAREST_MIRROR_M = 0.05
 SAME_PLANE = 0.02
+SEED_GATE_CHI2 = 200.0
 SEED_LOG_RANGE, SEED_RAD = 0.3, 0.1
 SEED_COSINE2 = 1.0 - 2.0 * SEED_RAD**2
 FIT_STEPS = 8
@@ -34,7 +35,9 @@ class Flares(NamedTuple):
     Attributes
     ----------
     origin_m, place_m
-        Camera centres, and where flares seem to be by their flux, in body axes, shape (m, 3).
+        Where bearings count from, and where flares are, in body axes, shape (m, 3).
+    seems_m
+        How far they seem by flux, shape (m,): mirror images are nearer.
     axes
         Left, up and along each bearing, as rows, shape (m, 3, 3).
     angular_rad2
@@ -43,17 +46,20 @@ class Flares(NamedTuple):
         Standard deviation of the logarithm of the range, by noise, shape (m,).
     noise_m2
         Covariance of the place by noise, shape (m, 3, 3).
-    common
-        Standard deviation of the logarithm of the range by what all images of a source share, shape (m,).
+    common, moved_m
+        Standard deviation of the logarithm of the range by what all images of a source share, shape (m,), and
+        by how much that moves the place, shape (m, 3).
     """
 
     origin_m: Array
     place_m: Array
+    seems_m: Array
     axes: Array
     angular_rad2: Array
     noise: Array
     noise_m2: Array
     common: Array
+    moved_m: Array
 
 
 @compiled
@@ -96,13 +102,10 @@ def residual(flares: Flares, image: int, plane: Array, kind: int, place_m: Array
         left += flares.axes[image, 0, k] * off[k]
         up += flares.axes[image, 1, k] * off[k]
         along += flares.axes[image, 2, k] * off[k]
-    seems_m2 = 0.0
-    for k in range(3):
-        seems_m2 += (flares.place_m[image, k] - flares.origin_m[image, k]) ** 2
     by_reflectance = log_root_reflectance(kind, plane[4], abs(cosine) / path_m)
     off[0] = -math.atan2(left, along)
     off[1] = -math.atan2(up, along)
-    off[2] = 0.5 * math.log(seems_m2) - math.log(path_m) + by_reflectance
+    off[2] = math.log(flares.seems_m[image] / path_m) + by_reflectance
 
 
 @compiled
@@ -123,9 +126,8 @@ def pair_covariance(
     for m in range(3):
         shared[m] = 0.0
         for k in range(3):
-            out_m = flares.place_m[parent, k] - flares.origin_m[parent, k]
-            shared[m] += slope[m, k] * out_m * flares.common[parent]
-    shared[2] += flares.common[parent]
+            shared[m] += slope[m, k] * flares.moved_m[parent, k]
+    shared[2] += flares.common[image]
     for a in range(3):
         for b in range(3):
             covariance[a, b] = shared[a] * shared[b]
@@ -264,7 +266,7 @@ def seeds_of_kind(flares: Flares, parents: Indices, images: Indices, kind: int, 
             s = math.exp(log_root_reflectance(kind, parameter, cosine))
             length, c, along, path2, near = 0.0, 0.0, 0.0, 0.0, 0.0
             for k in range(3):
-                seen = s * (flares.place_m[j, k] - flares.origin_m[j, k])
+                seen = s * flares.seems_m[j] * flares.axes[j, 2, k]
                 normal[k] = seen + flares.origin_m[j, k] - flares.place_m[i, k]
                 length += normal[k] ** 2
                 along += normal[k] * seen
@@ -356,10 +358,14 @@ def matched(
 def best_seeds(
     flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int, most: int
 ) -> tuple[Array, Indices]:
-    """Return the planes that explain most images, shape (most, 5) or less, and how many each does."""
+    """Return the planes that explain most images, shape (most, 5) or less, and how many each does.
+
+    A seed has the noise of one or two pairs, and that of a dielectric a guessed index, so gates are wide.
+    """
     count, misfit = np.empty(len(seeds), dtype=np.int64), np.empty(len(seeds))
     for seed in range(len(seeds)):
-        who, _, misfit[seed] = matched(flares, parents, images, seeds[seed], kind, 0.0)
+        gate_chi2 = SEED_GATE_CHI2 if kind == CONSTANT else 0.0
+        who, _, misfit[seed] = matched(flares, parents, images, seeds[seed], kind, gate_chi2)
         count[seed] = len(who)
     taken = np.zeros(len(seeds), dtype=np.bool_)
     chosen = np.empty(min(most, len(seeds)), dtype=np.int64)

@@ -39,22 +39,12 @@ def seeds_of_constant(flares: Flares, parents: Indices, images: Indices, stride:
             continue
         for x in range(3):
             y, z = (x + 1) % 3, (x + 2) % 3
-            a_y, a_z = (
-                flares.place_m[j, y] - flares.origin_m[j, y],
-                flares.place_m[j, z] - flares.origin_m[j, z],
-            )
-            b_y, b_z = (
-                flares.origin_m[j, y] - flares.place_m[i, y],
-                flares.origin_m[j, z] - flares.place_m[i, z],
-            )
-            c_y, c_z = (
-                flares.place_m[m, y] - flares.origin_m[m, y],
-                flares.place_m[m, z] - flares.origin_m[m, z],
-            )
-            d_y, d_z = (
-                flares.origin_m[m, y] - flares.place_m[k, y],
-                flares.origin_m[m, z] - flares.place_m[k, z],
-            )
+            a_y, a_z = flares.seems_m[j] * flares.axes[j, 2, y], flares.seems_m[j] * flares.axes[j, 2, z]
+            b_y = flares.origin_m[j, y] - flares.place_m[i, y]
+            b_z = flares.origin_m[j, z] - flares.place_m[i, z]
+            c_y, c_z = flares.seems_m[m] * flares.axes[m, 2, y], flares.seems_m[m] * flares.axes[m, 2, z]
+            d_y = flares.origin_m[m, y] - flares.place_m[k, y]
+            d_z = flares.origin_m[m, z] - flares.place_m[k, z]
             bend[2, x] = a_y * c_z - a_z * c_y
             bend[1, x] = a_y * d_z - a_z * d_y + b_y * c_z - b_z * c_y
             bend[0, x] = b_y * d_z - b_z * d_y
@@ -71,8 +61,8 @@ def seeds_of_constant(flares: Flares, parents: Indices, images: Indices, stride:
                 continue
             length1, length2, dot, c1, c2, near1, far1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for y in range(3):
-                seen1 = s * (flares.place_m[j, y] - flares.origin_m[j, y])
-                seen2 = s * (flares.place_m[m, y] - flares.origin_m[m, y])
+                seen1 = s * flares.seems_m[j] * flares.axes[j, 2, y]
+                seen2 = s * flares.seems_m[m] * flares.axes[m, 2, y]
                 one[y] = seen1 + flares.origin_m[j, y] - flares.place_m[i, y]
                 other[y] = seen2 + flares.origin_m[m, y] - flares.place_m[k, y]
                 length1 += one[y] ** 2

@@ -178,10 +178,11 @@ def _invert(matrix: Array) -> None:
 
 @compiled
 def placed(rays: Rays, rows: Indices, time_s: float, speed_m_per_s: float) -> tuple[Array, Array]:
-    """Return the most likely place of a source and its covariance, shapes (3,) and (3, 3).
+    """Return the most likely place of a source, shape (3,), and the covariance of it and of the shared error.
 
     Gauss–Newton over the place and the error that all ranges share; a sighting at another time counts less
-    by how far the source may have moved. Two sightings at least; the first starts it.
+    by how far the source may have moved. Two sightings at least; the first starts it. The covariance has the
+    shape (4, 4); the shared error, the last, is in units of its σ.
     """
     start_m, _ = ranges_of_pair(rays, rows[0], rows[1])
     place_m = rays.origin_m[rows[0]] + start_m * rays.axes[rows[0], 2]
@@ -228,4 +229,4 @@ def placed(rays: Rays, rows: Indices, time_s: float, speed_m_per_s: float) -> tu
                 place_m[k] += step
             else:
                 shared += step
-    return place_m, information[:3, :3].copy()
+    return place_m, information

@@ -19,6 +19,16 @@ UNCLAIMED_PX = 1.0
 UNCLAIMED_RANGE = 0.3
 """As for a range, relatively."""
 
+LEAST_PX, LEAST_NOISE = 1e-3, 1e-4
+"""No place and no range, relatively, is taken to be better than this."""
+
+FARTHEST_KNOWN_M = 1e4
+"""A range beyond is none."""
+
+CAMERAS_SHARE, CAMERAS_MOST = 0.5, 0.01
+"""The part of the common error's variance that is a camera's own, as its K was calibrated by itself, and
+the most that it is of a range. The rest is the source's, as LEDs differ, and shared by all cameras."""
+
 _STEPS_PX = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
 
 
@@ -72,30 +82,33 @@ def sightings_of(
         [
             [
                 hit.u_px, hit.v_px, hit.u_sigma_px, hit.v_sigma_px, hit.range_m, hit.range_sigma_m,
-                hit.range_sigma_common_m, hit.saturated, hit.merged, hit.ghost, *hit.bearing_body,
+                hit.range_sigma_common_m, hit.saturated, hit.merged, hit.ghost,
             ]
             for hit in hits
         ]
-    ).reshape(-1, 13).T  # fmt: skip
+    ).reshape(-1, 10).T  # fmt: skip
     u_px, v_px, u_sigma_px, v_sigma_px, range_m, sigma_m, common_m = columns[:7]
-    saturated, merged, ghost = columns[7:10].astype(bool)
-    axes = bearing_axes(columns[10:].T)
-    ranged = range_m > 0.0
+    saturated, merged, ghost = columns[7:].astype(bool)
+    axes = bearing_axes(_bearings(hits, calibrations))
+    ranged = (range_m > 0.0) & (range_m < FARTHEST_KNOWN_M)
     # Of a clipped flare that was not recovered the range is but a bound.
     bound = saturated & ~np.isfinite(sigma_m)
     known = ranged & ~bound
     claimed = known & np.isfinite(sigma_m)
     at_m = np.where(known, range_m, 1.0)
-    common = np.where(claimed, np.nan_to_num(common_m) / at_m, 0.0)
-    noise2 = np.where(claimed, np.nan_to_num(sigma_m) / at_m, 0.0) ** 2 - common**2
-    noise = np.where(claimed, np.sqrt(np.maximum(noise2, 1e-12)), UNCLAIMED_RANGE)
+    shared = np.where(claimed, np.nan_to_num(common_m) / at_m, 0.0)
+    of_camera2 = np.minimum(CAMERAS_SHARE * shared**2, CAMERAS_MOST**2)
+    of_source2 = shared**2 - of_camera2
+    noise2 = np.where(claimed, np.nan_to_num(sigma_m) / at_m, 0.0) ** 2 - of_source2
+    noise = np.where(claimed, np.sqrt(np.maximum(noise2, LEAST_NOISE**2)), UNCLAIMED_RANGE)
+    common = np.sqrt(of_source2)
     origin_m, time_s, angular_rad2 = (
         np.empty((len(hits), 3)),
         np.empty(len(hits)),
         np.empty((len(hits), 2, 2)),
     )
     sigmas_px = np.column_stack([u_sigma_px, v_sigma_px])
-    sigmas_px = np.where(np.isfinite(sigmas_px), sigmas_px, UNCLAIMED_PX)
+    sigmas_px = np.maximum(np.where(np.isfinite(sigmas_px), sigmas_px, UNCLAIMED_PX), LEAST_PX)
     end = 0
     for taken, found in zip(frames, detections, strict=True):
         these = slice(end, end := end + len(found))
@@ -128,6 +141,14 @@ def sightings_of(
         merged=merged,
         ghost=ghost,
     )
+
+
+def _bearings(hits: Sequence[Detection], calibrations: Mapping[str, Calibration]) -> Array:
+    """Return the unit vectors that detections say; those of their pixels where they say none."""
+    bearing = np.array([hit.bearing_body for hit in hits]).reshape(-1, 3)
+    for k in np.flatnonzero(~np.isfinite(bearing).all(axis=1)).tolist():
+        bearing[k] = bearing_body([[hits[k].u_px, hits[k].v_px]], calibrations[hits[k].camera])[0]
+    return bearing
 
 
 def _angular_rad2(places_px: Array, sigmas_px: Array, axes: Array, calibration: Calibration) -> Array:

@@ -38,22 +38,40 @@ def _seen(places: list[Array], rng: np.random.Generator, **errors: float) -> dic
     }
 
 
-@pytest.mark.parametrize("common", [0.0, 0.02])
+@pytest.mark.parametrize("common", [0.0, 0.02, 0.05])
 def test_a_robot_in_two_cameras_is_one_measurement_with_a_true_covariance(common: float) -> None:
-    """2 000 robots at seams: mean NEES 3 ± 4 standard errors; the range error that all share is drawn per set."""
+    """2 000 robots at seams: mean NEES 3 ± 4 standard errors, none made two.
+
+    Of an error of K half the variance is each camera's own, 1 % of range at most, the rest each robot's.
+    """
     rng = random(1501, int(1e3 * common))
     nees = []
     for _ in range(400):
         places = _at_seams(rng, 5)
-        errors = {"relative": 0.004, "common": common, "common_error": float(rng.normal())}
-        found = _measured(_seen(places, rng, **errors), RIG)
+        # Of each robot's own LED the rest, so that the variance is that of `common`.
+        cameras = min(np.sqrt(0.5), 0.01 / common) if common else 0.0
+        of_camera = {name: cameras * rng.normal() for name in RIG}
+        of_robot = np.sqrt(1.0 - cameras**2) * rng.normal(size=5)
+        seen = {
+            name: [
+                hit
+                for place, own in zip(places, of_robot, strict=True)
+                if (hit := detection(
+                    camera, place, rng, relative=0.004, common=common,
+                    common_error=float(own + of_camera[name]),
+                )) is not None
+            ]
+            for name, camera in RIG.items()
+        }  # fmt: skip
+        found = _measured(seen, RIG)
         assert len(found) == 5
         for one in found:
             place = min(places, key=lambda p: float(np.linalg.norm(p - one.position_body_m)))
             assert len(one.cameras) == len(one.detections) == 2
             off_m = place - one.position_body_m
             nees.append(off_m @ np.linalg.solve(one.position_covariance_m2, off_m))
-    # Where the error is shared five measurements of a set are not independent: a factor of √5 at most.
+            assert one.range_sigma_common_m <= np.sqrt(one.covariance[2, 2])
+    # The camera's error is that of all five of a set: a factor of √5 at most.
     slack = 4.0 * np.sqrt(6.0 / len(nees)) * (np.sqrt(5.0) if common else 1.0)
     assert np.mean(nees) == pytest.approx(3.0, abs=slack)
 
@@ -71,8 +89,8 @@ def test_fusion_is_the_least_squares_solution() -> None:
             local = camera.rotation_body_camera.T @ (unknown[:3] - camera.position_body_m)
             u = camera.cx_px + camera.fx_px * local[0] / local[2]
             v = camera.cy_px + camera.fy_px * local[1] / local[2]
-            noise = np.sqrt(hit.range_sigma_m**2 - hit.range_sigma_common_m**2) / hit.range_m
-            said = np.log(hit.range_m / np.linalg.norm(local)) - 0.01 * unknown[3]
+            noise = np.sqrt(hit.range_sigma_m**2 - 0.5 * hit.range_sigma_common_m**2) / hit.range_m
+            said = np.log(hit.range_m / np.linalg.norm(local)) - np.sqrt(0.5) * 0.01 * unknown[3]
             parts.append(
                 np.array([(u - hit.u_px) / hit.u_sigma_px, (v - hit.v_px) / hit.v_sigma_px, said / noise])
             )
@@ -171,3 +189,48 @@ def test_a_set_is_of_one_robot() -> None:
     frames = [frame_without_pixels(RIG["r1.front"]), frame_without_pixels(other)]
     with pytest.raises(ValueError, match="one robot's frames, not of r1, r2"):
         measure_set(frames, [[], []], {"r1.front": RIG["r1.front"], "r2.front": other})
+
+
+def test_of_a_bracket_the_exposure_that_is_not_clipped_counts() -> None:
+    """One camera, three exposures, the longest clipped: one measurement, with the σ of the best."""
+    rng = random(1508)
+    camera, place = RIG["r1.front"], np.array([2.0, 0.3, 0.25])
+    hits = [detection(camera, place, rng, relative=sigma) for sigma in (0.01, 0.004)]
+    clipped = detection(camera, place, rng)
+    assert clipped is not None
+    unknown = float("nan")
+    found = [
+        *([hit] for hit in hits if hit is not None),
+        [replace(clipped, saturated=True, range_sigma_m=unknown, u_sigma_px=unknown, v_sigma_px=unknown)],
+    ]
+    frames = [
+        replace(frame_without_pixels(camera, 0.25 + 0.002 * k), exposure_s=1e-3 * 4**k) for k in range(3)
+    ]
+    (one,) = measure_set(frames, found, {camera.camera: camera}).measurements
+    assert len(one.detections) == 3
+    assert not one.saturated
+    assert float(np.sqrt(one.covariance[2, 2])) == pytest.approx(0.004 * one.range_m, rel=0.01)
+
+
+def test_what_claims_perfection_or_nothing_is_taken_as_it_is() -> None:
+    """σ of 0, a bearing of NaN, a range of 1e200 m: one measurement, and the numbers that there are."""
+    rng = random(1509)
+    place = np.array([1.2, 1.25, 0.25])
+    nan = float("nan")
+    changes: list[dict[str, object]] = [
+        {"u_sigma_px": 0.0, "v_sigma_px": 0.0, "range_sigma_m": 0.0},
+        {"bearing_body": (nan, nan, nan)},
+        {"range_m": 1e200, "range_sigma_m": 1.0},
+    ]
+    for change in changes:
+        found = {
+            name: [replace(hit, **change) for hit in hits]  # type: ignore[arg-type]
+            for name, hits in _seen([place], rng, px=1e-4, relative=1e-6).items()
+        }
+        (one,) = _measured(found, RIG)
+        assert np.isfinite([one.time_s, *one.bearing_body, *one.covariance[:2, :2].ravel()]).all()
+
+
+def test_a_camera_without_calibration_is_named() -> None:
+    with pytest.raises(ValueError, match=r"no calibration for r1\.left"):
+        measure_set([frame_without_pixels(RIG["r1.left"])], [[]], {"r1.front": RIG["r1.front"]})

@@ -71,16 +71,18 @@ def _measure(
     own_source: bool,
     common: float = 0.0,
     planes: tuple[MirrorPlane, ...] = (),
+    errors: Array | None = None,
 ) -> SetMeasurements:
     cameras = WITH_OWN if own_source else RIG
+    errors = np.ones(len(shown)) if errors is None else errors
     found = []
     for camera in cameras.values():
         hits = [
             detection(
-                camera, place, rng, px=0.02, factor=factor, common=common, common_error=1.0,
+                camera, place, rng, px=0.02, factor=factor, common=common, common_error=errors[number],
                 relative=1e-3 * (1.0 + 0.5 * factor * float(np.linalg.norm(place))),
             )
-            for place, factor, _ in shown
+            for number, (place, factor, _) in enumerate(shown)
         ]  # fmt: skip
         found.append([hit for hit in hits if hit is not None])
     frames = [frame_without_pixels(camera) for camera in cameras.values()]
@@ -246,3 +248,93 @@ def test_a_robot_behind_a_pane_is_no_image() -> None:
     calls = list(_told(shown, _measure(shown, rng, False).measurements))
     assert [one.ghost for is_image, one in calls if not is_image] == ["no"] * 4
     assert [one.ghost for is_image, one in calls if is_image] == ["yes"] * 3
+
+
+@pytest.mark.parametrize("reflectance", [_metal, _pane])
+def test_images_are_told_where_leds_differ(reflectance: Callable[[float], float]) -> None:
+    """LEDs of ±10 %: each robot's ranges off by its own 5 %, its image's alike, some of them at seams."""
+    rng = random(1520)
+    images: list[str] = []
+    robots: list[str] = []
+    for _ in range(60):
+        wall = _wall(rng)
+        places = _room(rng, 4, wall)
+        shown = [(place, 1.0, False) for place in places] + _images(places, wall, reflectance)
+        errors = np.tile(rng.normal(size=4), 2)
+        seen = _measure(shown, rng, False, common=0.05, errors=errors)
+        for is_image, one in _told(shown, seen.measurements):
+            (images if is_image else robots).append(one.ghost)
+    assert images.count("yes") >= 0.95 * len(images)
+    assert robots.count("yes") == 0
+
+
+def test_a_plane_that_is_there_no_more_hinders_nothing() -> None:
+    """A mirror of yesterday, 1 m off, is handed in: what is there today is found, and nothing else."""
+    rng = random(1521)
+    images: list[str] = []
+    for shown in _with_mirror(rng, 30, 4, _metal, True):
+        stale = MirrorPlane((0.6, 0.8, 0.0), 1.3, "constant", 0.8, np.diag([1e-4, 1e-4, 1e-2, 1e-2]), 3)
+        seen = _measure(shown, rng, True, planes=(stale,))
+        for is_image, one in _told(shown, seen.measurements):
+            assert is_image or one.ghost != "yes"
+            images += [one.ghost] * is_image
+    assert images.count("yes") >= 0.98 * len(images)
+
+
+def test_a_plane_handed_on_is_as_good_as_its_covariance() -> None:
+    """A faint mirror, R 0.06 ± 0.015: the prior is of R, not of its logarithm."""
+    rng = random(1522)
+    wall = (np.array([0.0, 1.0, 0.0]), 1.5)
+    told = 0
+    for _ in range(20):
+        place = np.array([rng.uniform(-1.3, 2.7), rng.uniform(-1.0, 0.5), 0.28])
+        shown = [(place, 1.0, False), *_images([place], wall, lambda _: 0.06)]
+        off_m, off = 0.01 * rng.normal(), 0.015 * rng.normal()
+        known = MirrorPlane(
+            (0.0, 1.0, 0.0), 1.5 + off_m, "constant", 0.06 + max(off, -0.04), np.diag([1e-6, 1e-6, 1e-4, 2.25e-4]), 3
+        )  # fmt: skip
+        seen = _measure(shown, rng, False, planes=(known,))
+        told += any(one.ghost == "yes" for is_image, one in _told(shown, seen.measurements) if is_image)
+    assert told >= 19
+
+
+def test_a_floor_that_shines_is_a_mirror_at_the_bodys_own_origin() -> None:
+    """The body's origin is on the floor: n·x = 0, 20 cm below the cameras."""
+    rng = random(1523)
+    robots = [
+        np.array([x, y, z])
+        for x, y, z in ((2.0, 0.5, 0.3), (1.4, -1.0, 0.25), (-1.8, 0.6, 0.4), (0.2, 2.4, 0.3))
+    ]
+    shown = [(place, 1.0, False) for place in robots]
+    shown += _images(robots, (np.array([0.0, 0.0, -1.0]), 0.0), _metal)
+    calls = list(_told(shown, _measure(shown, rng, False).measurements))
+    assert [one.ghost for is_image, one in calls if is_image] == ["yes"] * 4
+
+
+def test_images_are_told_in_a_crowd() -> None:
+    """25 robots and their images: more flares than are searched for mirrors."""
+    rng = random(1524)
+    images, robots = _calls(_with_mirror(rng, 4, 25, _metal, True), rng, True)
+    assert images.count("yes") >= 0.97 * len(images)
+    assert robots.count("yes") == 0
+
+
+def test_a_mirror_that_shows_few_of_many_is_found() -> None:
+    """20 robots, four of them with an image: nine of ten such images."""
+    rng = random(1525)
+    images: list[str] = []
+    for _ in range(12):
+        wall = _wall(rng)
+        places = _room(rng, 20, wall)
+        shown = [(place, 1.0, False) for place in places] + _images(places[:4], wall, _metal)
+        calls = list(_told(shown, _measure(shown, rng, False).measurements))
+        images += [one.ghost for is_image, one in calls if is_image]
+        assert "yes" not in [one.ghost for is_image, one in calls if not is_image]
+    assert images.count("yes") >= 0.8 * len(images)
+
+
+def test_planes_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="wanted a unit normal"):
+        _measure(
+            [], random(1526), False, planes=(MirrorPlane((0, 1, 0), 1.0, "constant", 0.0, np.eye(4), 1),)
+        )

@@ -57,14 +57,34 @@ def frames_of(
     flux: Sequence[float] | None = None,
 ) -> list[RawFrame]:
     """Return the frames of a set: sources by brute force, photons and read noise by numpy."""
-    frames = []
+    return exposed(cameras, means_of(cameras, places_m, exposure_s, flux), rng, exposure_s)
+
+
+def exposed(
+    cameras: dict[str, Calibration], means_e: Sequence[Array], rng: np.random.Generator, exposure_s: float
+) -> list[RawFrame]:
+    """Return one draw of the noise on the frames of a set."""
+    return [
+        simulation.expose(mean_e, camera, rng, exposure_s)
+        for camera, mean_e in zip(cameras.values(), means_e, strict=True)
+    ]
+
+
+def means_of(
+    cameras: dict[str, Calibration],
+    places_m: Sequence[Array],
+    exposure_s: float,
+    flux: Sequence[float] | None = None,
+) -> list[Array]:
+    """Return the mean electrons of a set's frames."""
+    means = []
     for camera in cameras.values():
         mean_e = np.full((camera.height_px, camera.width_px), 20.0)
         for place, factor in zip(places_m, flux or [1.0] * len(places_m), strict=True):
             if (seen := seen_by(camera, place, -60.0)) is not None:
                 mean_e += simulation.expected_e(camera, [seen], exposure_s, gain_fault=factor)
-        frames.append(simulation.expose(mean_e, camera, rng, exposure_s))
-    return frames
+        means.append(mean_e)
+    return means
 
 
 def frame_without_pixels(camera: Calibration, time_s: float = 0.25) -> RawFrame:
