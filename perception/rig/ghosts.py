@@ -10,7 +10,6 @@ of its own, in which nothing is a ghost.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +25,12 @@ from perception.rig.mirror_model import (
     matched,
     seeds_of_kind,
 )
+from perception.rig.mirror_planes import KINDS, mirror_plane, prior_of
 from perception.rig.mirror_seeds import seeds_of_constant
 from perception.types import Ghost, Measurement, MirrorPlane, bearing_axes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-KINDS: tuple[Literal["constant", "surface", "pane"], ...] = ("constant", "surface", "pane")
 
 MIRROR_PROBABILITY = 0.1
 """That a set shows a flat mirror at all, before it is looked at."""
@@ -140,35 +138,7 @@ def told_ghosts(
         each if each.ghost != "no" else replace(each, ghost=_called(p), ghost_probability=p)
         for each, p in zip(measurements, probability.tolist(), strict=True)
     )
-    return told, tuple(_mirror(one) for one in found)
-
-
-def check_planes(planes: Sequence[MirrorPlane]) -> None:
-    """Refuse mirrors that cannot be.
-
-    Raises
-    ------
-    ValueError
-        If a normal is no unit vector, a kind is unknown, a parameter or covariance is out of bounds.
-    """
-    for number, plane in enumerate(planes):
-        least = 1e-4 if plane.kind == "constant" else 1.0
-        most = 1.0 if plane.kind == "constant" else 5.0
-        covariance = np.asarray(plane.covariance)
-        right = (
-            plane.kind in KINDS
-            and abs(math.hypot(*plane.normal_body) - 1.0) < 1e-6
-            and math.isfinite(plane.distance_m)
-            and least <= plane.parameter <= most
-            and covariance.shape == (4, 4)
-            and bool(np.isfinite(covariance).all())
-            and bool((np.linalg.eigvalsh(covariance) >= -1e-12).all())
-        )
-        if not right:
-            raise ValueError(
-                f"planes[{number}] is {plane}; wanted a unit normal, a kind of {', '.join(KINDS)}, a "
-                "reflectance up to 1 or an index from 1 to 5, and a covariance of shape (4, 4)"
-            )
+    return told, tuple(mirror_plane(one.plane, one.kind, one.covariance, len(one.images)) for one in found)
 
 
 def _called(probability: float) -> Ghost:
@@ -227,15 +197,7 @@ def _best_plane(
     """Return the plane that explains most, of those that are known first; it is taken from them."""
     for plane in list(known):
         known.remove(plane)
-        prior = np.array([*plane.normal_body, plane.distance_m, plane.parameter])
-        kind = KINDS.index(plane.kind)
-        if kind == CONSTANT:
-            prior[4] = -0.5 * math.log(plane.parameter)
-        covariance = np.asarray(plane.covariance, dtype=np.float64)
-        if kind == CONSTANT:
-            scale = np.diag([1.0, 1.0, 1.0, -0.5 / plane.parameter])  # R → −½ ln R
-            covariance = scale @ covariance @ scale
-        precision = np.asarray(np.linalg.inv(covariance + 1e-12 * np.eye(4)), dtype=np.float64)
+        prior, kind, precision = prior_of(plane)
         one = _fitted(flares, robots, images, log_chance, prior, kind, prior, precision)
         if one is not None and one.log_odds > _LOG_YES:
             return one
@@ -390,15 +352,3 @@ def _lone_probability(count: int, own: int, has_mirror: bool) -> list[float]:
     share = math.exp(_log_share(1, max(count + own - 2, 0)))
     odds = 0.0 if has_mirror else MIRROR_PROBABILITY * share / count
     return [min(odds * (nearer + own), 0.5) for nearer in range(count)]
-
-
-def _mirror(found: _Found) -> MirrorPlane:
-    x, y, z = found.plane[:3].tolist()
-    parameter, covariance = float(found.plane[4]), found.covariance
-    if found.kind == CONSTANT:  # −½ ln R → R
-        parameter = min(math.exp(-2.0 * parameter), 1.0)
-        scale = np.diag([1.0, 1.0, 1.0, -2.0 * parameter])
-        covariance = scale @ covariance @ scale
-    return MirrorPlane(
-        (x, y, z), float(found.plane[3]), KINDS[found.kind], parameter, covariance, len(found.images)
-    )

@@ -8,7 +8,8 @@ from perception.estimators import Estimator, detect_frames
 from perception.rig.extinction import Extinction, corrected, estimated_extinction
 from perception.rig.frame_sets import Exposed, robot_of
 from perception.rig.fusion import associated, fused
-from perception.rig.ghosts import check_planes, told_ghosts
+from perception.rig.ghosts import told_ghosts
+from perception.rig.mirror_planes import check_planes
 from perception.rig.sightings import sightings_of
 from perception.types import Calibration, Detection, Measurement, MirrorPlane, RawFrame, SetMeasurements
 

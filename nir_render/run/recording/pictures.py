@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from nir_render.errors import InputError, shown
 from perception import RecordingError, read_picture
+from perception.calibration.darkness import Darkness, darkness
 from perception.files.fields import first_of
-from perception.model.darkness import Darkness, darkness
 
 KINDS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _LOOKED_AT = 8
