@@ -9,7 +9,6 @@ from dataclasses import fields, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nir_render.camera.beams import beam_electrons
 from nir_render.camera.optics.lens import aperture_area_m2, intrinsics_of
@@ -49,12 +48,7 @@ def calibration(world: Scene | Snapshot, camera: str, progress: Progress | None 
     device, sources = _devices(world, camera)
     for source in sources:
         flare_spread(device, source, progress)
-    known = _of_devices(camera, device, sources)
-    snapshot = world.at(0.0) if isinstance(world, Scene) else world
-    sigma = dict(known.sigma)
-    if snapshot.fog is not None and snapshot.fog.extinction_per_m > 0.0:
-        sigma["extinction_per_m"] = FOG_SIGMA_PER_M
-    return replace(known, sigma=sigma, own_sources_body_m=_own_sources_body_m(snapshot, camera))
+    return _with_robot(_of_devices(camera, device, sources), world)
 
 
 def calibration_without_rail(world: Scene | Snapshot, camera: str) -> Calibration:
@@ -62,7 +56,7 @@ def calibration_without_rail(world: Scene | Snapshot, camera: str) -> Calibratio
 
     NaN are the Gaussian of the point spread and both range constants; no σ is given. Errors as `calibration`.
     """
-    return _without_rail(camera, *_devices(world, camera))
+    return _with_robot(_without_rail(camera, *_devices(world, camera)), world)
 
 
 def _devices(world: Scene | Snapshot, camera: str) -> tuple[Camera, tuple[Source, ...]]:
@@ -78,11 +72,16 @@ def _devices(world: Scene | Snapshot, camera: str) -> tuple[Camera, tuple[Source
     return device, tuple(sources)
 
 
-def _own_sources_body_m(snapshot: Snapshot, camera: str) -> NDArray[np.float64]:
-    """Return where the observer's own sources sit on its body, shape (n, 3)."""
-    own = camera.partition(".")[0] + "."
+def _with_robot(known: Calibration, world: Scene | Snapshot) -> Calibration:
+    """Return a calibration with what else the robot knows: where its own sources sit, that there is fog."""
+    snapshot = world.at(0.0) if isinstance(world, Scene) else world
+    own = known.camera.partition(".")[0] + "."
     places = [each.source.position_m for name, each in snapshot.sources.items() if name.startswith(own)]
-    return np.array(places, dtype=np.float64).reshape(-1, 3)
+    sigma = dict(known.sigma)
+    if snapshot.fog is not None and snapshot.fog.extinction_per_m > 0.0:
+        sigma["extinction_per_m"] = FOG_SIGMA_PER_M
+    own_sources_body_m = np.array(places, dtype=np.float64).reshape(-1, 3)
+    return replace(known, sigma=sigma, own_sources_body_m=own_sources_body_m)
 
 
 @lru_cache(maxsize=_KEPT)

@@ -79,7 +79,7 @@ def test_no_false_alarms_in_pure_noise() -> None:
         assert detect_robust(expose(mean, camera, random(53, key)), camera) == []
 
 
-@pytest.mark.parametrize("range_m", [0.2, 0.8, 1.5, 3.0, 5.0])
+@pytest.mark.parametrize("range_m", [0.4, 0.8, 1.5, 3.0, 5.0])
 def test_clipped_flares_are_recovered_from_their_wings(range_m: float) -> None:
     """1.35 ms is 2 to 6 times too long here: ranges within 4 claimed σ, which stay below 5 %."""
     (hit,) = detect_robust(take([(80.3, 60.8, range_m)], 1.35e-3, 54), SMALL)
