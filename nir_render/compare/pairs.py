@@ -121,10 +121,7 @@ def read_scored(folder: Path, estimators: Iterable[str] = ()) -> ScoredRun:
         raise InputError(
             f"{folder / run_folder.TRUTH}: there is no such file; without truth nothing is scored"
         )
-    paths = {
-        path.name.removeprefix("detections.").removesuffix(".jsonl"): path
-        for path in sorted(folder.glob("detections.*.jsonl"))
-    }
+    paths = run_folder.detection_files(folder)
     known = ", ".join(paths) or "none"
     for name in estimators:
         if name not in paths:

@@ -1,17 +1,21 @@
 """Which detection belongs to which source: without this, recall means nothing."""
 
 import math
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from nir_render.truth.lamps import Outline
+from nir_render.truth.lamps import LampTruth, Outline
 from nir_render.truth.sources import SourceTruth
 from perception.model import flare as flare_model
-from perception.types import Calibration, Detection
+from perception.types import Calibration, Detection, FrameKey
+
+Item = TypeVar("Item", SourceTruth, LampTruth, Detection)
 
 GATE_PX = 3.0
 MIN_VISIBLE_FRACTION = 0.5
@@ -73,6 +77,14 @@ def image_radius_px(truth: SourceTruth, calibration: Calibration) -> float:
         return 0.0
     angle_rad = math.asin(calibration.source_radius_m / truth.range_m)
     return float(flare_model.image_radius_px(truth.u_px, truth.v_px, angle_rad, calibration))
+
+
+def by_frame(items: Iterable[Item]) -> dict[FrameKey, list[Item]]:
+    """Sort what belongs to frames by camera and index; a frame without any has no entry, or an empty list."""
+    frames: dict[FrameKey, list[Item]] = defaultdict(list)
+    for item in items:
+        frames[item.camera, item.index].append(item)
+    return frames
 
 
 def on_a_lamp(detection: Detection, outlines_px: Sequence[Outline]) -> bool:

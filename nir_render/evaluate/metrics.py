@@ -1,26 +1,23 @@
 """A stack's detections against truth and against the physical limit, as numbers."""
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.evaluate.match import countable, image_radius_px, match, on_a_lamp
+from nir_render.evaluate.match import by_frame, countable, image_radius_px, match, on_a_lamp
 from nir_render.evaluate.sets import SetEvaluation
 from nir_render.truth.lamps import LampTruth, Outline
 from nir_render.truth.sources import SourceTruth
-from perception.model.bearing import direction_camera
+from perception.model.bearing import pixel_turn
 from perception.model.fisher import flare_limits, limit_box
 from perception.model.flare import PixelBox, flare_image, has_image
 from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import at_gain
 from perception.types import Calibration, Detection, FrameKey
-
-Item = TypeVar("Item", SourceTruth, LampTruth, Detection)
 
 _OVERLAP_SIGMAS = 6.0
 
@@ -76,8 +73,8 @@ def evaluate(
     lamps
         Where lamps and the sun stand: what is found there is counted apart.
     """
-    truth_in, lamps_in = _by_frame(truth), _by_frame(lamps)
-    found_in = {name: _by_frame(found) for name, found in detections.items()}
+    truth_in, lamps_in = by_frame(truth), by_frame(lamps)
+    found_in = {name: by_frame(found) for name, found in detections.items()}
     frame_scores = [
         _score_frame(
             truth_in.get(key, []),
@@ -186,10 +183,9 @@ def source_limits(
         shone_e = sum(other[own > 0.01 * own.max()].mean() for other in others)
         background_e = max(background_e - float(shone_e), truth.dark_e)
     limit = flare_limits(camera, flares, background_e)[0]
-    steps_px = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
-    left, right, above, below = direction_camera(steps_px + np.array([truth.u_px, truth.v_px]), calibration)
-    along_u_rad = float(np.linalg.norm(right - left)) * limit.u_sigma_px
-    along_v_rad = float(np.linalg.norm(below - above)) * limit.v_sigma_px
+    ((turn_u, turn_v),) = pixel_turn([[truth.u_px, truth.v_px]], calibration)
+    along_u_rad = float(np.linalg.norm(turn_u)) * limit.u_sigma_px
+    along_v_rad = float(np.linalg.norm(turn_v)) * limit.v_sigma_px
     return limit.range_sigma_m, math.degrees(math.hypot(along_u_rad, along_v_rad))
 
 
@@ -252,10 +248,3 @@ def angle_deg(one: Sequence[float], other: Sequence[float]) -> float:
 def _rms(values: Sequence[float]) -> float | None:
     finite = [value for value in values if math.isfinite(value)]
     return float(np.sqrt(np.mean(np.square(finite)))) if finite else None
-
-
-def _by_frame(items: Iterable[Item]) -> dict[FrameKey, list[Item]]:
-    frames: dict[FrameKey, list[Item]] = defaultdict(list)
-    for item in items:
-        frames[item.camera, item.index].append(item)
-    return frames

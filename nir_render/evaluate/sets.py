@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from nir_render.evaluate.match import GATE_PX, countable, image_radius_px, on_a_lamp
+from nir_render.evaluate.match import GATE_PX, by_frame, countable, image_radius_px, on_a_lamp
 from nir_render.truth.lamps import LampTruth
 from nir_render.truth.sources import SourceTruth
 from perception.types import Calibration, Detection, FrameKey, Measurement, MirrorPlane
@@ -87,14 +87,12 @@ def evaluate_sets(
     rows: list[list[SourceTruth]] = [[] for _ in sets]
     for row in truth:
         rows[of_frame[row.camera, row.index]].append(row)
-    outlines: dict[FrameKey, list[Any]] = {}
-    for lamp in lamps:
-        outlines.setdefault((lamp.camera, lamp.index), []).append(lamp.outline_px)
+    outlines = {key: [lamp.outline_px for lamp in own] for key, own in by_frame(lamps).items()}
     said: dict[str, list[list[Measurement]]] = {name: [[] for _ in sets] for name in measurements}
     for name, found in measurements.items():
         for each in found:
             said[name][of_frame[each.detections[0][:2]]].append(each)
-    places = {name: _places(found) for name, found in detections.items()}
+    places = {name: by_frame(found) for name, found in detections.items()}
     scores: list[SetScore] = []
     false_alarms: dict[str, list[tuple[int, Measurement]]] = {name: [] for name in measurements}
     splits = dict.fromkeys(measurements, 0)
@@ -174,13 +172,6 @@ def _pairs(apart: Values) -> list[tuple[int, int]]:
     within = apart <= 1.0
     rows, columns = linear_sum_assignment(np.where(within, apart, 1.0 + len(apart)))
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if within[i, j]]
-
-
-def _places(detections: Sequence[Detection]) -> dict[FrameKey, list[Detection]]:
-    by_frame: dict[FrameKey, list[Detection]] = {}
-    for detection in detections:
-        by_frame.setdefault((detection.camera, detection.index), []).append(detection)
-    return by_frame
 
 
 def _on_lamps(

@@ -167,12 +167,9 @@ def _read(folder: Path) -> Reference:
         ReferenceShot(light, electrons[f"{frame.camera}.{frame.index}"], frame)
         for light, frame in zip(facts["light_of_frames"], frames, strict=True)
     ]
-    files = sorted(folder.glob("detections.*.jsonl"))
     detections = {
-        file.name.removeprefix("detections.").removesuffix(".jsonl"): tuple(
-            map(parse_detection, run_folder.read_lines(file))
-        )
-        for file in files
+        name: tuple(map(parse_detection, run_folder.read_lines(file)))
+        for name, file in run_folder.detection_files(folder).items()
     }
     return Reference(
         document=facts["document"],

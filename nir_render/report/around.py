@@ -16,6 +16,7 @@ from nir_render.report.drawing import Drawing, legend, sheet, svg_of
 from nir_render.report.parts import Table
 from nir_render.report.style import INK, LIMIT, MATPLOTLIB, TRUTH, look
 from nir_render.report.wording import counted, metres, share
+from perception.rig.frame_sets import robot_of
 from perception.types import Measurement, MirrorPlane
 
 _SIGMAS = 3.0
@@ -68,7 +69,7 @@ def _picture(around: SetEvaluation) -> Drawing | None:
     counts = np.bincount([score.number for score in around.scores])
     number = int(np.argmax(counts))
     scores = [score for score in around.scores if score.number == number]
-    robot = around.sets[number][0][0].rpartition(".")[0]
+    robot = robot_of(around.sets[number][0][0])
     names = list(around.summary)
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(7.4)

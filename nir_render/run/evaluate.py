@@ -20,13 +20,13 @@ from nir_render.truth.sources import SourceTruth, parse_truth
 from perception import (
     Calibration,
     Detection,
+    Recording,
     RecordingError,
     frame_sets,
     parse_detection,
     parse_measurement,
     parse_mirror,
     read_frame,
-    read_frame_records,
     read_recording,
 )
 from perception.rig.frame_sets import robot_of
@@ -42,7 +42,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         The folder has no truth or no detections, or a file is broken.
     """
     started = time.perf_counter()
-    paths = sorted(folder.glob("detections.*.jsonl"))
+    paths = run_folder.detection_files(folder)
     truth_path = folder / run_folder.TRUTH
     if not truth_path.is_file():
         raise InputError(
@@ -56,16 +56,13 @@ def evaluate_run(folder: Path) -> Evaluation:
         calibrations = recording.calibrations
         keys = [(record.camera, record.index) for record in recording.records]
         truth = parse_lines(truth_path, parse_truth)
-        detections = {
-            path.name.removeprefix("detections.").removesuffix(".jsonl"): parse_lines(path, parse_detection)
-            for path in paths
-        }
+        detections = {name: parse_lines(path, parse_detection) for name, path in paths.items()}
         lamps_path = folder / run_folder.LAMPS
         lamps = parse_lines(lamps_path, parse_lamp) if lamps_path.is_file() else []
         check_frames_known(keys, truth, lamps, detections, calibrations, folder)
         result = evaluate(keys, truth, calibrations, detections, lamps)
-        result = _with_sets(folder, result, truth, calibrations, detections, lamps)
-        preview = _preview(folder, keys, calibrations, result)
+        result = _with_sets(recording, result, truth, detections, lamps)
+        preview = _preview(recording, keys, result)
     except InputError:
         raise
     except RecordingError as error:
@@ -104,21 +101,21 @@ def check_frames_known(
 
 
 def _with_sets(
-    folder: Path,
+    recording: Recording,
     result: Evaluation,
     truth: Sequence[SourceTruth],
-    calibrations: Mapping[str, Calibration],
     detections: Mapping[str, Sequence[Detection]],
     lamps: Sequence[LampTruth],
 ) -> Evaluation:
     """Add the scores of what the rigs measured, where the folder has `measurements.*.jsonl`."""
+    folder = recording.folder
     paths = {name: folder / f"measurements.{name}.jsonl" for name in detections}
     measurements = {
         name: parse_lines(path, parse_measurement) for name, path in paths.items() if path.is_file()
     }
     if not measurements:
         return result
-    records = frame_sets(read_frame_records(folder))
+    records = frame_sets(recording.records)
     sets = [[(frame.camera, frame.index) for frame in each] for each in records]
     began = {(robot_of(each[0].camera), each[0].time_s): number for number, each in enumerate(records)}
     mirrors = {
@@ -138,7 +135,7 @@ def _with_sets(
                     f"{paths[name]}: speaks of detection {number} of frame {index} of {camera}, which "
                     f"detections.{name}.jsonl does not have; run 'nir-render perceive {folder}' again"
                 )
-    around = evaluate_sets(sets, truth, calibrations, measurements, detections, lamps, mirrors)
+    around = evaluate_sets(sets, truth, recording.calibrations, measurements, detections, lamps, mirrors)
     summary = dict(result.summary)
     summary["estimators"] = {
         name: {**numbers, **around.summary.get(name, {})} for name, numbers in summary["estimators"].items()
@@ -146,19 +143,17 @@ def _with_sets(
     return replace(result, summary=summary, around=around)
 
 
-def _preview(
-    folder: Path, keys: Sequence[FrameKey], calibrations: Mapping[str, Calibration], result: Evaluation
-) -> bytes:
+def _preview(recording: Recording, keys: Sequence[FrameKey], result: Evaluation) -> bytes:
     from nir_render.report.preview import preview_png  # Matplotlib loads only where something is drawn
 
-    at = {(record.camera, record.index): record for record in read_frame_records(folder)}
+    at = {(record.camera, record.index): record for record in recording.records}
     estimators = list(result.summary["estimators"])
     return preview_png(
         keys=keys,
         scores=result.scores,
         ghosts=result.ghosts,
         estimators=estimators,
-        load=lambda key: read_frame(folder, at[key]),
-        calibrations=calibrations,
-        title=folder.resolve().name,
+        load=lambda key: read_frame(recording.folder, at[key]),
+        calibrations=recording.calibrations,
+        title=recording.folder.resolve().name,
     )

@@ -93,6 +93,21 @@ def locked(file: Path, taken: str) -> Iterator[None]:
         yield
 
 
+def detection_files(folder: Path) -> dict[str, Path]:
+    """Return the files of detections in a folder, by the name of their estimator."""
+    paths = sorted(folder.glob("detections.*.jsonl"))
+    return {path.name.removeprefix("detections.").removesuffix(".jsonl"): path for path in paths}
+
+
+def files_beside(page: Path) -> list[str]:
+    """Return the names of the files that lie beside a page, to be linked to."""
+    return sorted(
+        path.name
+        for path in page.parent.iterdir()
+        if path.is_file() and not path.name.startswith(".") and path.name != page.name
+    )
+
+
 def write_file(path: Path, data: bytes) -> None:
     """Write a file aside, sync it and rename it into its place.
 

@@ -31,11 +31,7 @@ def report_run(folder: Path, result: Evaluation) -> Path:
             calibrations=read_calibrations(folder),
             manifest=run_folder.read_json(folder / run_folder.MANIFEST) if has_manifest else {},
             folder_name=folder.resolve().name,
-            files=sorted(
-                path.name
-                for path in folder.iterdir()
-                if path.is_file() and not path.name.startswith(".") and path.name != "report.html"
-            ),
+            files=run_folder.files_beside(folder / "report.html"),
         )
     except RecordingError as error:
         raise InputError(str(error)) from None

@@ -6,6 +6,8 @@ from numpy.typing import ArrayLike, NDArray
 from perception.model.lens import unproject
 from perception.types import Calibration
 
+_HALF_PIXELS = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+
 
 def direction_camera(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:
     """Back-project pixels to unit directions in camera axes (x right, y down, z forward).
@@ -42,6 +44,16 @@ def field_angle_rad(points_px: ArrayLike, calibration: Calibration) -> NDArray[n
 def angle_from_axis_rad(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angle between the optical axis and directions in camera axes, shape (..., 3) → (...)."""
     return np.arctan2(np.hypot(direction[..., 0], direction[..., 1]), direction[..., 2])
+
+
+def pixel_turn(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:
+    """By how much the direction turns over a pixel along u, and along v: shape (n, 2, 3), in camera axes.
+
+    Between half a pixel before and half a pixel beyond, of places of shape (n, 2). Lengths are angles in rad.
+    """
+    around_px = np.asarray(points_px, dtype=np.float64)[:, None, :] + _HALF_PIXELS
+    around = direction_camera(around_px.reshape(-1, 2), calibration).reshape(-1, 4, 3)
+    return np.asarray(around[:, 1::2] - around[:, 0::2])
 
 
 def bearing_body(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:

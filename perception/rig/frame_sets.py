@@ -9,8 +9,8 @@ from typing import Protocol, TypeVar
 _PERIOD_S = 0.1
 
 
-class Timed(Protocol):
-    """What says of which camera it is, and when its exposure began: a frame, or its record."""
+class Exposed(Protocol):
+    """What says when a camera exposed, and how: a frame, or its record."""
 
     @property
     def camera(self) -> str:
@@ -19,10 +19,6 @@ class Timed(Protocol):
     @property
     def time_s(self) -> float:
         """Start of the exposure."""
-
-
-class Exposed(Timed, Protocol):
-    """What also says how long it was exposed: all that a set need know of a frame beside its detections."""
 
     @property
     def exposure_s(self) -> float:

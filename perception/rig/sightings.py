@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import bearing_body
+from perception.model.bearing import bearing_body, pixel_turn
 from perception.rig.frame_sets import Exposed
 from perception.rig.rays import UNKNOWN_RANGE, Rays
 from perception.types import Calibration, Detection, bearing_axes
@@ -28,8 +28,6 @@ FARTHEST_KNOWN_M = 1e4
 CAMERAS_SHARE, CAMERAS_MOST = 0.5, 0.01
 """The part of the common error's variance that is a camera's own, as its K was calibrated by itself, and
 the most that it is of a range. The rest is the source's, as LEDs differ, and shared by all cameras."""
-
-_STEPS_PX = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +151,6 @@ def _bearings(hits: Sequence[Detection], calibrations: Mapping[str, Calibration]
 
 def _angular_rad2(places_px: Array, sigmas_px: Array, axes: Array, calibration: Calibration) -> Array:
     """Return the covariance of bearings' angles to the left and upwards, shape (n, 2, 2)."""
-    around = bearing_body((places_px[:, None, :] + _STEPS_PX).reshape(-1, 2), calibration).reshape(-1, 4, 3)
-    turn = around[:, 1::2] - around[:, 0::2]  # by a pixel along u, and along v
+    turn = pixel_turn(places_px, calibration) @ calibration.rotation_body_camera.T
     slope = axes[:, :2] @ np.swapaxes(turn, 1, 2) * sigmas_px[:, None, :]
     return np.asarray(slope @ np.swapaxes(slope, 1, 2))

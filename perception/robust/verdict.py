@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.bearing import direction_camera
+from perception.model.bearing import pixel_turn
 from perception.model.layout import UNUSABLE
 from perception.robust.clusters import Candidate
 from perception.robust.goodness import MODEL_ERROR
@@ -23,7 +23,6 @@ _DISC_FILLS = (0.88, 1.12)
 _MOST_ASPECT = 1.5
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _LEAST_PX, _LEAST_SHARE = 1.0, 0.15
-_PIXEL_STEPS = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
 _FLANK_PX, _FLANK_SHARE = 3.0, 0.25
 
 
@@ -131,8 +130,8 @@ def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     box, calibration = member.blob.box, prepared.calibration
     rows, columns = prepared.shape
     cut = box.top == 0 or box.left == 0 or box.top + box.height == rows or box.left + box.width == columns
-    around = direction_camera(np.array([member.u_px, member.v_px]) + _PIXEL_STEPS, calibration)
-    long_rad, short_rad = map(float, np.linalg.svd(around[1::2] - around[::2], compute_uv=False))
+    (turn,) = pixel_turn([[member.u_px, member.v_px]], calibration)
+    long_rad, short_rad = map(float, np.linalg.svd(turn, compute_uv=False))
     most_aspect = _MOST_ASPECT * long_rad / short_rad
     fill = member.blob.area_px / (0.25 * math.pi * box.height * box.width)
     aspect = max(box.height, box.width) / min(box.height, box.width)

@@ -40,11 +40,7 @@ def report_recording(folder: Path) -> Path:
             load=load,
             calibrations=recording.calibrations,
             folder_name=folder.resolve().name,
-            files=sorted(
-                path.name
-                for path in folder.iterdir()
-                if path.is_file() and not path.name.startswith(".") and path.name != "report.html"
-            ),
+            files=run_folder.files_beside(folder / "report.html"),
         )
     except RecordingError as error:
         raise InputError(str(error)) from None
@@ -55,11 +51,11 @@ def report_recording(folder: Path) -> Path:
 
 def _detections(folder: Path, known: set[FrameKey]) -> dict[str, dict[FrameKey, list[Detection]]]:
     """Return the detections of a folder, by estimator and frame."""
-    paths = sorted(folder.glob("detections.*.jsonl"))
+    paths = run_folder.detection_files(folder)
     if not paths:
         raise InputError(f"{folder}: there are no detections; run 'nir-render perceive {folder}' first")
     found: dict[str, dict[FrameKey, list[Detection]]] = {}
-    for path in paths:
+    for name, path in paths.items():
         by_frame: dict[FrameKey, list[Detection]] = defaultdict(list)
         for one in parse_lines(path, parse_detection):
             if (one.camera, one.index) not in known:
@@ -68,5 +64,5 @@ def _detections(folder: Path, known: set[FrameKey]) -> dict[str, dict[FrameKey, 
                     "take those lines out, or perceive again"
                 )
             by_frame[one.camera, one.index].append(one)
-        found[path.name.removeprefix("detections.").removesuffix(".jsonl")] = dict(by_frame)
+        found[name] = dict(by_frame)
     return found
