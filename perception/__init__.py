@@ -64,7 +64,18 @@ from perception.paper import PaperRegression, regress_paper_range_constant
 from perception.rig.frame_sets import frame_sets
 from perception.rig.measure_set import detect_set, measure_set
 from perception.rig.warm_up import warm_up
-from perception.types import Calibration, Detection, Measurement, MirrorPlane, RawFrame, SetMeasurements
+from perception.types import (
+    Calibration,
+    Detection,
+    Measurement,
+    Message,
+    MirrorPlane,
+    Odometry,
+    RawFrame,
+    SetMeasurements,
+    Signal,
+    Track,
+)
 
 __all__ = [
     "ESTIMATORS",
@@ -77,7 +88,9 @@ __all__ = [
     "FlareLimit",
     "FrameRecord",
     "Measurement",
+    "Message",
     "MirrorPlane",
+    "Odometry",
     "OwnEstimator",
     "OwnSetEstimator",
     "PaperRegression",
@@ -88,6 +101,8 @@ __all__ = [
     "Recording",
     "RecordingError",
     "SetMeasurements",
+    "Signal",
+    "Track",
     "calibrate_rail",
     "calibration_document",
     "detect",

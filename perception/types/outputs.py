@@ -1,120 +1,11 @@
-"""What perception reads and what it says: raw frames, calibration, detections, measurements of a rig.
-
-Pixel coordinates follow OpenCV: (0, 0) is the centre of the top left pixel, u to the right, v down.
-Camera axes: x right, y down, z forward. Body axes: x forward, y left, z up.
-"""
+"""What perception says: detections, measurements of a rig, tracks, what they send."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
-FrameKey = tuple[str, int]
-"""Which frame of a recording: camera and index."""
-
-
-@dataclass(frozen=True, eq=False)
-class RawFrame:
-    """One raw frame as the sensor delivers it, without scaling or gamma.
-
-    `time_s` is the start of the exposure of row 0, `line_time_s` the delay between rows (0 for a global
-    shutter), `gain` the factor on the calibrated system gain (1: as calibrated), `data_dn` the counts,
-    uint16, shape (rows, columns).
-    """
-
-    camera: str
-    index: int
-    time_s: float
-    exposure_s: float
-    data_dn: NDArray[np.uint16]
-    black_level_dn: float
-    line_time_s: float = 0.0
-    gain: float = 1.0
-
-    def _repr_png_(self) -> bytes:
-        """Show the frame as a picture in a notebook, tone-mapped."""
-        from perception.picture import frame_png
-
-        return frame_png(self.data_dn, self.black_level_dn)
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """All that perception may know about one camera, and about the sources it looks for.
-
-    Attributes
-    ----------
-    camera
-        Name, `robot.camera`.
-    width_px, height_px, fx_px, fy_px, cx_px, cy_px
-        Intrinsics.
-    lens_model, distortion
-        `rectilinear`, or a model of OpenCV's with its coefficients in OpenCV's order: `brown_conrady` (k1,
-        k2, p1, p2[, k3[, k4, k5, k6]]) or `fisheye` (k1, k2, k3, k4).
-    rotation_body_camera
-        Rotation that takes camera axes to body axes, shape (3, 3).
-    position_body_m
-        The camera's centre in body axes, shape (3,).
-    system_gain_dn_per_e, read_noise_e, black_level_dn, saturation_dn, bit_depth
-        EMVA 1288 linear model. A pixel at or above `saturation_dn` is clipped.
-    dsnu_e, prnu
-        Standard deviations of the pixels' fixed offsets and relative responses (EMVA 1288). Which pixel
-        has which is not known: they add to the noise of a place, and do not average over frames.
-    psf_sigma_px
-        Standard deviation of the Gaussian point spread function, without the pixel's own aperture.
-    response_angle_rad, response_relative
-        Response (filter, vignetting) against field angle (increasing from 0), relative to the axis, shape
-        (n,) each.
-        The cosine of the tilted lens aperture is not part of it.
-    range_constant_dn_m2_per_s
-        K of the *integrated* flux: flux_dn = K · exposure · cos θ · response(θ) / range².
-    range_constant_paper_dn_m2_per_s
-        K of the paper's mean grey value (its eq. 1), from the paper's own regression (Exp1); NaN where its
-        detector finds too little to calibrate with.
-    source_radius_m
-        Radius of a source, a sphere.
-    wavelength_m
-        Centre wavelength.
-    extinction_per_m
-        Of the fog, 0 in clear air. Where it is not known a σ says so (0.05 /m: anything from clear air to
-        a visibility of 40 m): ranges by flux are then no better than that allows.
-    own_sources_body_m
-        Where the robot's own sources sit, in body axes, shape (n, 3): mirrors show them too.
-    sigma
-        Standard deviation of entries, by field name; an entry that is missing is taken as exact.
-    """
-
-    camera: str
-    width_px: int
-    height_px: int
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    rotation_body_camera: NDArray[np.float64]
-    position_body_m: NDArray[np.float64]
-    system_gain_dn_per_e: float
-    read_noise_e: float
-    black_level_dn: float
-    saturation_dn: int
-    bit_depth: int
-    psf_sigma_px: float
-    response_angle_rad: NDArray[np.float64]
-    response_relative: NDArray[np.float64]
-    range_constant_dn_m2_per_s: float
-    range_constant_paper_dn_m2_per_s: float
-    source_radius_m: float
-    wavelength_m: float
-    sigma: Mapping[str, float] = field(default_factory=dict)
-    lens_model: str = "rectilinear"
-    distortion: tuple[float, ...] = ()
-    dsnu_e: float = 0.0
-    prnu: float = 0.0
-    extinction_per_m: float = 0.0
-    own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +166,111 @@ class SetMeasurements:
     planes: tuple[MirrorPlane, ...] = ()
     extinction_per_m: float = math.nan
     extinction_sigma_per_m: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One source followed over time, as it is known at one time.
+
+    Attributes
+    ----------
+    robot
+        The observer's name.
+    time_s
+        When it is as said.
+    track
+        Its number, which it keeps for life and no other track of the observer ever has.
+    position_body_m, velocity_body_m_per_s
+        Where it is from the observer's origin, and how it moves over ground, in the observer's body axes at
+        `time_s`, shape (3,) each.
+    covariance
+        Of both, in this order, in m, s: shape (6, 6).
+    detections
+        Of which detections its measurement is made, as in `Measurement`; empty where it was not seen (dark,
+        hidden, out of view) and is predicted.
+    unseen_s
+        Time since it was last seen, 0 if it is.
+    identity
+        Who it says it is, None as long as it has not said so.
+    ghost
+        Whether it is a mirror image, by all that was measured of it so far.
+    """
+
+    robot: str
+    time_s: float
+    track: int
+    position_body_m: NDArray[np.float64]
+    velocity_body_m_per_s: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    detections: tuple[tuple[str, int, int], ...] = ()
+    unseen_s: float = 0.0
+    identity: str | None = None
+    ghost: Ghost = "no"
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """How bright one track was over time: what a decoder reads.
+
+    Attributes
+    ----------
+    robot, track
+        The observer's name, and the track's number.
+    time_s, exposure_s
+        Mid-exposure at the source's row, increasing, and how long each exposure was, shape (n,) each. A
+        dropped frame is missing.
+    level
+        Measured brightness over what it is when lit at the predicted place: 0 dark, about 1 lit, shape (n,).
+        Between them where an edge falls into the exposure. One factor common to all (the source's own flux,
+        the range constant) is not known better than to some 10 %.
+    sigma_dark, sigma_lit
+        Standard deviation of `level` where the source is dark, and where it is lit, shape (n,) each; infinite
+        where nothing is known: hidden, out of view, merged with another.
+    """
+
+    robot: str
+    track: int
+    time_s: NDArray[np.float64]
+    exposure_s: NDArray[np.float64]
+    level: NDArray[np.float64]
+    sigma_dark: NDArray[np.float64]
+    sigma_lit: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Message:
+    """What one source said.
+
+    Attributes
+    ----------
+    robot, track
+        The observer's name, and the number of the track that said it.
+    start_s, end_s
+        From the first start bit to the end of the last stop bit that was read.
+    word
+        The payload, 0 to 127.
+    command
+        What it means: one of the sixteen commands for 0 to 15, the ASCII character for 32 to 126.
+    confidence
+        The probability that it is this word.
+    frames
+        How many of the repetitions were read.
+    identity
+        Who says it, None where nobody has said so.
+    ambiguous_with
+        The number of another track that may have said it instead.
+    """
+
+    robot: str
+    track: int
+    start_s: float
+    end_s: float
+    word: int
+    command: str
+    confidence: float
+    frames: int
+    identity: str | None = None
+    ambiguous_with: int | None = None
 
 
 def bearing_axes(bearing: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,134 @@
+"""What perception reads: raw frames, calibration, the robot's own odometry.
+
+Pixel coordinates follow OpenCV: (0, 0) is the centre of the top left pixel, u to the right, v down.
+Camera axes: x right, y down, z forward. Body axes: x forward, y left, z up.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FrameKey = tuple[str, int]
+"""Which frame of a recording: camera and index."""
+
+
+@dataclass(frozen=True, eq=False)
+class RawFrame:
+    """One raw frame as the sensor delivers it, without scaling or gamma.
+
+    `time_s` is the start of the exposure of row 0, `line_time_s` the delay between rows (0 for a global
+    shutter), `gain` the factor on the calibrated system gain (1: as calibrated), `data_dn` the counts,
+    uint16, shape (rows, columns).
+    """
+
+    camera: str
+    index: int
+    time_s: float
+    exposure_s: float
+    data_dn: NDArray[np.uint16]
+    black_level_dn: float
+    line_time_s: float = 0.0
+    gain: float = 1.0
+
+    def _repr_png_(self) -> bytes:
+        """Show the frame as a picture in a notebook, tone-mapped."""
+        from perception.picture import frame_png
+
+        return frame_png(self.data_dn, self.black_level_dn)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """All that perception may know about one camera, and about the sources it looks for.
+
+    Attributes
+    ----------
+    camera
+        Name, `robot.camera`.
+    width_px, height_px, fx_px, fy_px, cx_px, cy_px
+        Intrinsics.
+    lens_model, distortion
+        `rectilinear`, or a model of OpenCV's with its coefficients in OpenCV's order: `brown_conrady` (k1,
+        k2, p1, p2[, k3[, k4, k5, k6]]) or `fisheye` (k1, k2, k3, k4).
+    rotation_body_camera
+        Rotation that takes camera axes to body axes, shape (3, 3).
+    position_body_m
+        The camera's centre in body axes, shape (3,).
+    system_gain_dn_per_e, read_noise_e, black_level_dn, saturation_dn, bit_depth
+        EMVA 1288 linear model. A pixel at or above `saturation_dn` is clipped.
+    dsnu_e, prnu
+        Standard deviations of the pixels' fixed offsets and relative responses (EMVA 1288). Which pixel
+        has which is not known: they add to the noise of a place, and do not average over frames.
+    psf_sigma_px
+        Standard deviation of the Gaussian point spread function, without the pixel's own aperture.
+    response_angle_rad, response_relative
+        Response (filter, vignetting) against field angle (increasing from 0), relative to the axis, shape
+        (n,) each.
+        The cosine of the tilted lens aperture is not part of it.
+    range_constant_dn_m2_per_s
+        K of the *integrated* flux: flux_dn = K · exposure · cos θ · response(θ) / range².
+    range_constant_paper_dn_m2_per_s
+        K of the paper's mean grey value (its eq. 1), from the paper's own regression (Exp1); NaN where its
+        detector finds too little to calibrate with.
+    source_radius_m
+        Radius of a source, a sphere.
+    wavelength_m
+        Centre wavelength.
+    extinction_per_m
+        Of the fog, 0 in clear air. Where it is not known a σ says so (0.05 /m: anything from clear air to
+        a visibility of 40 m): ranges by flux are then no better than that allows.
+    own_sources_body_m
+        Where the robot's own sources sit, in body axes, shape (n, 3): mirrors show them too.
+    sigma
+        Standard deviation of entries, by field name; an entry that is missing is taken as exact.
+    """
+
+    camera: str
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    rotation_body_camera: NDArray[np.float64]
+    position_body_m: NDArray[np.float64]
+    system_gain_dn_per_e: float
+    read_noise_e: float
+    black_level_dn: float
+    saturation_dn: int
+    bit_depth: int
+    psf_sigma_px: float
+    response_angle_rad: NDArray[np.float64]
+    response_relative: NDArray[np.float64]
+    range_constant_dn_m2_per_s: float
+    range_constant_paper_dn_m2_per_s: float
+    source_radius_m: float
+    wavelength_m: float
+    sigma: Mapping[str, float] = field(default_factory=dict)
+    lens_model: str = "rectilinear"
+    distortion: tuple[float, ...] = ()
+    dsnu_e: float = 0.0
+    prnu: float = 0.0
+    extinction_per_m: float = 0.0
+    own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """Where a robot takes itself to be at one time, in a frame of its own that starts anywhere and drifts.
+
+    `position_m`, shape (3,), is the body's origin in that frame, `rotation`, shape (3, 3), takes body axes to
+    its axes. Per axis, `position_sigma_m` and `rotation_sigma_rad` are the errors of each record by itself
+    (tilt, vibration); the walks say by how much the error of a later record departs, by the root of time.
+    """
+
+    robot: str
+    time_s: float
+    position_m: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    position_sigma_m: float = 0.0
+    rotation_sigma_rad: float = 0.0
+    position_walk_m_per_sqrt_s: float = 0.0
+    rotation_walk_rad_per_sqrt_s: float = 0.0
