@@ -33,6 +33,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.geometry": (),
     "nir_render.errors": (),
     "perception.pipeline": (),
+    "perception.photometry": (),
     "perception.track": (),
     "perception.messages": (),
     "perception.rig": (),
