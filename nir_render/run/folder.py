@@ -25,6 +25,8 @@ SCENE = "scene.yaml"
 FRAMES = "frames.jsonl"
 TRUTH = "truth.jsonl"
 LAMPS = "lamps.jsonl"
+SENT = "sent.jsonl"
+POSES = "poses.jsonl"
 
 Item = TypeVar("Item")
 
