@@ -1,0 +1,106 @@
+"""Two tracks that share one flare: light of both, told by its range, feeds both with its bearing alone."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.track.association import log_clutter
+from perception.track.bank import Bank
+from perception.track.observations import LEAST_RANGE_M, Observations
+from perception.track.settings import TrackerSettings
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+FLAGGED_ODDS = 2.0
+"""What it adds that the estimator itself took a flare for several."""
+
+
+class Shared(NamedTuple):
+    """One measurement for two tracks: which, and how far these are apart."""
+
+    measurement: int
+    tracks: tuple[int, int]
+    apart_rad: float
+
+
+def shared_flares(
+    bank: Bank,
+    seen: Observations,
+    observer_m: Array,
+    gain: Array,
+    taken: Indices,
+    clutter: float,
+    settings: TrackerSettings,
+) -> list[Shared]:
+    """Tell which measurements are the light of two tracks rather than what was assigned.
+
+    Fluxes add up, so two at r_a and r_b look like one at (r_a⁻² + r_b⁻²)^−½, at the bearing that their fluxes
+    weigh. How far a track *seems* by flux is known better than how far it is: the shared error of its range
+    cancels, and a change by a tenth tells.
+
+    Parameters
+    ----------
+    bank, seen, observer_m
+        Predicted confirmed tracks, measurements of the set, where the observer is.
+    gain, taken
+        Of each track the gain of its own measurement (0 if none) and which it is (−1), shape (n,).
+    clutter, settings
+        As in `gated_pairs`.
+    """
+    arm_m = bank.mean[:, :3] - observer_m
+    far_m = np.maximum(np.linalg.norm(arm_m, axis=1), LEAST_RANGE_M)
+    along = arm_m / far_m[:, None]
+    close = along @ along.T > math.cos(settings.resolution_rad)
+    firsts, seconds = np.nonzero(np.triu(close, 1))
+    found: list[Shared] = []
+    if not (len(firsts) and len(seen.range_m)):
+        return found
+    place = bank.covariance[:, :3, :3]
+    on_m2 = np.einsum("ni,nij,nj->n", along, place, along)
+    across_rad2 = (np.trace(place, axis1=1, axis2=2) - on_m2) / (2.0 * far_m**2)
+    missed = math.log(1.0 - settings.seen_probability)
+    used: set[int] = set()
+    busy: set[int] = set()
+    for a, b in zip(firsts.tolist(), seconds.tolist(), strict=True):
+        pair = [a, b]
+        if used & {a, b}:
+            continue
+        seems_m = float(np.sum(far_m[pair] ** -2.0) ** -0.5)
+        share = seems_m**2 / far_m[pair] ** 2
+        bearing = share @ along[pair]
+        angle2 = np.sum((seen.bearing - bearing) ** 2, axis=1)
+        near = np.flatnonzero(np.isfinite(seen.range_m) & (angle2 < (3.0 * settings.resolution_rad) ** 2))
+        others = np.setdiff1d(taken, taken[pair])
+        for k in near.tolist():
+            if k in others or k in busy:
+                continue
+            load = seen.common_m[k] / seen.range_m[k] * far_m[pair]
+            crossed = np.einsum("ni,ni->n", along[pair], bank.common[pair, :3])
+            relative2 = np.maximum(on_m2[pair] + 2.0 * load * crossed + load**2, 0.0) / far_m[pair] ** 2
+            apart_rad = float(np.linalg.norm(along[a] - along[b]))
+            range2 = seen.noise_m2[k] + seems_m**2 * float(share**2 @ relative2)
+            lateral2 = (
+                float(share**2 @ across_rad2[pair])
+                + 0.5 * float(np.trace(seen.angle_rad2[k]))
+                + (0.2 * apart_rad) ** 2
+            ) * seems_m**2
+            chi2 = angle2[k] * seems_m**2 / lateral2 + (seen.range_m[k] - seems_m) ** 2 / range2
+            if chi2 > settings.gate_chi2:
+                continue
+            both = -0.5 * chi2 - math.log(lateral2) - 0.5 * math.log(range2) - 1.5 * math.log(2.0 * math.pi)
+            both += 2.0 * math.log(settings.seen_probability) + FLAGGED_ODDS * bool(seen.merged[k])
+            both -= float(
+                log_clutter(
+                    seen.range_m[k : k + 1], np.array([True]), clutter, settings.clutter_solid_angle_sr
+                )[0]
+            )
+            alone = float(np.sum(np.where(taken[pair] >= 0, gain[pair], missed)))
+            if both > alone:
+                found.append(Shared(k, (a, b), apart_rad))
+                used |= {a, b}
+                busy.add(k)
+                break
+    return found
