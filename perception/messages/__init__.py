@@ -1,0 +1,1 @@
+"""What sources say: the optical language, and decoders that read it out of tracks' signals."""

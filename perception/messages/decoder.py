@@ -1,0 +1,302 @@
+"""The maximum-likelihood decoder: whole packets over word, start and clock rate, with their probability.
+
+A signal is a chain of idle stretches (lit) and packets; a hidden semi-Markov model. Each explanation of all
+that was seen so far has a probability: packets at every start, on every clock rate, of every word, also those
+that began before the signal did or go on after it, and stretches that are neither. A message's confidence is
+the share of the explanations that hold it (forward recursion, and what is still under way). A rotated reading
+of a packet that was joined midway shares its probability with the true one until idle was seen, and is not
+given out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.messages.lattice import (
+    ROWS,
+    STEPS_PER_BIT,
+    Clocks,
+    Lattice,
+    add_samples,
+    moved_on,
+)
+from perception.messages.samples import LevelScale, likelihood_of_levels, usable_samples
+from perception.messages.settings import DecoderSettings
+from perception.messages.uart import FRAME_BITS, IDLE_BITS, meaning
+from perception.types import Message, Signal
+
+Array = NDArray[np.float64]
+
+_BLOCK = 3 * STEPS_PER_BIT  # steps that are taken in at once
+_MARGIN = 4  # steps that a sample's exposure may reach over its middle, and half a bit of decency
+_LAST_CHANCE = (IDLE_BITS + 1) * STEPS_PER_BIT  # steps after its end until a packet must have been settled
+_BACK = _LAST_CHANCE + 4 * _BLOCK  # steps that are kept before the longest packet
+_WORTH_ASKING = 15.0  # log-likelihood over idle from which a packet is looked into
+_GARBAGE = float(np.log(1e-3))  # log-probability that what starts is no packet
+_NEIGHBOURS = 6  # steps to either side that count as the same packet
+_FORGET_S = 12.0  # a gap after which a signal starts anew
+_BACKWARDS_S = 1.0  # a clock that jumps back by more starts anew; by less, its samples are left out
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A packet that may have been sent: its score with what came before, its start in steps, rate, word."""
+
+    score: float
+    start: int
+    rate: int
+    column: int
+
+
+class Decoder:
+    """Decodes one track's signal as it comes; what it remembers does not grow.
+
+    Samples that are not later than the last are left out; a clock that jumps back by more than a second, or
+    a gap of more than twelve, starts anew.
+    """
+
+    def __init__(self, robot: str, track: int, settings: DecoderSettings | None = None) -> None:
+        self._robot, self._track = robot, track
+        self._settings = DecoderSettings() if settings is None else settings
+        self._clocks = Clocks(self._settings)
+        self._begin_at = _BACK + self._clocks.longest  # the block's first step in the window
+        self._complete = self._begin_at + _BLOCK - _MARGIN  # the last step of which all samples are in
+        self._size = self._begin_at + _BLOCK + 2 * _MARGIN + self._clocks.longest
+        step_rate = self._settings.packets_per_s * self._clocks.step_s
+        self._log_start = float(np.log(step_rate / len(self._settings.words)))
+        self._log_garbage = float(np.log(step_rate)) + _GARBAGE
+        self._restart()
+
+    def _restart(self) -> None:
+        self._waiting: list[Array] = []
+        self._last_s = -np.inf
+        self._origin_s: float | None = None  # of step 0
+        self._done = 0  # steps by which the window has moved on
+        self._table = np.zeros((ROWS, self._size))
+        self._scale = LevelScale(self._settings.level_sigma)
+        # Before the signal: a packet may have been under way, begun at any step with the same probability.
+        rates = len(self._clocks.drifts)
+        self._before = np.full((rates, self._complete + 1), np.log(0.5 / self._clocks.longest))
+        self._before -= np.log(self._settings.packets_per_s * self._clocks.step_s)
+        self._idle = np.full(rates, np.log(0.5))
+        self._candidates: list[_Candidate] = []
+        self._spoken_until = -np.inf
+
+    def push(self, signal: Signal) -> tuple[Message, ...]:
+        """Take in samples of the track, later than those before; return the messages that they complete."""
+        rows = np.stack(
+            [signal.time_s, signal.exposure_s, signal.level, signal.sigma_dark, signal.sigma_lit]
+        ).astype(float)
+        messages: list[Message] = []
+        while rows.shape[1]:
+            time_s = rows[0]
+            later = time_s > np.maximum.accumulate(np.concatenate([[self._last_s], time_s[:-1]]))
+            jump = np.diff(time_s, prepend=self._last_s if np.isfinite(self._last_s) else time_s[0])
+            anew = np.flatnonzero((jump < -_BACKWARDS_S) | (jump > _FORGET_S))
+            until = int(anew[0]) if len(anew) else rows.shape[1]
+            messages += self._take(rows[:, :until][:, later[:until]])
+            rows = rows[:, until:]
+            if len(anew):
+                messages += self.finish()
+        return tuple(messages)
+
+    def finish(self) -> tuple[Message, ...]:
+        """Return what can be said of the samples still held, and forget the signal."""
+        messages: list[Message] = []
+        if self._origin_s is not None:
+            messages += self._block()
+            for _ in range(_LAST_CHANCE // _BLOCK + 1):
+                messages += self._block()
+        self._restart()
+        return tuple(messages)
+
+    def _take(self, rows: Array) -> list[Message]:
+        if not rows.shape[1]:
+            return []
+        if self._origin_s is None:
+            self._origin_s = float(rows[0, 0]) - self._begin_at * self._clocks.step_s
+        self._waiting.append(rows)
+        self._last_s = float(rows[0, -1])
+        messages: list[Message] = []
+        while self._last_s >= self._step_s(self._begin_at + _BLOCK):
+            messages += self._block()
+        return messages
+
+    def _step_s(self, step: float) -> float:
+        """Return the time of a step of the window."""
+        assert self._origin_s is not None
+        return self._origin_s + (step + self._done) * self._clocks.step_s
+
+    def _block(self) -> list[Message]:
+        """Take in the samples of the next block, and say what is now clear."""
+        self._learn()
+        lattice = Lattice(self._table, self._clocks)
+        self._recurse(lattice)
+        messages = self._settle(lattice)
+        moved_on(self._table, _BLOCK)
+        self._before[:, :-_BLOCK] = self._before[:, _BLOCK:]
+        top = float(self._idle.max())  # only differences matter
+        self._before -= top
+        self._idle -= top
+        self._candidates = [
+            _Candidate(one.score - top, one.start, one.rate, one.column) for one in self._candidates
+        ]
+        self._done += _BLOCK
+        return messages
+
+    def _learn(self) -> None:
+        if not self._waiting:
+            return
+        rows = np.concatenate(self._waiting, axis=1)
+        now = rows[0] < self._step_s(self._begin_at + _BLOCK)
+        self._waiting = [] if now.all() else [rows[:, ~now]]
+        time_s, exposure_s, level, dark, lit = rows[:, now]
+        samples = usable_samples(time_s, exposure_s, level, dark, lit, self._settings)
+        if len(samples):
+            score = likelihood_of_levels(samples, self._scale.learn(samples))
+            add_samples(self._table, samples, score, self._step_s(0), self._clocks.step_s)
+
+    def _recurse(self, lattice: Lattice) -> None:
+        """Go on with the probability of idle at each step, and note the best packet that ends there."""
+        ends = np.arange(self._complete - _BLOCK + 1, self._complete + 1)
+        best: _Candidate | None = None
+        dark = self._dark_in_reach()
+        for rate, length in enumerate(self._clocks.lengths):
+            starts = ends - length
+            before = self._before[rate, starts]
+            ended = before + lattice.garbage(starts, rate) + self._log_garbage
+            promising = lattice.promising(starts, rate) if dark else np.zeros(_BLOCK, bool)
+            if promising.any():
+                words = lattice.words(starts[promising], rate)
+                best = self._best(best, words, before[promising], starts[promising], rate)
+                ended[promising] = np.logaddexp(
+                    ended[promising], before[promising] + self._log_start + _log_sum(words)
+                )
+            idle = np.logaddexp.accumulate(np.concatenate([self._idle[rate : rate + 1], ended]))
+            self._before[rate, ends] = idle[1:]
+            self._idle[rate] = idle[-1]
+        if best is not None:
+            self._note(best)
+
+    def _dark_in_reach(self) -> bool:
+        """Return whether anything was dark for as long as a packet: an idle source costs nothing."""
+        first = self._complete - _BLOCK - self._clocks.longest
+        return float(np.maximum(self._table[0, first:], 0.0).sum()) > _WORTH_ASKING
+
+    def _best(
+        self,
+        best: _Candidate | None,
+        words: Array,
+        before: Array,
+        starts: NDArray[np.int64],
+        rate: int,
+    ) -> _Candidate | None:
+        row, column = np.unravel_index(np.argmax(words + before[:, None]), words.shape)
+        score = float(words[row, column] + before[row])
+        if words[row, column] < _WORTH_ASKING or (best is not None and best.score >= score):
+            return best
+        return _Candidate(score, int(starts[row]) + self._done, rate, int(column))
+
+    def _note(self, found: _Candidate) -> None:
+        """Keep a packet that may have been sent, unless a better one takes its place."""
+        if found.start + _MARGIN < self._spoken_until:
+            return
+        apart = self._clocks.longest - STEPS_PER_BIT
+        rivals = [one for one in self._candidates if abs(one.start - found.start) < apart]
+        if all(one.score < found.score for one in rivals):
+            self._candidates = [one for one in self._candidates if one not in rivals] + [found]
+
+    def _settle(self, lattice: Lattice) -> list[Message]:
+        """Give out the packets that have become clear; forget those that had their chance."""
+        messages: list[Message] = []
+        kept: list[_Candidate] = []
+        for one in self._candidates:
+            over = self._complete - (one.start - self._done + int(self._clocks.lengths[one.rate]))
+            message = self._message(one, lattice) if over >= _MARGIN else None
+            if message is not None:
+                messages.append(message)
+                self._spoken_until = one.start + float(self._clocks.lengths[one.rate])
+            elif over <= _LAST_CHANCE:
+                kept.append(one)
+        self._candidates = kept
+        return messages
+
+    def _message(self, one: _Candidate, lattice: Lattice) -> Message | None:
+        """Return a packet as a message if its probability is high enough."""
+        here = one.start - self._done
+        under_way = self._under_way(lattice)
+        total = np.logaddexp(self._idle, [_log_sum(row) for row in under_way])
+        logs, begins, ends = [], [], []
+        for rate, length in enumerate(self._clocks.lengths):
+            starts = np.arange(here - _NEIGHBOURS, min(here + _NEIGHBOURS, self._complete - length) + 1)
+            if not len(starts):
+                continue
+            score = lattice.words(starts, rate)[:, one.column] + self._log_start
+            after = np.array([self._after(under_way[rate], rate, int(end)) for end in starts + length])
+            logs.append(self._before[rate, starts] + score + after)
+            begins.append(starts)
+            ends.append(starts + length)
+        log = np.concatenate(logs)
+        confidence = min(float(np.exp(_log_sum(log) - _log_sum(total))), 1.0)
+        if confidence < self._settings.confidence:
+            return None
+        weight = np.exp(log - log.max())
+        begin = float(np.average(np.concatenate(begins), weights=weight))
+        end = float(np.average(np.concatenate(ends), weights=weight))
+        seen = np.flatnonzero(lattice.frames_seen(here, one.rate))
+        if not len(seen):
+            return None
+        repeats = self._settings.repeats
+        word = self._settings.words[one.column]
+        return Message(
+            robot=self._robot,
+            track=self._track,
+            start_s=self._step_s(begin + (end - begin) * int(seen[0]) / repeats),
+            end_s=self._step_s(begin + (end - begin) * (int(seen[-1]) + 1) / repeats),
+            word=word,
+            command=meaning(word),
+            confidence=confidence,
+            frames=len(seen),
+        )
+
+    def _under_way(self, lattice: Lattice) -> Array:
+        """Return the log-probability of packets that began and have not ended, shape (rates, starts).
+
+        Starts are the steps of a longest packet up to now; only clock rates that matter are looked into.
+        """
+        starts = np.arange(self._complete - self._clocks.longest + 1, self._complete + 1)
+        logs = np.full((len(self._clocks.drifts), len(starts)), -np.inf)
+        for rate in np.flatnonzero(self._idle > self._idle.max() - 8.0):
+            going = starts + self._clocks.lengths[rate] > self._complete
+            before = self._before[rate, starts]
+            logs[rate] = before + lattice.garbage(starts, rate) + self._log_garbage
+            asked = going & lattice.promising(starts, rate)
+            if asked.any():
+                words = _log_sum(lattice.words(starts[asked], rate))
+                logs[rate, asked] = np.logaddexp(logs[rate, asked], before[asked] + self._log_start + words)
+            logs[rate, ~going] = -np.inf
+        return logs
+
+    def _after(self, under_way: Array, rate: int, end: int) -> float:
+        """Return the log-probability of all that may follow a packet which ends at a step, up to now."""
+        first = self._complete - self._clocks.longest + 1
+        later = np.arange(max(end, first), self._complete + 1)
+        following = under_way[later - first] - self._before[rate, later]
+        return float(np.logaddexp(0.0, _log_sum(following)))
+
+
+def decode(signal: Signal, settings: DecoderSettings | None = None) -> tuple[Message, ...]:
+    """Return what a whole signal says: what a `Decoder` says that is fed it piece by piece."""
+    decoder = Decoder(signal.robot, signal.track, settings)
+    return decoder.push(signal) + decoder.finish()
+
+
+def _log_sum(logs: Array) -> Array:
+    """Return the logarithm of the sum over the last axis."""
+    if not logs.shape[-1]:
+        return np.full(logs.shape[:-1], -np.inf)
+    top = logs.max(axis=-1)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(top + np.log(np.exp(logs - top[..., None]).sum(axis=-1)))
