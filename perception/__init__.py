@@ -72,9 +72,11 @@ from perception.files.tracks import (
 )
 from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
+from perception.pipeline import Heard, Pipeline
 from perception.rig.frame_sets import frame_sets
 from perception.rig.measure_set import detect_set, measure_set
 from perception.rig.warm_up import warm_up
+from perception.track.tracker import Tracker
 from perception.types import (
     Calibration,
     Detection,
@@ -98,6 +100,7 @@ __all__ = [
     "EstimatorError",
     "FlareLimit",
     "FrameRecord",
+    "Heard",
     "Measurement",
     "Message",
     "MirrorPlane",
@@ -106,6 +109,7 @@ __all__ = [
     "OwnSetEstimator",
     "PaperRegression",
     "Picture",
+    "Pipeline",
     "RailCalibration",
     "RangeConstantFit",
     "RawFrame",
@@ -114,6 +118,7 @@ __all__ = [
     "SetMeasurements",
     "Signal",
     "Track",
+    "Tracker",
     "calibrate_rail",
     "calibration_document",
     "detect",

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from perception.messages.uart import packet_bits
 
 from nir_render.evaluate.tracks import Moment, SourceName
 from nir_render.truth.sent import SentTruth
+from perception.messages.uart import encode
 from perception.types import Message, Signal
 
 SEEN = 0.95
@@ -174,7 +174,7 @@ def _bits(
     bits = errors = 0
     for reception in receptions:
         packet = reception.sent
-        sent = packet_bits(packet.word)
+        sent = encode(packet.word)
         for signal in of_source[reception.observer, (packet.robot, packet.source, None)]:
             decided, known = _decided(signal, packet, len(sent))
             bits += int(known.sum())

@@ -14,8 +14,10 @@ from nir_render.run.manifest import enlarging_facts, noise_facts, noise_warning,
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Shot, simulate
+from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
 from nir_render.transport.cache import LightCache
-from perception import Calibration, calibration_document, encode_png16, frame_record
+from perception import Calibration, calibration_document, encode_png16, frame_record, odometry_record
+from perception.files.tracks import ODOMETRY
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done, and of all."""
@@ -56,6 +58,7 @@ def render_run(
             writer.add(shot)
             progress(done + 1, total)
         writer.finish()
+        _write_motion(scene, aside)
         run_folder.write_json(aside / run_folder.CALIBRATION, calibration_document(calibrations))
         run_folder.write_file(aside / run_folder.SCENE, scene.resolved_yaml().encode())
         noise = noise_facts(scene.document.render.noise, writer.noises)
@@ -64,6 +67,15 @@ def render_run(
         run_folder.write_manifest(aside, _facts(scene, writer, noise, lights, seconds))
     warning = noise_warning(noise, len(writer.noises))
     return [] if warning is None else [warning]
+
+
+def _write_motion(scene: Scene, folder: Path) -> None:
+    """Write where robots were, and what those that take frames believe of it, where anything moves."""
+    if any(robot.motion for robot in scene.document.robots.values()):
+        run_folder.write_lines(folder / run_folder.POSES, pose_records(scene))
+    believed = [line for robot in observers_astir(scene) for line in odometry_of(scene, robot)]
+    if believed:
+        run_folder.write_lines(folder / ODOMETRY, map(odometry_record, believed))
 
 
 def calibrations_of(scene: Scene, progress: Progress = lambda *_: None) -> list[Calibration]:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from perception.files.fields import Place, check_format, get, parse_object, read_text
 from perception.files.readers import (
@@ -42,6 +41,8 @@ _ODOMETRY_SIGMAS = (
 
 def odometry_record(odometry: Odometry) -> dict[str, Any]:
     """Make the JSON object of one line of `odometry.jsonl`."""
+    from scipy.spatial.transform import Rotation  # loads slowly
+
     return {
         "format": 1,
         "robot": odometry.robot,
@@ -60,6 +61,8 @@ def parse_odometry(record: Mapping[str, Any], file: str = "", line: int | None =
     RecordingError
         If a field is missing or of the wrong type.
     """
+    from scipy.spatial.transform import Rotation
+
     place = Place(file, line)
     check_format(record, place)
     quaternion = numbers(record, "quaternion_xyzw", place, 4)

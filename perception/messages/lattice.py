@@ -127,7 +127,6 @@ class Lattice:
         """Return the score of a stretch as long as a packet in which anything goes, shape (starts,)."""
         return np.asarray(self._garbage[starts + self._clocks.lengths[rate]] - self._garbage[starts])
 
-
     def frames_seen(self, start: int, rate: int) -> NDArray[np.bool_]:
         """Return of which repeats each bit was seen, shape (repeats,)."""
         seen = np.diff(self._seen[start + self._clocks.edges[rate]])

@@ -6,8 +6,10 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import (
+    Angle,
     Document,
     Fraction,
+    Length,
     Name,
     NotNegative,
     Orientation,
@@ -147,10 +149,24 @@ class Camera(PresetDocument):
         return self
 
 
+class OdometryErrors(Document):
+    """How wrong a robot is about its own motion, as standard deviations per axis.
+
+    `position_noise` and `rotation_noise` are those of each record by itself; `position_walk` and
+    `rotation_walk` by how much more it has gone astray after a second: they grow with the root of time.
+    """
+
+    position_noise_m: Annotated[Length, NotNegative] = 0.0
+    rotation_noise_rad: Annotated[Angle, NotNegative] = 0.0
+    position_walk_m: Annotated[Length, NotNegative] = 0.0
+    rotation_walk_rad: Annotated[Angle, NotNegative] = 0.0
+
+
 class Rig(PresetDocument):
-    """What a robot carries: sources and cameras, by name."""
+    """What a robot carries: sources and cameras, by name, and what tells it of its own motion."""
 
     preset_folder: ClassVar[str] = "rigs"
 
     sources: dict[Name, Source] = {}
     cameras: dict[Name, Camera] = {}
+    odometry: OdometryErrors | None = None
