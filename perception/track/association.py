@@ -15,9 +15,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 RANGE_NATS = 3.4
-"""Logarithm of the farthest over the nearest range of false detections, which are as likely at every scale."""
+"""Logarithm of the farthest over the nearest range of false detections, as likely at every scale."""
 
-_ORIGINS_M = 0.15
 _GATE_SIGMAS = 5.0
 
 
@@ -73,19 +72,31 @@ def gated_pairs(
 
 
 def _near(states: States, seen: Observations, observer_m: Array) -> tuple[Indices, Indices]:
-    """Return pairs by bearing alone, with room to spare: what is left of n × m for the exact gate."""
+    """Return pairs with room to spare, by bearing and then by place: what is left for the exact gate."""
     arm_m = states.mean[:, :3] - observer_m
     far_m = np.maximum(np.linalg.norm(arm_m, axis=1), LEAST_RANGE_M)
     along = arm_m / far_m[:, None]
     place = states.covariance[:, :3, :3]
-    across_m2 = np.trace(place, axis1=1, axis2=2) - np.einsum("ni,nij,nj->n", along, place, along)
+    on_m2 = np.einsum("ni,nij,nj->n", along, place, along)
+    across_m2 = np.maximum(np.trace(place, axis1=1, axis2=2) - on_m2, 0.0)
     late_s = float(np.max(np.abs(seen.after_s), initial=0.0))
-    moved_m = late_s * np.linalg.norm(states.mean[:, 3:], axis=1)
-    angle = (_GATE_SIGMAS * np.sqrt(np.maximum(across_m2, 0.0)) + moved_m + _ORIGINS_M) / far_m
+    room_m = _GATE_SIGMAS * np.sqrt(across_m2) + late_s * np.linalg.norm(states.mean[:, 3:], axis=1)
     noise = _GATE_SIGMAS * np.sqrt(np.trace(seen.angle_rad2, axis1=1, axis2=2))
-    widest = np.minimum(angle[:, None] + noise, np.pi)
+    origins_m = np.max(np.linalg.norm(seen.origin_m - observer_m, axis=1), initial=0.0)
+    shaken_m = _GATE_SIGMAS * np.sqrt(2.0 * np.max(seen.shaken_m2, initial=0.0))
+    widest = np.minimum(((room_m + origins_m + shaken_m) / far_m)[:, None] + noise, np.pi)
     track, measurement = np.nonzero(along @ seen.bearing.T > np.cos(widest))
-    return track, measurement
+    # Now from where each camera stands, and by range where there is one.
+    bearing, range_m = seen.bearing[measurement], seen.range_m[measurement]
+    apart_m = states.mean[track, :3] - seen.origin_m[measurement]
+    depth_m = np.sum(apart_m * bearing, axis=1)
+    aside_m = np.sqrt(np.maximum(np.sum(apart_m**2, axis=1) - depth_m**2, 0.0))
+    reach_m = np.maximum(depth_m, np.nan_to_num(range_m))
+    inside = (depth_m > 0.0) & (aside_m < room_m[track] + shaken_m + noise[measurement] * reach_m)
+    sigma_m = np.sqrt(seen.noise_m2[measurement]) * np.maximum(depth_m / range_m, 1.0) ** 3
+    deep_m = np.sqrt(on_m2[track] + across_m2[track]) + sigma_m + seen.common_m[measurement] + shaken_m
+    inside &= ~(np.abs(depth_m - range_m) > 1.5 * _GATE_SIGMAS * deep_m)
+    return track[inside], measurement[inside]
 
 
 def _likelihood(

@@ -60,11 +60,11 @@ class Bank(NamedTuple):
 
     def taken(self, rows: Indices | NDArray[np.bool_]) -> "Bank":
         """Return some of them."""
-        return Bank(*(column[rows] for column in self))
+        return Bank._make(column[rows] for column in self)
 
     def joined(self, others: "Bank") -> "Bank":
         """Return these and others."""
-        return Bank(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
+        return Bank._make(np.concatenate(pair) for pair in zip(self, others, strict=True))
 
     def with_states(self, states: States) -> "Bank":
         """Return the same tracks in other states."""

@@ -29,6 +29,7 @@ def fed(
     time_s: float,
     settings: TrackerSettings,
     spread_rad: Array | None = None,
+    alone: bool = True,
 ) -> Bank:
     """Update tracks, each by one measurement.
 
@@ -47,7 +48,10 @@ def fed(
     time_s, settings
         When, and how.
     spread_rad
-        Noise to be added to bearings, shape (n,), for flares of two tracks: then their ranges do not count.
+        Noise to be added to bearings, shape (n,), of flares that are not one source's whole light: then their
+        ranges do not count. NaN where they do.
+    alone
+        Whether they are of no other source.
     """
     states = taken_states(bank.states, tracks)
     if settings.filter == "paper":
@@ -68,7 +72,7 @@ def fed(
     seen_s, alone_s, hits = bank.seen_s.copy(), bank.alone_s.copy(), bank.hits.copy()
     seen_s[tracks] = time_s
     hits[tracks] += 1
-    if spread_rad is None:
+    if alone:
         alone_s[tracks] = time_s
     return bank.with_states(everything)._replace(
         anchor_mean=anchors.mean,

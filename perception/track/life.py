@@ -13,7 +13,7 @@ from perception.types import Ghost, Track
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-LEAST_ODDS = -2.0
+LEAST_ODDS = -1.0
 """A tentative track below is none."""
 
 MOST_GHOST, GHOST_STEP, GHOST_SAID = 6.0, 1.0, 2.0
@@ -73,7 +73,6 @@ def tracks(
     bank: Bank,
     robot: str,
     time_s: float,
-    newest_s: float,
     pose: Pose,
     detections: Mapping[int, tuple[tuple[str, int, int], ...]],
 ) -> tuple[Track, ...]:

@@ -1,4 +1,4 @@
-"""Two tracks that share one flare: light of both, told by its range, feeds both with its bearing alone."""
+"""Flares that are not one source's whole light: of two tracks, or a part of one; they feed bearings alone."""
 
 import math
 from typing import NamedTuple
@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.track.association import log_clutter
-from perception.track.bank import Bank
-from perception.track.observations import LEAST_RANGE_M, Observations
+from perception.track.bank import Bank, taken_states
+from perception.track.kalman import innovation_covariance
+from perception.track.observations import LEAST_RANGE_M, Observations, innovations
 from perception.track.settings import TrackerSettings
 
 Array = NDArray[np.float64]
@@ -16,6 +17,12 @@ Indices = NDArray[np.int64]
 
 FLAGGED_ODDS = 2.0
 """What it adds that the estimator itself took a flare for several."""
+
+SHARED_ODDS = 3.0
+"""By so much must light of both explain a flare better than light of one: else a track that is not there
+could live on in the glare of another. Two that shared the last one may explain it worse by as much."""
+
+DIM_CHI2, MOST_CHANCE = 14.0, 0.01
 
 
 class Shared(NamedTuple):
@@ -33,6 +40,7 @@ def shared_flares(
     gain: Array,
     taken: Indices,
     clutter: float,
+    before: frozenset[tuple[int, int]],
     settings: TrackerSettings,
 ) -> list[Shared]:
     """Tell which measurements are the light of two tracks rather than what was assigned.
@@ -49,6 +57,8 @@ def shared_flares(
         Of each track the gain of its own measurement (0 if none) and which it is (−1), shape (n,).
     clutter, settings
         As in `gated_pairs`.
+    before
+        Numbers of those that shared a flare when they were last seen.
     """
     arm_m = bank.mean[:, :3] - observer_m
     far_m = np.maximum(np.linalg.norm(arm_m, axis=1), LEAST_RANGE_M)
@@ -61,7 +71,6 @@ def shared_flares(
     place = bank.covariance[:, :3, :3]
     on_m2 = np.einsum("ni,nij,nj->n", along, place, along)
     across_rad2 = (np.trace(place, axis1=1, axis2=2) - on_m2) / (2.0 * far_m**2)
-    missed = math.log(1.0 - settings.seen_probability)
     used: set[int] = set()
     busy: set[int] = set()
     for a, b in zip(firsts.tolist(), seconds.tolist(), strict=True):
@@ -91,16 +100,55 @@ def shared_flares(
             if chi2 > settings.gate_chi2:
                 continue
             both = -0.5 * chi2 - math.log(lateral2) - 0.5 * math.log(range2) - 1.5 * math.log(2.0 * math.pi)
-            both += 2.0 * math.log(settings.seen_probability) + FLAGGED_ODDS * bool(seen.merged[k])
+            both += math.log(settings.seen_probability)
+            both += FLAGGED_ODDS * bool(seen.merged[k])
+            both += SHARED_ODDS if (bank.number[a], bank.number[b]) in before else -SHARED_ODDS
             both -= float(
                 log_clutter(
                     seen.range_m[k : k + 1], np.array([True]), clutter, settings.clutter_solid_angle_sr
                 )[0]
             )
-            alone = float(np.sum(np.where(taken[pair] >= 0, gain[pair], missed)))
+            alone = float(np.sum(gain[pair]))
             if both > alone:
                 found.append(Shared(k, (a, b), apart_rad))
                 used |= {a, b}
                 busy.add(k)
                 break
     return found
+
+
+def dimmed(
+    bank: Bank, seen: Observations, taken: Indices, clutter: float, settings: TrackerSettings
+) -> tuple[Indices, Indices]:
+    """Return tracks that no measurement was of, and measurements of none that are their light, only dimmer.
+
+    An exposure across an edge of a bit catches a part of it, and a body's edge may hide a part: at the
+    track's bearing, but seemingly farther. Where frames keep step with bits, such would pass for a robot
+    behind.
+    """
+    lost = np.flatnonzero(taken < 0)
+    free = np.setdiff1d(np.flatnonzero(np.isfinite(seen.range_m)), taken)
+    if not (len(lost) and len(free)):
+        return lost[:0], free[:0]
+    rows, columns = (grid.ravel() for grid in np.meshgrid(lost, free, indexing="ij"))
+    states, there = taken_states(bank.states, rows), seen.taken(columns)
+    apart_m = np.sum((states.mean[:, :3] - there.origin_m) * there.bearing, axis=1)
+    near = np.flatnonzero((apart_m > 0.0) & (there.range_m > apart_m))
+    rows, columns = rows[near], columns[near]
+    states, there = taken_states(states, near), there.taken(near)
+    found = innovations(states, there, np.zeros(len(near)))
+    spread = innovation_covariance(states, found)[:, :2, :2]
+    off = found.residual_m[:, :2]
+    chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
+    across_rad2 = np.sqrt(np.linalg.det(spread)) / apart_m[near] ** 2
+    by_chance = clutter / settings.clutter_solid_angle_sr * math.pi * DIM_CHI2 * across_rad2
+    # Where the place itself is hardly known, a bearing says little of whose light it is.
+    good = (chi2 < DIM_CHI2) & (across_rad2 < settings.resolution_rad**2) & (by_chance < MOST_CHANCE)
+    order = np.flatnonzero(good)[np.argsort(chi2[good])]
+    tracks: list[int] = []
+    measurements: list[int] = []
+    for k in order.tolist():
+        if rows[k] not in tracks and columns[k] not in measurements:
+            tracks.append(int(rows[k]))
+            measurements.append(int(columns[k]))
+    return np.array(tracks, dtype=np.int64), np.array(measurements, dtype=np.int64)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.track.kalman import Innovations, States
-from perception.track.odometry import Pose
+from perception.track.odometry import Poses
 from perception.track.settings import TrackerSettings
 from perception.types import Measurement, bearing_axes
 
@@ -77,11 +77,11 @@ class Observations(NamedTuple):
 
     def taken(self, rows: Indices) -> "Observations":
         """Return some of them."""
-        return Observations(*(column[rows] for column in self))
+        return Observations._make(column[rows] for column in self)
 
 
 def observed(
-    measurements: Sequence[Measurement], poses: Sequence[Pose], time_s: float, settings: TrackerSettings
+    measurements: Sequence[Measurement], poses: Poses, time_s: float, settings: TrackerSettings
 ) -> Observations:
     """Turn measurements, each by the observer's pose at its time, into the odometry frame."""
     m = len(measurements)
@@ -90,13 +90,9 @@ def observed(
     covariance = np.array([one.covariance for one in measurements]).reshape(m, 3, 3)
     range_m = np.array([one.range_m for one in measurements], dtype=float)
     common_m = np.array([one.range_sigma_common_m for one in measurements], dtype=float)
-    rotation = np.array([pose.rotation for pose in poses]).reshape(m, 3, 3)
-    place_m = np.array([pose.position_m for pose in poses]).reshape(m, 3)
-    tilt_rad = np.array([pose.rotation_sigma_rad for pose in poses])
-    shaken_m = np.array([pose.position_sigma_m for pose in poses])
     angle = covariance[:, :2, :2].copy()
     angle[np.isnan(angle).any(axis=(1, 2))] = settings.bearing_sigma_rad**2 * np.eye(2)
-    angle += (tilt_rad**2)[:, None, None] * np.eye(2)
+    angle += (poses.rotation_sigma_rad**2)[:, None, None] * np.eye(2)
     claimed = np.isfinite(covariance[:, 2, 2])
     common_m = np.where(claimed, np.nan_to_num(common_m), settings.range_common_relative * range_m)
     noise = np.where(
@@ -104,14 +100,14 @@ def observed(
     )
     least = 1e-8 + 1e-4 * np.where(claimed, covariance[:, 2, 2], 0.0)
     return Observations(
-        origin_m=np.einsum("mij,mj->mi", rotation, origin_m) + place_m,
-        axes=np.einsum("mij,mkj->mki", rotation, bearing_axes(bearing)),
+        origin_m=np.einsum("mij,mj->mi", poses.rotation, origin_m) + poses.position_m,
+        axes=np.einsum("mij,mkj->mki", poses.rotation, bearing_axes(bearing)),
         range_m=range_m,
         angle_rad2=angle,
         skew_m=np.nan_to_num(covariance[:, :2, 2]),
         noise_m2=np.maximum(noise, least),
         common_m=common_m,
-        shaken_m2=shaken_m**2,
+        shaken_m2=poses.position_sigma_m**2,
         after_s=np.array([one.time_s for one in measurements], dtype=float) - time_s,
         merged=np.array([one.merged for one in measurements], dtype=bool),
         saturated=np.array([one.saturated for one in measurements], dtype=bool),
@@ -126,7 +122,7 @@ def innovations(states: States, seen: Observations, spread_rad: Array | None = N
     given noise): with the measured range a flux that came out too high would also count as the more precise.
     Where the prediction itself is open to more than 30 %, r is the measured range all the same.
     The bias of a range by flux, E[r̂] = r (1 + ⅜ (σ_F/F)²), is taken off. A range that is not known gets a σ
-    of 1 km, and only the bearing counts; so with `spread_rad`, which adds to the bearing's noise (n,).
+    of 1 km, and only the bearing counts; so where `spread_rad`, shape (n,), is no NaN: it adds to the noise.
     """
     n = len(seen.range_m)
     rows = np.zeros((n, 3, 6))
@@ -135,7 +131,7 @@ def innovations(states: States, seen: Observations, spread_rad: Array | None = N
     far_m = np.maximum(np.linalg.norm(apart_m, axis=1), LEAST_RANGE_M)
     ranged = np.isfinite(seen.range_m)
     if spread_rad is not None:
-        ranged &= False
+        ranged &= np.isnan(spread_rad)
     along_m2 = np.einsum("ni,nij,nj->n", seen.bearing, states.covariance[:, :3, :3], seen.bearing)
     far_m = np.where(ranged & (along_m2 > (_KNOWN_RANGE * far_m) ** 2), seen.range_m, far_m)
     range_m = np.where(ranged, seen.range_m, far_m)
@@ -148,7 +144,7 @@ def innovations(states: States, seen: Observations, spread_rad: Array | None = N
     noise = np.zeros((n, 3, 3))
     noise[:, :2, :2] = seen.angle_rad2
     if spread_rad is not None:
-        noise[:, :2, :2] += (spread_rad**2)[:, None, None] * np.eye(2)
+        noise[:, :2, :2] += (np.nan_to_num(spread_rad) ** 2)[:, None, None] * np.eye(2)
     noise[:, :2, :2] *= (far_m**2)[:, None, None]
     noise[:, 2, 2] = sigma_m**2
     most_m2 = (

@@ -66,7 +66,7 @@ class OwnTracker:
         return self._newest
 
     def predicted(self, time_s: float, odometry: Sequence[Odometry] = ()) -> tuple[Track, ...]:
-        """Return the newest tracks, gone on as they moved, in body axes at a time; σ are left as they were."""
+        """Return the newest tracks, gone on as they moved, in body axes at a time; their σ stay."""
         pose = pose_at(odometry, time_s)
         turn = pose.rotation.T @ self._pose.rotation
         both = np.kron(np.eye(2), turn)
@@ -126,7 +126,7 @@ def _checked(track: object, where: str) -> Track:
     """Return a track with arrays of the contract's shapes, or say what about it is wrong."""
     if not isinstance(track, Track):
         raise TrackerError(f"{where}: returned {_kind(track)} among its tracks; wanted a Track")
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for name, shape in (
         ("position_body_m", (3,)),
         ("velocity_body_m_per_s", (3,)),

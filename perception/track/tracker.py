@@ -11,9 +11,9 @@ from perception.track.association import Pairs, assigned, gated_pairs, paper_pai
 from perception.track.bank import Bank, newborn
 from perception.track.fed import fed
 from perception.track.kalman import predicted, wandered
-from perception.track.merging import shared_flares
+from perception.track.merging import dimmed, shared_flares
 from perception.track.observations import Observations, observed
-from perception.track.odometry import Pose, pose_at
+from perception.track.odometry import Pose, pose_at, poses_at
 from perception.track.settings import TrackerSettings
 from perception.types import Measurement, Odometry, Track
 
@@ -23,6 +23,13 @@ Keys = tuple[tuple[str, int, int], ...]
 
 LEAST_CLUTTER = 0.5
 CLUTTER_MEMORY_S = 1.0
+
+DAWN_S = 0.06
+"""In sets that follow each other faster, of the first light after darkness only the bearing counts.
+
+Its exposure may have caught but a part of it, and where a track was unseen for long nothing tells a part of
+the light from a robot that went away. Where sets are rarer, too much would be lost.
+"""
 
 
 class Tracker:
@@ -51,6 +58,7 @@ class Tracker:
         self._next = 1
         self._clutter = LEAST_CLUTTER
         self._bank = _nobody()
+        self._sharing: frozenset[tuple[int, int]] = frozenset()
 
     def update(
         self, time_s: float, measurements: Sequence[Measurement], odometry: Sequence[Odometry] = ()
@@ -82,16 +90,15 @@ class Tracker:
         after_s = time_s - self._time_s if math.isfinite(self._time_s) else 0.0
         self._bank = self._moved(after_s, pose)
         self._time_s, self._pose = time_s, pose
-        seen = observed(
-            measurements, [pose_at(odometry, one.time_s) for one in measurements], time_s, self.settings
-        )
+        times_s = np.array([one.time_s for one in measurements], dtype=float)
+        seen = observed(measurements, poses_at(odometry, times_s), time_s, self.settings)
         self._bank = life.survivors(self._bank, time_s, self.settings)
         which = self._associate(seen, after_s)
         self._bank, self._next = life.confirmed(self._bank, self._next, self.settings)
         keys: dict[int, Keys] = {
             number: measurements[k].detections for number, k in which.items() if number > 0
         }
-        return life.tracks(self._bank, self._robot, time_s, time_s, pose, keys)
+        return life.tracks(self._bank, self._robot, time_s, pose, keys)
 
     def predicted(self, time_s: float, odometry: Sequence[Odometry] = ()) -> tuple[Track, ...]:
         """Return where all live confirmed tracks are at a time, by prediction; nothing is changed.
@@ -106,13 +113,13 @@ class Tracker:
         pose = pose_at(odometry, time_s)
         after_s = time_s - self._time_s if math.isfinite(self._time_s) else 0.0
         bank = self._moved(after_s, pose)
-        return life.tracks(bank.taken(bank.number > 0), self._robot, time_s, self._time_s, pose, {})
+        return life.tracks(bank.taken(bank.number > 0), self._robot, time_s, pose, {})
 
     def _name(self, measurements: Sequence[Measurement]) -> None:
         names = sorted({one.robot for one in measurements} | ({self._robot} - {""}))
         if len(names) > 1:
             raise ValueError(
-                f"measurements of {' and '.join(names)} in one tracker; give each observer a tracker of its own"
+                f"measurements of {' and '.join(names)} in one tracker; give each observer its own"
             )
         self._robot = names[0] if names else self._robot
 
@@ -136,8 +143,8 @@ class Tracker:
         confirmed = self._bank.number > 0
         old, young = self._bank.taken(confirmed), self._bank.taken(~confirmed)
         free = np.arange(len(seen.range_m))
-        old, taken, sharing = self._feed_confirmed(old, seen)
-        free = np.setdiff1d(free, np.concatenate([taken[taken >= 0], sharing]))
+        old, taken = self._feed_confirmed(old, seen, after_s)
+        free = np.setdiff1d(free, taken)
         share = min(after_s / CLUTTER_MEMORY_S, 1.0)
         self._clutter = max(LEAST_CLUTTER, self._clutter + share * (len(free) - self._clutter))
         rest = seen.taken(free)
@@ -154,8 +161,8 @@ class Tracker:
         numbers = old.number.tolist()
         return {number: int(k) for number, k in zip(numbers, taken.tolist(), strict=True) if k >= 0}
 
-    def _feed_confirmed(self, old: Bank, seen: Observations) -> tuple[Bank, Indices, Indices]:
-        """Feed confirmed tracks: which measurement each took (−1: none), and which went to two."""
+    def _feed_confirmed(self, old: Bank, seen: Observations, after_s: float) -> tuple[Bank, Indices]:
+        """Feed confirmed tracks, and return which measurement each took, −1 for none."""
         pairs = self._pairs(old, seen, self._clutter)
         chosen = assigned(pairs)
         taken = np.full(len(old.number), -1, dtype=np.int64)
@@ -165,7 +172,7 @@ class Tracker:
         shared = []
         if self.settings.overlap == "sound":
             shared = shared_flares(
-                old, seen, self._pose.position_m, gain, taken, self._clutter, self.settings
+                old, seen, self._pose.position_m, gain, taken, self._clutter, self._sharing, self.settings
             )
         both = np.array([one.tracks for one in shared], dtype=np.int64).reshape(-1)
         light = np.repeat(np.array([one.measurement for one in shared], dtype=np.int64), 2)
@@ -173,13 +180,22 @@ class Tracker:
         taken[both] = -1
         alone = np.flatnonzero(taken >= 0)
         when, how = self._time_s, self.settings
-        old = fed(old, alone, seen.taken(taken[alone]), chi2[alone], when, how)
+        dawn = (when - old.seen_s[alone] > 1.5 * after_s) & (after_s < DAWN_S)
+        spread = np.where(dawn, 0.0, np.nan)
+        old = fed(old, alone, seen.taken(taken[alone]), chi2[alone], when, how, spread)
         old = life.judged_ghosts(old, alone, seen.ghost[taken[alone]])
         if len(both):
             spread = np.maximum(apart, how.resolution_rad / 8.0)
-            old = fed(old, both, seen.taken(light), np.zeros(len(both)), when, how, spread)
+            old = fed(old, both, seen.taken(light), np.zeros(len(both)), when, how, spread, alone=False)
             taken[both] = light
-        return old, taken, light
+        now = {(int(old.number[a]), int(old.number[b])) for _, (a, b), _ in shared}
+        seen_alone = set(old.number[alone].tolist())
+        self._sharing = frozenset(now | {pair for pair in self._sharing if not seen_alone & set(pair)})
+        dim, edge = dimmed(old, seen, taken, self._clutter, how)
+        if len(dim):
+            old = fed(old, dim, seen.taken(edge), np.zeros(len(dim)), when, how, np.zeros(len(dim)))
+            taken[dim] = edge
+        return old, taken
 
     def _pairs(self, bank: Bank, seen: Observations, clutter: float) -> Pairs:
         if self.settings.association == "paper":
@@ -188,5 +204,5 @@ class Tracker:
 
 
 def _nobody() -> Bank:
-    nothing = observed((), (), 0.0, TrackerSettings())
+    nothing = observed((), poses_at((), np.zeros(0)), 0.0, TrackerSettings())
     return newborn(nothing, 0.0, TrackerSettings())
