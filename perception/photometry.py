@@ -31,7 +31,7 @@ BLURRED_MOST = 3.0
 SURE_SNR = 12.0
 """A lit source whose flux is this many times its noise is found."""
 
-_MISSED = 0.25
+_MISSED, _MOST_MISSED, _MERGE = 3e-4, 0.2, 3.0
 
 _REACH = 4.0
 """Half a window, in standard deviations of the image, and what counts as a neighbour beyond its edge."""
@@ -124,14 +124,20 @@ def sample_of_detection(
 
 
 def sample_at(
-    expected: Expected, found: Sequence[Detection], frame: RawFrame, calibration: Calibration
+    expected: Expected,
+    found: Sequence[Detection],
+    frame: RawFrame,
+    calibration: Calibration,
+    claimed: Sequence[bool] | None = None,
 ) -> Sample | None:
     """Return the brightness at the place where a source is expected but was not found.
 
     Parameters
     ----------
     found
-        All detections in the frame: none of them is the source.
+        All detections in the frame: none of them is taken for the source.
+    claimed
+        Which of them are known to be others'; by default none is.
 
     Returns
     -------
@@ -146,13 +152,11 @@ def sample_at(
     floor_e2 = noise_floor_e2(calibration, frame.gain)
     lit_e = expected.flux_dn / gain
     if expected.sigma_px > BLURRED_MOST * width_px:
-        reach_px = _REACH * (expected.sigma_px + width_px)
-        if any(math.hypot(hit.u_px - expected.u_px, hit.v_px - expected.v_px) < reach_px for hit in found):
-            return None
         snr = lit_e / math.sqrt(lit_e + 4.0 * math.pi * width_px**2 * floor_e2)
-        if snr < SURE_SNR:
+        missed = _chance_missed(expected, width_px, found, claimed or [False] * len(found))
+        if snr < SURE_SNR or missed > _MOST_MISSED:
             return None
-        return _sample(0.0, max(_MISSED, 3.0 / snr), expected, frame, calibration)
+        return _sample(0.0, 1.0 / math.sqrt(-2.0 * math.log(missed)), expected, frame, calibration)
     blurred_px = math.hypot(width_px, expected.sigma_px)
     # Images so close differ by their shapes alone, and places are not known as well as that.
     if any(
@@ -191,6 +195,22 @@ def sample_at(
     if not 0.0 < sigma_e < lit_e:
         return None
     return _sample(flux_e / lit_e, sigma_e / lit_e, expected, frame, calibration)
+
+
+def _chance_missed(
+    expected: Expected, width_px: float, found: Sequence[Detection], claimed: Sequence[bool]
+) -> float:
+    """Return how probable it is that a lit source goes unseen: it may stand upon another, or be the other."""
+    missed = _MISSED
+    for hit, others in zip(found, claimed, strict=True):
+        off_px = math.hypot(hit.u_px - expected.u_px, hit.v_px - expected.v_px)
+        if not others and off_px < _REACH * (expected.sigma_px + width_px):
+            return 1.0
+        upon = (_MERGE * width_px / expected.sigma_px) ** 2
+        missed += (
+            0.5 * upon * math.exp(-0.5 * (max(off_px - _MERGE * width_px, 0.0) / expected.sigma_px) ** 2)
+        )
+    return missed
 
 
 def _sample(

@@ -238,7 +238,8 @@ class Pipeline:
             if hit is None or hit.merged or fed[own[0]] > 1:
                 return None
             return sample_of_detection(hit, expected, frame, calibration)
-        return sample_at(expected, found, frame, calibration)
+        claimed = [(frame.camera, frame.index, number) in fed for number in range(len(found))]
+        return sample_at(expected, found, frame, calibration, claimed)
 
     def _signal(self, track: int, samples: Sequence[Sample]) -> Signal:
         columns = np.array(
