@@ -11,7 +11,7 @@ from perception.track.association import Pairs, assigned, gated_pairs, paper_pai
 from perception.track.bank import Bank, newborn
 from perception.track.fed import fed
 from perception.track.kalman import predicted, wandered
-from perception.track.merging import dimmed, shared_flares
+from perception.track.merging import Shared, dimmed, shared_flares
 from perception.track.observations import Observations, observed
 from perception.track.odometry import Pose, pose_at, poses_at
 from perception.track.rejoin import continued, rejoined
@@ -185,9 +185,10 @@ class Tracker:
         gain, chi2 = np.zeros(len(taken)), np.zeros(len(taken))
         taken[pairs.track[chosen]] = pairs.measurement[chosen]
         gain[pairs.track[chosen]], chi2[pairs.track[chosen]] = pairs.gain[chosen], pairs.chi2[chosen]
-        shared = []
+        shared: list[Shared] = []
+        doubtful = np.full(len(taken), np.nan)
         if self.settings.overlap == "sound":
-            shared = shared_flares(
+            shared, doubtful = shared_flares(
                 old, seen, self._pose.position_m, gain, taken, self._clutter, self._sharing, self.settings
             )
         both = np.array([one.tracks for one in shared], dtype=np.int64).reshape(-1)
@@ -197,7 +198,7 @@ class Tracker:
         alone = np.flatnonzero(taken >= 0)
         when, how = self._time_s, self.settings
         dawn = (when - old.seen_s[alone] > 1.5 * after_s) & (after_s < DAWN_S)
-        spread = np.where(dawn, 0.0, np.nan)
+        spread = np.where(dawn, 0.0, doubtful[alone])
         old = fed(old, alone, seen.taken(taken[alone]), chi2[alone], when, how, spread)
         old = life.judged_ghosts(old, alone, seen.ghost[taken[alone]])
         if len(both):
