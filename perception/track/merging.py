@@ -22,6 +22,9 @@ SHARED_ODDS = 3.0
 """By so much must light of both explain a flare better than light of one: else a track that is not there
 could live on in the glare of another. Two that shared the last one may explain it worse by as much."""
 
+DOUBT_ODDS = 8.0
+"""Where light of both explains a flare worse than light of one by less, its range does not count."""
+
 DIM_CHI2, MOST_CHANCE = 14.0, 0.01
 
 
@@ -42,7 +45,7 @@ def shared_flares(
     clutter: float,
     before: frozenset[tuple[int, int]],
     settings: TrackerSettings,
-) -> list[Shared]:
+) -> tuple[list[Shared], Array]:
     """Tell which measurements are the light of two tracks rather than what was assigned.
 
     Fluxes add up, so two at r_a and r_b look like one at (r_a⁻² + r_b⁻²)^−½, at the bearing that their fluxes
@@ -59,6 +62,11 @@ def shared_flares(
         As in `gated_pairs`.
     before
         Numbers of those that shared a flare when they were last seen.
+
+    Returns
+    -------
+    What is shared; and for each track how far the other is from it whose light may be in its flare: such a
+    flare's range is not to be trusted. NaN elsewhere, shape (n,).
     """
     arm_m = bank.mean[:, :3] - observer_m
     far_m = np.maximum(np.linalg.norm(arm_m, axis=1), LEAST_RANGE_M)
@@ -66,8 +74,9 @@ def shared_flares(
     close = along @ along.T > math.cos(settings.resolution_rad)
     firsts, seconds = np.nonzero(np.triu(close, 1))
     found: list[Shared] = []
+    doubtful = np.full(len(far_m), np.nan)
     if not (len(firsts) and len(seen.range_m)):
-        return found
+        return found, doubtful
     place = bank.covariance[:, :3, :3]
     on_m2 = np.einsum("ni,nij,nj->n", along, place, along)
     across_rad2 = (np.trace(place, axis1=1, axis2=2) - on_m2) / (2.0 * far_m**2)
@@ -109,12 +118,14 @@ def shared_flares(
                 )[0]
             )
             alone = float(np.sum(gain[pair]))
+            if both < alone and both > alone - DOUBT_ODDS:
+                doubtful[pair] = apart_rad
             if both > alone:
                 found.append(Shared(k, (a, b), apart_rad))
                 used |= {a, b}
                 busy.add(k)
                 break
-    return found
+    return found, doubtful
 
 
 def dimmed(

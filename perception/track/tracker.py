@@ -11,9 +11,10 @@ from perception.track.association import Pairs, assigned, gated_pairs, paper_pai
 from perception.track.bank import Bank, newborn
 from perception.track.fed import fed
 from perception.track.kalman import predicted, wandered
-from perception.track.merging import dimmed, shared_flares
+from perception.track.merging import Shared, dimmed, shared_flares
 from perception.track.observations import Observations, observed
 from perception.track.odometry import Pose, pose_at, poses_at
+from perception.track.rejoin import continued, rejoined
 from perception.track.settings import TrackerSettings
 from perception.types import Measurement, Odometry, Track
 
@@ -23,6 +24,12 @@ Keys = tuple[tuple[str, int, int], ...]
 
 LEAST_CLUTTER = 0.5
 CLUTTER_MEMORY_S = 1.0
+
+SURE_ODDS = 6.0
+"""A track that was unseen takes at once what is its own for sure; else it waits for a track that begins.
+
+In a crowd of false detections the gate of a dark track holds some soon, and one that follows such is lost.
+"""
 
 DAWN_S = 0.06
 """In sets that follow each other faster, of the first light after darkness only the bearing counts.
@@ -154,6 +161,13 @@ class Tracker:
         young = fed(young, track, rest.taken(measurement), pairs.chi2[chosen], self._time_s, self.settings)
         young = life.scored(young, track, pairs.gain[chosen], after_s, self.settings)
         young = life.judged_ghosts(young, track, rest.ghost[measurement])
+        lost = np.flatnonzero(taken < 0)
+        found = rejoined(old.taken(lost), young.taken(track))
+        if found:
+            ends, begins = (np.array(side, dtype=np.int64) for side in zip(*found, strict=True))
+            old = continued(old, lost[ends], young.taken(track[begins]))
+            taken[lost[ends]] = free[measurement[begins]]
+            young = young.taken(np.setdiff1d(np.arange(len(young.number)), track[begins]))
         left = rest.taken(np.setdiff1d(np.arange(len(free)), measurement))
         born = newborn(left, self._time_s, self.settings)
         born = life.judged_ghosts(born, np.arange(len(left.range_m)), left.ghost)
@@ -164,14 +178,17 @@ class Tracker:
     def _feed_confirmed(self, old: Bank, seen: Observations, after_s: float) -> tuple[Bank, Indices]:
         """Feed confirmed tracks, and return which measurement each took, −1 for none."""
         pairs = self._pairs(old, seen, self._clutter)
+        unsure = (self._time_s - old.seen_s > 1.5 * after_s)[pairs.track] & (pairs.gain < SURE_ODDS)
+        pairs = pairs._replace(gain=np.where(unsure, 0.0, pairs.gain))
         chosen = assigned(pairs)
         taken = np.full(len(old.number), -1, dtype=np.int64)
         gain, chi2 = np.zeros(len(taken)), np.zeros(len(taken))
         taken[pairs.track[chosen]] = pairs.measurement[chosen]
         gain[pairs.track[chosen]], chi2[pairs.track[chosen]] = pairs.gain[chosen], pairs.chi2[chosen]
-        shared = []
+        shared: list[Shared] = []
+        doubtful = np.full(len(taken), np.nan)
         if self.settings.overlap == "sound":
-            shared = shared_flares(
+            shared, doubtful = shared_flares(
                 old, seen, self._pose.position_m, gain, taken, self._clutter, self._sharing, self.settings
             )
         both = np.array([one.tracks for one in shared], dtype=np.int64).reshape(-1)
@@ -181,7 +198,7 @@ class Tracker:
         alone = np.flatnonzero(taken >= 0)
         when, how = self._time_s, self.settings
         dawn = (when - old.seen_s[alone] > 1.5 * after_s) & (after_s < DAWN_S)
-        spread = np.where(dawn, 0.0, np.nan)
+        spread = np.where(dawn, 0.0, doubtful[alone])
         old = fed(old, alone, seen.taken(taken[alone]), chi2[alone], when, how, spread)
         old = life.judged_ghosts(old, alone, seen.ghost[taken[alone]])
         if len(both):
