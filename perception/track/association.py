@@ -155,21 +155,22 @@ def assigned(pairs: Pairs) -> Indices:
     return chosen[chosen >= 0]
 
 
-def paper_pairs(bank: Bank, seen: Observations, observer_m: Array, settings: TrackerSettings) -> Pairs:
+def paper_pairs(bank: Bank, seen: Observations, settings: TrackerSettings) -> Pairs:
     """Return all pairs whose boxes overlap, with the paper's cost: gain = most − C.
 
     C = C_IoU + C_θ + w_d (1 − exp(−|Δd|)). A box is a square about the bearing, of `paper_box_rad`; C_θ is
     the turn against the track's direction as a share of 180 degrees.
     """
-    arm_m = bank.mean[:, :3] - observer_m
-    far_m = np.maximum(np.linalg.norm(arm_m, axis=1), LEAST_RANGE_M)
-    off = np.einsum("mij,nj->nmi", seen.axes, arm_m / far_m[:, None])
+    # A bearing counts from its camera, so each measurement sees the tracks from there.
+    arm_m = bank.mean[:, None, :3] - seen.origin_m
+    far_m = np.maximum(np.linalg.norm(arm_m, axis=2), LEAST_RANGE_M)
+    off = np.einsum("mij,nmj->nmi", seen.axes, arm_m / far_m[:, :, None])
     side = settings.paper_box_rad
     shared = np.prod(np.maximum(side - np.abs(off[:, :, :2]), 0.0), axis=2) * (off[:, :, 2] > 0.0)
     overlap = shared / (2.0 * side**2 - shared)
     track, measurement = np.nonzero(overlap > 0.0)
     there = seen.taken(measurement)
-    depth_m = np.nan_to_num(np.abs(there.range_m - far_m[track]), nan=np.inf)
+    depth_m = np.nan_to_num(np.abs(there.range_m - far_m[track, measurement]), nan=np.inf)
     cost = (
         1.0
         - overlap[track, measurement]

@@ -216,7 +216,7 @@ class Tracker:
 
     def _pairs(self, bank: Bank, seen: Observations, clutter: float) -> Pairs:
         if self.settings.association == "paper":
-            return paper_pairs(bank, seen, self._pose.position_m, self.settings)
+            return paper_pairs(bank, seen, self.settings)
         return gated_pairs(bank, seen, self._pose.position_m, clutter, self.settings)
 
 
