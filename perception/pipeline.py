@@ -106,11 +106,20 @@ class Pipeline:
         self._samples: dict[int, list[Sample]] = {}
 
     @staticmethod
-    def of(name: str, calibrations: Mapping[str, Calibration]) -> "Pipeline":
-        """Return the stack that goes with an estimator: the paper's own parts where it is `paper`."""
-        if name != "paper":
-            return Pipeline(calibrations)
-        return Pipeline(calibrations, "paper", Tracker(_AS_THE_PAPER))
+    def of(
+        name: str,
+        calibrations: Mapping[str, Calibration],
+        tracker: Follows | None = None,
+        decoder: Callable[[str, int], Reads] | None = None,
+    ) -> "Pipeline":
+        """Return the stack that goes with an estimator: the paper's own parts where it is `paper`.
+
+        `tracker` and `decoder` take the place of those that belong to it.
+        """
+        paper = name == "paper"
+        if tracker is None:
+            tracker = Tracker(_AS_THE_PAPER if paper else None)
+        return Pipeline(calibrations, "paper" if paper else "robust", tracker, decoder or Decoder)
 
     def push(self, frames: Sequence[RawFrame], odometry: Sequence[Odometry] = ()) -> Heard:
         """Take the next set of frames.

@@ -10,7 +10,7 @@ from pathlib import Path
 from nir_render.errors import InputError
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds
-from nir_render.run.follow import Follower
+from nir_render.run.follow import Follower, OwnParts
 from nir_render.run.render import Progress
 from perception import (
     ESTIMATORS,
@@ -32,6 +32,8 @@ from perception import (
     read_recording,
 )
 from perception.command_estimator import LIMIT_S, is_command
+from perception.messages.own import DecoderError
+from perception.track.own import TrackerError
 from perception.types import FrameKey
 
 RunEstimator = Estimator | OwnSetEstimator | CommandEstimator
@@ -108,11 +110,17 @@ def frame_estimators(names: Sequence[str]) -> dict[str, Estimator]:
     return chosen
 
 
-def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progress: Progress) -> Perceived:
+def perceive_run(
+    folder: Path,
+    *,
+    estimators: Mapping[str, RunEstimator],
+    progress: Progress,
+    own: OwnParts = OwnParts(),  # noqa: B008
+) -> Perceived:
     """Run estimators over the frames of a folder; write the detections of each that reads them all.
 
     One's own that fails on a frame is left out from there on, and the others go on. Of it nothing is written;
-    detections of an earlier call stay.
+    detections of an earlier call stay. `own` are a tracker and a decoder of one's own, for all of them.
 
     Raises
     ------
@@ -122,7 +130,7 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progre
     started = time.perf_counter()
     try:
         recording = read_recording(folder)
-        found, failures = _read_all(recording, estimators, progress)
+        found, failures = _read_all(recording, estimators, progress, own)
     except InputError:
         raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
@@ -146,6 +154,7 @@ def _read_all(
     recording: Recording,
     estimators: Mapping[str, RunEstimator],
     progress: Progress,
+    own: OwnParts,
 ) -> tuple[dict[str, tuple[Found, Follower]], dict[str, str]]:
     """Return what each estimator found and followed that came to the end, and what went wrong with others."""
     records, calibrations = recording.records, recording.calibrations
@@ -159,13 +168,13 @@ def _read_all(
         def attempt(name: str, work: Callable[[], None]) -> None:
             try:
                 work()
-            except EstimatorError as error:
+            except (EstimatorError, TrackerError, DecoderError) as error:
                 failures[name] = str(error)
                 found.pop(name, None)
 
         def start(name: str, estimator: RunEstimator) -> None:
             readers[name] = _Reader.of(estimator, calibrations, stack)
-            found[name] = {}, Follower(name, calibrations, odometry)
+            found[name] = {}, Follower(name, calibrations, odometry, own)
 
         def read(name: str, frames: Sequence[RawFrame], files: Sequence[Path]) -> None:
             hits, follower = found[name]
@@ -186,6 +195,8 @@ def _read_all(
             progress(done, len(records))
         for name in list(found):
             attempt(name, readers[name].finish)
+        for name, (_, follower) in list(found.items()):
+            attempt(name, follower.finish)
     return found, failures
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.estimators import _error_line, _functions_listed, _import_file, _kind
+from perception.own_code import error_line, kind_of, load_function
 from perception.track.odometry import AT_REST, Pose, pose_at
 from perception.types import Measurement, Odometry, Track
 
@@ -55,9 +55,9 @@ class OwnTracker:
             found = self._function(list(measurements), list(odometry), self._state)
             listed = tuple(found) if isinstance(found, Iterable) else None
         except Exception as error:
-            raise TrackerError(f"{where}: {_error_line(error, self.path)}") from error
+            raise TrackerError(f"{where}: {error_line(error, self.path)}") from error
         if listed is None:
-            raise TrackerError(f"{where}: returned {_kind(found)}; wanted a list of tracks")
+            raise TrackerError(f"{where}: returned {kind_of(found)}; wanted a list of tracks")
         self._newest = tuple(_checked(track, where) for track in listed)
         numbers = [track.track for track in self._newest]
         if len(set(numbers)) < len(numbers):
@@ -102,30 +102,16 @@ def load_tracker(reference: str) -> OwnTracker:
     TrackerError
         If there is no such file or function, it cannot be called, or the file raises while it is imported.
     """
-    file, _, name = reference.rpartition(":")
-    if not (file and name.isidentifier() and name.isascii()):
-        raise TrackerError(f"{reference}: wanted file.py:function, such as my_tracker.py:nearest")
-    if name.lower() in TRACKERS:
-        raise TrackerError(f"{reference}: {name.lower()!r} is a tracker that is built in; rename yours")
-    path = Path(file)
-    if not path.is_file():
-        raise TrackerError(f"{reference}: there is no file {file!r}")
-    try:
-        contents = _import_file(path, reference)
-    except ValueError as error:
-        raise TrackerError(str(error)) from error
-    if name not in contents:
-        raise TrackerError(f"{reference}: there is no {name!r} in the file{_functions_listed(contents)}")
-    function = contents[name]
-    if not callable(function):
-        raise TrackerError(f"{reference}: {name!r} is {_kind(function)}, which cannot be called")
+    name, path, function = load_function(
+        reference, "tracker", "my_tracker.py:nearest", TRACKERS, TrackerError
+    )
     return OwnTracker(name, reference, path, function)
 
 
 def _checked(track: object, where: str) -> Track:
     """Return a track with arrays of the contract's shapes, or say what about it is wrong."""
     if not isinstance(track, Track):
-        raise TrackerError(f"{where}: returned {_kind(track)} among its tracks; wanted a Track")
+        raise TrackerError(f"{where}: returned {kind_of(track)} among its tracks; wanted a Track")
     arrays: dict[str, Any] = {}
     for name, shape in (
         ("position_body_m", (3,)),

@@ -44,6 +44,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.robust": ("search",),
     "perception.files": (),
     "perception.model": (),
+    "perception.own_code": (),
     "perception.compiled": (),
     "perception.types": (),
     "perception.picture": (),

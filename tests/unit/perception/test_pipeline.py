@@ -89,12 +89,12 @@ def test_two_that_cross_are_followed_and_understood(frames: list[RawFrame]) -> N
         assert one.confidence > 0.999
     pulls, speeds = [], []
     for each in heard[45:]:
-        for one in each.tracks:
-            who = "near" if one.track == near else "far"
-            off_m = one.position_body_m - _place_m(who, each.time_s)
-            pulls.append(off_m @ np.linalg.solve(one.covariance[:3, :3], off_m))
+        for track in each.tracks:
+            who = "near" if track.track == near else "far"
+            off_m = track.position_body_m - _place_m(who, each.time_s)
+            pulls.append(off_m @ np.linalg.solve(track.covariance[:3, :3], off_m))
             speeds.append(
-                one.velocity_body_m_per_s - np.diff([_place_m(who, t) for t in (0.0, 1.0)], axis=0)[0]
+                track.velocity_body_m_per_s - np.diff([_place_m(who, t) for t in (0.0, 1.0)], axis=0)[0]
             )
     assert 1.0 < np.mean(pulls) < 6.0  # three, but errors last for seconds
     assert np.sqrt(np.mean(np.square(speeds))) < 0.06
