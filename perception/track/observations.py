@@ -105,8 +105,8 @@ def observed(
         range_m=range_m,
         angle_rad2=angle,
         skew_m=np.nan_to_num(covariance[:, :2, 2]),
-        noise_m2=np.maximum(noise, least),
-        common_m=common_m,
+        noise_m2=np.where(np.isfinite(range_m), np.maximum(noise, least), NO_RANGE_M**2),
+        common_m=np.nan_to_num(common_m),
         shaken_m2=poses.position_sigma_m**2,
         after_s=np.array([one.time_s for one in measurements], dtype=float) - time_s,
         merged=np.array([one.merged for one in measurements], dtype=bool),
@@ -153,7 +153,7 @@ def innovations(states: States, seen: Observations, spread_rad: Array | None = N
         * np.sqrt(noise[:, [0, 1], [0, 1]] * np.where(ranged, seen.noise_m2, 0.0)[:, None])
     )
     skew = np.clip(seen.skew_m * far_m[:, None], -most_m2, most_m2)
-    skew *= (sigma_m / np.sqrt(seen.noise_m2))[:, None] * ranged[:, None]
+    skew *= np.where(ranged, sigma_m / np.sqrt(seen.noise_m2), 0.0)[:, None]
     noise[:, :2, 2] = noise[:, 2, :2] = skew
     noise += seen.shaken_m2[:, None, None] * np.eye(3)
     load = np.zeros((n, 3))

@@ -1,6 +1,5 @@
 """Robots that move and blink, as measurements of a rig would have them: for tests and benchmarks, NumPy alone."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -149,11 +148,12 @@ def sets(
     false: int = 0,
     dropped: float = 0.0,
     jitter_s: float = 0.0,
+    range_factors: Array | None = None,
 ) -> list[Set]:
     """Simulate sets of measurements; flares that are too near to each other merge into one."""
     rng = random(1601, key)
     at = observer or Observer()
-    factor = (1.0 + COMMON * rng.normal()) * (1.0 + 0.0 * rng.normal(size=len(robots)))
+    factor = np.full(len(robots), 1.0 + COMMON * rng.normal()) if range_factors is None else range_factors
     drift_m, drift_rad = np.zeros(3), 0.0
     found, records = [], []
     for n in range(round(seconds * fps)):
@@ -269,6 +269,74 @@ def straight(start: Sequence[float], velocity: Sequence[float]) -> Path:
     return lambda time_s: begin + time_s * step
 
 
-def with_flux(robot: Robot, flux: float) -> Robot:
-    """Return a robot that is brighter than others."""
-    return dataclasses.replace(robot, flux=flux)
+# --- the scenes of the issue, by their measurements ---
+
+MOVING = Observer(
+    path=lambda t: np.array([0.03 * t, 0.2 * math.sin(0.5 * t), 0.0]),
+    yaw=lambda t: 0.3 * math.sin(0.7 * t),
+    position_sigma_m=2e-3, rotation_sigma_rad=1e-3, position_walk=5e-3, rotation_walk=2e-3,
+)  # fmt: skip
+TURNING = Observer(yaw=MOVING.yaw, rotation_sigma_rad=1e-3, rotation_walk=2e-3)
+
+
+def crossing() -> list[Robot]:
+    """Two talkers cross with 0.6 m of depth between."""
+    return [
+        Robot(straight([2.0, -1.5, 0.0], [0.0, 0.25, 0.0]), talking(random(1602, 1))),
+        Robot(straight([2.6, 1.5, 0.0], [0.0, -0.25, 0.0]), talking(random(1602, 2))),
+    ]
+
+
+def dark_crossing() -> list[Robot]:
+    """Two cross in the middle of 0.9 s in which both are dark, with 0.5 m of depth between."""
+
+    def lit(time_s: float) -> float:
+        return float(not 5.55 <= time_s < 6.45)
+
+    return [
+        Robot(straight([2.0, -1.5, 0.0], [0.0, 0.25, 0.0]), lit),
+        Robot(straight([2.5, 1.875, 0.0], [0.0, -0.3125, 0.0]), lit),
+    ]
+
+
+def bounce(back: bool) -> list[Robot]:
+    """Two flares that are one for 0.5 s; then both go on, or back."""
+
+    def path(range_m: float, side: float) -> Path:
+        def at(time_s: float) -> Array:
+            angle = side * 0.0104 * (time_s - 6.0)
+            angle = -abs(angle) * side if back else angle
+            return range_m * np.array([math.cos(angle), math.sin(angle), 0.0])
+
+        return at
+
+    return [Robot(path(2.0, 1.0)), Robot(path(2.5, -1.0))]
+
+
+def occlusion() -> list[Robot]:
+    """Two talkers, each hidden for a while."""
+    one, other = (straight([2.0, -1.5, 0.0], [0.0, 0.25, 0.0]), straight([3.0, 1.5, 0.0], [0.0, -0.25, 0.0]))
+    return [
+        Robot(one, talking(random(1603, 1)), lambda t: not 5.0 < t < 5.8),
+        Robot(other, talking(random(1603, 2)), lambda t: not 7.0 < t < 7.9),
+    ]
+
+
+def swarm(count: int, key: int, speed_m_per_s: float = 0.1) -> list[Robot]:
+    """Talkers that go round in circles of 0.25 m, nowhere nearer to each other than 0.5 m."""
+    rng = random(1604, key)
+    centres: list[Array] = []
+    while len(centres) < count:
+        place = np.array([rng.uniform(-5.0, 5.0), rng.uniform(-5.0, 5.0), 0.0])
+        if np.linalg.norm(place) > 1.2 and all(np.linalg.norm(place - one) > 1.0 for one in centres):
+            centres.append(place)
+
+    def round_about(centre: Array, turn_rad_per_s: float, phase: float) -> Path:
+        return lambda t: centre + 0.25 * np.array(
+            [math.cos(turn_rad_per_s * t + phase), math.sin(turn_rad_per_s * t + phase), 0.0]
+        )
+
+    return [
+        Robot(round_about(one, speed_m_per_s / 0.25 * rng.choice([-1.0, 1.0]), rng.uniform(0.0, 2.0 * np.pi)), talking(rng))
+        for one in centres
+    ]
