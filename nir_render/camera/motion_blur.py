@@ -12,12 +12,20 @@ frame differ in their drive, not in place.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.beams import Beam
+from nir_render.camera.optics.psf import Window, place_of
+from nir_render.camera.timing.drive import mean_level
+from nir_render.camera.timing.shutter import on_fractions, row_profile, row_starts_s
+from nir_render.geometry import sunflower
 from nir_render.light.light import DirectTable
+from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.emitters import Drive
 from nir_render.scene.motion import Velocity
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
@@ -42,13 +50,10 @@ class Path:
     distance_m: Array
 
 
-def moves(snapshot: Snapshot, camera: str, group: str) -> bool:
-    """Tell whether a source moves as a camera, `robot.camera`, sees it."""
-    eye, _, _ = camera.partition(".")
-    carrier, _, _ = group.partition(".")
-    if group not in snapshot.sources or carrier == eye:
-        return False
-    return any(snapshot.robots[name].velocity is not None for name in (eye, carrier))
+def may_move(snapshot: Snapshot, camera: str, group: str) -> bool:
+    """Tell whether a source may move as a camera, `robot.camera`, sees it; the sun counts as still."""
+    carriers = (name.partition(".")[0] for name in (camera, group))
+    return group in snapshot.sources and any(snapshot.robots[one].velocity is not None for one in carriers)
 
 
 def path_of(
@@ -70,6 +75,64 @@ def path_of(
     offset_m = np.einsum("nji,nj->ni", _turns(eye.velocity, offsets_s), there_m - lens_m)
     distance_m = np.linalg.norm(offset_m, axis=1)
     return Path((offset_m / distance_m[:, None]) @ here.rotation, distance_m)
+
+
+def moved_beam(beam: Beam, direction: Array, distance_m: float, seen: NDArray[np.bool_] | None) -> Beam:
+    """Return a beam whose disc has come to another place: its light goes by 1/distance².
+
+    `seen` tells which rays of `sunflower` reach the disc where a part of it is hidden, else it is None.
+    """
+    nearer = beam.distance_m / distance_m
+    angle_rad = math.asin(min(nearer * math.sin(beam.angular_radius_rad), 1.0))
+    return replace(
+        beam,
+        direction=direction,
+        angular_radius_rad=angle_rad,
+        irradiance_w_per_m2=beam.irradiance_w_per_m2 * nearer**2,
+        seen=None if seen is None else sunflower(direction, angle_rad, len(seen))[seen],
+        distance_m=distance_m,
+    )
+
+
+def drawn_out(windows: Sequence[Window], weights_s: Array) -> Window:
+    """Return the sum of windows, each row of pixels weighted with what it collects of each.
+
+    Parameters
+    ----------
+    windows
+        Electrons per second in each stretch of time.
+    weights_s
+        How long each row is lit in each stretch, shape (stretches, rows). What of a total lies elsewhere
+        counts by the mean of its window's rows, or of all.
+    """
+    places = [place_of(window) for window in windows if window.values.size]
+    if not places:
+        means_s = weights_s.mean(axis=1)
+        total = sum(window.total * mean_s for window, mean_s in zip(windows, means_s, strict=True))
+        return Window(np.empty((0, 0)), 0, 0, float(total))
+    top, left = (min(place[axis].start for place in places) for axis in (0, 1))
+    bottom, right = (max(place[axis].stop for place in places) for axis in (0, 1))
+    values, total = np.zeros((bottom - top, right - left)), 0.0
+    for window, weight_s in zip(windows, weights_s, strict=True):
+        rows, columns = place_of(window)
+        lit = window.values * weight_s[rows, None]
+        values[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] += lit
+        own_s = weight_s[rows] if window.values.size else weight_s
+        total += float(lit.sum()) + (window.total - float(window.values.sum())) * float(own_s.mean())
+    return Window(values, top, left, total)
+
+
+def stretch_weights_s(camera: Camera, drive: Drive, time_s: float, exposure_s: float, count: int) -> Array:
+    """Return how long each row is lit in each of `count` even stretches of its exposure, (count, rows).
+
+    What parasitic light adds while a row waits to be read counts to the last.
+    """
+    stretch_s = exposure_s / count
+    starts_s = row_starts_s(camera, time_s) + stretch_s * np.arange(count)[:, None]
+    weights_s = stretch_s * mean_level(drive, starts_s, stretch_s)
+    profile = row_profile(camera, drive, time_s, exposure_s)
+    weights_s[-1] += exposure_s * (profile - on_fractions(camera, drive, time_s, exposure_s))
+    return weights_s
 
 
 def stretches(length_px: float) -> int:

@@ -25,6 +25,8 @@ SCENE = "scene.yaml"
 FRAMES = "frames.jsonl"
 TRUTH = "truth.jsonl"
 LAMPS = "lamps.jsonl"
+POSES = "poses.jsonl"
+ODOMETRY = "odometry.jsonl"
 
 Item = TypeVar("Item")
 

@@ -14,6 +14,8 @@ from nir_render.run.manifest import enlarging_facts, noise_facts, noise_warning,
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Shot, simulate
+from nir_render.simulation.frame_times import frame_times
+from nir_render.simulation.odometry import odometry_of, odometry_record, pose_records
 from nir_render.transport.cache import LightCache
 from perception import Calibration, calibration_document, encode_png16, frame_record
 
@@ -45,7 +47,8 @@ def render_run(
     run_folder.check_free(folder, overwrite)
     started = time.perf_counter()
     cameras = scene.cameras()
-    total = scene.document.clock.frames * len(cameras)
+    times = frame_times(scene, scene.document.seed).values()
+    total = sum(int((~one.dropped).sum()) for one in times)
     if calibrations is None:
         calibrations = calibrations_of(scene)
     cache = LightCache() if cache is None else cache
@@ -56,6 +59,10 @@ def render_run(
             writer.add(shot)
             progress(done + 1, total)
         writer.finish()
+        run_folder.write_lines(aside / run_folder.POSES, pose_records(scene))
+        observers = dict.fromkeys(name.partition(".")[0] for name in cameras)
+        known = (record for name in observers for record in odometry_of(scene, name, scene.document.seed))
+        run_folder.write_lines(aside / run_folder.ODOMETRY, map(odometry_record, known))
         run_folder.write_json(aside / run_folder.CALIBRATION, calibration_document(calibrations))
         run_folder.write_file(aside / run_folder.SCENE, scene.resolved_yaml().encode())
         noise = noise_facts(scene.document.render.noise, writer.noises)
