@@ -14,6 +14,7 @@ from nir_render.run.manifest import enlarging_facts, noise_facts, noise_warning,
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Shot, simulate
+from nir_render.simulation.frame_times import frame_times
 from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
 from nir_render.transport.cache import LightCache
 from perception import Calibration, calibration_document, encode_png16, frame_record, odometry_record
@@ -46,8 +47,8 @@ def render_run(
     """
     run_folder.check_free(folder, overwrite)
     started = time.perf_counter()
-    cameras = scene.cameras()
-    total = scene.document.clock.frames * len(cameras)
+    times = frame_times(scene, scene.document.seed).values()
+    total = sum(int((~one.dropped).sum()) for one in times)
     if calibrations is None:
         calibrations = calibrations_of(scene)
     cache = LightCache() if cache is None else cache
@@ -71,9 +72,11 @@ def render_run(
 
 def _write_motion(scene: Scene, folder: Path) -> None:
     """Write where robots were, and what those that take frames believe of it, where anything moves."""
-    if any(robot.motion for robot in scene.document.robots.values()):
+    if any(robot.moves for robot in scene.document.robots.values()):
         run_folder.write_lines(folder / run_folder.POSES, pose_records(scene))
-    believed = [line for robot in observers_astir(scene) for line in odometry_of(scene, robot)]
+    believed = [
+        line for robot in observers_astir(scene) for line in odometry_of(scene, robot, scene.document.seed)
+    ]
     if believed:
         run_folder.write_lines(folder / ODOMETRY, map(odometry_record, believed))
 

@@ -33,6 +33,7 @@ from nir_render.randomness import RandomKey
 from nir_render.scene.documents.camera import MOST_GAIN, AutoExposure, Camera
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
+from nir_render.simulation.frame_times import frame_times
 from nir_render.simulation.lamps import lamp_truth
 from nir_render.simulation.truth import truth_of
 from nir_render.transport.cache import LightCache
@@ -242,8 +243,9 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
     """Yield frames with their truth: for each time of the clock, each observing camera.
 
     `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
-    Geometry stands still within a frame, as it is at mid-exposure of its middle row. Light is rendered only
-    where geometry is new; `cache` keeps it beyond this run.
+    Geometry is as at mid-exposure of a frame's middle row; only the flares of what moves are drawn out along
+    their way (`camera/motion_blur.py`). Light is rendered only where geometry is new; `cache` keeps it beyond
+    this run. Frames that a camera's clock drops are taken, for automatic exposure, and not yielded.
     """
     run_seed = scene.document.seed if seed is None else seed
     cache = LightCache() if cache is None else cache
@@ -257,10 +259,14 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
         kept[name] = _reused_rates(light, snapshot, kept.get(name))
         return light, kept[name]
 
-    for index, time_s in enumerate(scene.document.frame_times_s()):
+    own_times = frame_times(scene, run_seed)
+    for index in range(scene.document.clock.frames):
         for name in scene.cameras():
             _, camera = scene.camera(name)
             control, setting = camera.auto_exposure, own_setting(camera, index)
+            time_s, dropped = float(own_times[name].time_s[index]), bool(own_times[name].dropped[index])
+            if dropped and control is None:
+                continue
             if control is not None:
                 if name not in states:
                     _, rates = light_at(name, time_s)
@@ -268,7 +274,8 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
                 setting = states[name].upcoming[0]
             light, rates = light_at(name, time_s + mid_exposure_s(camera, setting.exposure_s))
             shot = _shot(light, rates, setting, time_s, RandomKey(run_seed, "read_out", name, index))
-            yield shot
+            if not dropped:
+                yield shot
             if control is not None:
                 states[name] = next_state(states[name], control, camera, shot.frame)
 
@@ -305,9 +312,28 @@ def frame_of(
 
 def _reused_rates(light: Light, snapshot: Snapshot, kept: Rates | None) -> Rates:
     """Return the rates of a light: those that are kept where it is the same light at another time."""
-    if kept is None or kept.light.indirect is not light.indirect or kept.light.direct is not light.direct:
+    if kept is None or not _as_fast(kept.snapshot, snapshot):
+        return electron_rates(light, snapshot)
+    if kept.light.indirect is not light.indirect or kept.light.direct is not light.direct:
         return electron_rates(light, snapshot)
     return kept
+
+
+def _as_fast(before: Snapshot, after: Snapshot) -> bool:
+    """Tell whether all robots go as fast in two worlds: else their flares are drawn out otherwise."""
+    pairs = [(before.robots[name].velocity, robot.velocity) for name, robot in after.robots.items()]
+    return all(
+        (one is None) == (other is None)
+        and (
+            one is None
+            or other is None
+            or (
+                np.array_equal(one.linear_m_per_s, other.linear_m_per_s)
+                and np.array_equal(one.angular_rad_per_s, other.angular_rad_per_s)
+            )
+        )
+        for one, other in pairs
+    )
 
 
 def _settled(rates: Rates, control: AutoExposure, time_s: float, period_s: float, seed: int) -> ExposureState:

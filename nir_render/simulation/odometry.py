@@ -1,6 +1,5 @@
-"""What a robot knows of its own motion: the true one, seen from where it began, with its rig's errors."""
+"""Where robots are at each frame, and where they take themselves to be: dead reckoning with its errors."""
 
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,74 +7,83 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.randomness import generator
-from nir_render.scene.documents.camera import OdometryErrors
-from nir_render.scene.motion import robot_pose
+from nir_render.scene.documents.times.clocks import OdometryNoise
+from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.scene import Scene
 from perception.types import Odometry
+
+Array = NDArray[np.float64]
 
 
 def observers_astir(scene: Scene) -> list[str]:
     """Return the robots that take frames and have odometry: those that move, or may believe they do."""
     names = dict.fromkeys(name.partition(".")[0] for name in scene.cameras())
     robots = scene.document.robots
-    return [name for name in names if robots[name].motion or robots[name].rig.odometry is not None]
+    return [name for name in names if robots[name].moves or robots[name].rig.odometry is not None]
+
+
+def pose_times_s(scene: Scene) -> Array:
+    """Return when poses are told of: at each frame of the scene's clock, and one period after the last."""
+    times_s = scene.document.frame_times_s()
+    return np.array([*times_s, times_s[-1] + 1.0 / scene.document.clock.frame_rate_hz])
 
 
 def pose_records(scene: Scene) -> Iterator[dict[str, Any]]:
-    """Yield the lines of `poses.jsonl`: where each robot is at each time of the clock, in the world."""
+    """Yield the true pose and velocity of every robot in the world, by time: lines of `poses.jsonl`."""
     from scipy.spatial.transform import Rotation
 
-    for time_s in scene.document.frame_times_s():
+    for time_s in pose_times_s(scene):
         for name, robot in scene.document.robots.items():
-            pose = robot_pose(robot, time_s)
+            pose, velocity = robot_pose(robot, float(time_s)), robot_velocity(robot, float(time_s))
+            still = np.zeros(3)
             yield {
                 "format": 1,
                 "robot": name,
-                "time_s": time_s,
+                "time_s": float(time_s),
                 "position_m": pose.position_m.tolist(),
                 "quaternion_xyzw": Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist(),
+                "velocity_m_per_s": (still if velocity is None else velocity.linear_m_per_s).tolist(),
+                "angular_velocity_rad_per_s": (
+                    still if velocity is None else velocity.angular_rad_per_s
+                ).tolist(),
             }
 
 
-def odometry_of(scene: Scene, robot: str, seed: int | None = None) -> Iterator[Odometry]:
-    """Yield what a robot believes of its pose at each time of the clock, and once after the last.
+def odometry_of(scene: Scene, robot: str, seed: int) -> list[Odometry]:
+    """Return what a robot knows of its own way, in a frame that is its body's axes at the first time.
 
-    The frame is that of its own body at the first time, axes and all. Each step is the true one and a step of
-    a random walk, position in the frame's axes and rotation about the body's; each record has its own noise
-    on top, keyed by (seed, robot, record).
+    Each step is the true one, in the axes that the robot takes itself to have, and a normal error of the walk
+    times the root of its time on top, per axis: a heading that is off bends what follows. Errors of each
+    record by itself are laid over it and do not add up. All are in body axes, keyed by seed, robot and step.
     """
     from scipy.spatial.transform import Rotation
 
-    run_seed = scene.document.seed if seed is None else seed
-    errors = scene.document.robots[robot].rig.odometry or OdometryErrors()
-    times_s = scene.document.frame_times_s()
-    times_s = [*times_s, times_s[-1] + 1.0 / scene.document.clock.frame_rate_hz]
-    first = robot_pose(scene.document.robots[robot], times_s[0])
-    astray_m, astray = np.zeros(3), np.eye(3)
-    before_s = times_s[0]
-    for record, time_s in enumerate(times_s):
-        pose = robot_pose(scene.document.robots[robot], time_s)
-        draws = generator(run_seed, "odometry", robot, record).standard_normal((4, 3))
-        root_s = math.sqrt(time_s - before_s)
-        before_s = time_s
-        astray_m = astray_m + errors.position_walk_m * root_s * draws[0]
-        astray = astray @ Rotation.from_rotvec(errors.rotation_walk_rad * root_s * draws[1]).as_matrix()
-        noise = Rotation.from_rotvec(errors.rotation_noise_rad * draws[3]).as_matrix()
-        yield Odometry(
-            robot=robot,
-            time_s=time_s,
-            position_m=first.rotation.T @ (pose.position_m - first.position_m)
-            + astray_m
-            + errors.position_noise_m * draws[2],
-            rotation=_rotation(first.rotation.T @ pose.rotation @ astray @ noise),
-            position_sigma_m=errors.position_noise_m,
-            rotation_sigma_rad=errors.rotation_noise_rad,
-            position_walk_m_per_sqrt_s=errors.position_walk_m,
-            rotation_walk_rad_per_sqrt_s=errors.rotation_walk_rad,
+    known = scene.document.robots[robot]
+    noise = known.rig.odometry or OdometryNoise()
+    times_s = pose_times_s(scene)
+    poses = [robot_pose(known, float(time_s)) for time_s in times_s]
+    position_m, rotation = np.zeros(3), np.eye(3)
+    records = []
+    for index, (time_s, pose) in enumerate(zip(times_s, poses, strict=True)):
+        random = generator(seed, "odometry", robot, index)
+        walked, turned, shaken, tilted = random.standard_normal((4, 3))
+        if index:
+            before, root_s = poses[index - 1], float(np.sqrt(time_s - times_s[index - 1]))
+            step_m = before.rotation.T @ (pose.position_m - before.position_m)
+            position_m = position_m + rotation @ (step_m + noise.position_walk_m * root_s * walked)
+            turn = Rotation.from_rotvec(noise.rotation_walk_rad * root_s * turned).as_matrix()
+            rotation = rotation @ before.rotation.T @ pose.rotation @ turn
+        tilt = Rotation.from_rotvec(noise.rotation_noise_rad * tilted).as_matrix()
+        records.append(
+            Odometry(
+                robot=robot,
+                time_s=float(time_s),
+                position_m=position_m + rotation @ (noise.position_noise_m * shaken),
+                rotation=rotation @ tilt,
+                position_sigma_m=noise.position_noise_m,
+                rotation_sigma_rad=noise.rotation_noise_rad,
+                position_walk_m_per_sqrt_s=noise.position_walk_m,
+                rotation_walk_rad_per_sqrt_s=noise.rotation_walk_rad,
+            )
         )
-
-
-def _rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a product of rotations without the rounding that piles up."""
-    u, _, v = np.linalg.svd(matrix)
-    return np.asarray(u @ v)
+    return records

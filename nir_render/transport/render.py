@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError
 from nir_render.light.enlarge import Enlargement, part_of
 from nir_render.light.light import DirectTable, Indirect, Light
+from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.checks import indivisible_sensor, solid_around
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
@@ -174,7 +175,7 @@ def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | N
     inside = solid_around(snapshot.shapes, placed.pose.position_m)
     if inside is not None:
         raise InputError(
-            f"{snapshot.origin}: the camera {camera} is inside shapes.{inside} at {snapshot.time_s:g} s; "
+            f"{snapshot.origin}: the camera {camera} is inside {place_of_shape(inside)} at {snapshot.time_s:g} s; "
             "move one"
         )
     if snapshot.has_indirect_light():

@@ -63,6 +63,12 @@ class Window:
         image[self.row : self.row + rows, self.column : self.column + columns] += self.values
 
 
+def place_of(window: Window) -> tuple[slice, slice]:
+    """Return the rows and the columns of pixels that a window lies on."""
+    rows, columns = window.values.shape
+    return slice(window.row, window.row + rows), slice(window.column, window.column + columns)
+
+
 def source_window(
     intrinsics: Intrinsics,
     core: Core,

@@ -10,7 +10,7 @@ from nir_render import parse_scene
 from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
 
 
-def _scene(frames: int, seed: int = 1, **odometry: str) -> Any:
+def _scene(frames: int, **odometry: str) -> Any:
     motion = [
         {"time": "0 s", "position": "[1, 2, 0] m", "orientation": {"yaw": "90 deg"}},
         {"time": "10 s", "position": "[1, 4, 0] m", "orientation": {"yaw": "180 deg"}},
@@ -20,7 +20,7 @@ def _scene(frames: int, seed: int = 1, **odometry: str) -> Any:
         rig["odometry"] = odometry
     return parse_scene(
         {
-            "format": 1, "name": "odometry", "seed": seed, "clock": {"frames": frames, "frame_rate": "10 Hz"},
+            "format": 1, "name": "odometry", "seed": 1, "clock": {"frames": frames, "frame_rate": "10 Hz"},
             "observe": ["r1.front"],
             "robots": {"r1": {"rig": rig, "motion": motion}, "r2": {"rig": "infra_swarm"}},
         }
@@ -28,7 +28,7 @@ def _scene(frames: int, seed: int = 1, **odometry: str) -> Any:
 
 
 def test_without_errors_it_is_the_motion_seen_from_where_it_began() -> None:
-    lines = list(odometry_of(_scene(101), "r1"))
+    lines = odometry_of(_scene(101), "r1", 1)
     assert len(lines) == 102
     np.testing.assert_allclose(lines[0].position_m, 0.0, atol=1e-12)
     np.testing.assert_allclose(lines[0].rotation, np.eye(3), atol=1e-12)
@@ -42,13 +42,14 @@ def test_errors_are_as_large_as_they_say() -> None:
     errors = {
         "position_noise": "2 mm", "rotation_noise": "0.2 deg", "position_walk": "1 cm", "rotation_walk": "0.5 deg",
     }  # fmt: skip
-    runs = [list(odometry_of(_scene(41, seed, **errors), "r1")) for seed in range(60)]
-    true = list(odometry_of(_scene(41), "r1"))
+    runs = [odometry_of(_scene(41, **errors), "r1", seed) for seed in range(60)]
+    true = odometry_of(_scene(41), "r1", 1)
     last, first = true[-1], true[0]
     assert (runs[0][3].position_sigma_m, runs[0][3].position_walk_m_per_sqrt_s) == (2e-3, 1e-2)
-    off_m = np.array([run[-1].position_m - last.position_m for run in runs]).ravel()
+    # Where it is by its own account, had it not turned astray: upwards nothing bends.
+    off_m = np.array([(run[-1].position_m - last.position_m)[2] for run in runs])
     turned = [Rotation.from_matrix(last.rotation.T @ run[-1].rotation).as_rotvec() for run in runs]
-    slack = 4.0 / np.sqrt(2 * off_m.size)
+    slack = 4.0 / np.sqrt(2 * len(runs))
     seconds = last.time_s - first.time_s
     assert off_m.std() == pytest.approx(np.hypot(2e-3, 1e-2 * np.sqrt(seconds)), rel=slack)
     expected_rad = np.radians(np.hypot(0.2, 0.5 * np.sqrt(seconds)))
@@ -58,7 +59,7 @@ def test_errors_are_as_large_as_they_say() -> None:
 
 
 def test_the_same_seed_believes_the_same() -> None:
-    one, other = (list(odometry_of(_scene(5, 3, position_walk="1 cm"), "r1")) for _ in range(2))
+    one, other = (odometry_of(_scene(5, position_walk="1 cm"), "r1", 3) for _ in range(2))
     assert all((a.position_m == b.position_m).all() for a, b in zip(one, other, strict=True))
 
 

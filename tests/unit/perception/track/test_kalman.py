@@ -50,7 +50,9 @@ def test_schmidt_update_is_the_joint_one_with_no_gain_for_u() -> None:
     states, found = _some_states(5)
     after = updated(states, found)
     for k in range(5):
-        joint = np.block([[states.covariance[k], states.common[k][:, None]], [states.common[k][None], np.ones((1, 1))]])
+        joint = np.block(
+            [[states.covariance[k], states.common[k][:, None]], [states.common[k][None], np.ones((1, 1))]]
+        )
         rows = np.hstack([found.rows[k], found.load_m[k][:, None]])
         gain = joint @ rows.T @ np.linalg.inv(rows @ joint @ rows.T + found.noise_m2[k])
         gain[6] = 0.0
@@ -64,11 +66,15 @@ def test_schmidt_update_is_the_joint_one_with_no_gain_for_u() -> None:
 def test_a_range_that_is_not_known_leaves_the_range() -> None:
     far = np.array([[3.0, 1.0, 0.2, 0.0, 0.0, 0.0]])
     states = States(far, np.diag([0.04] * 3 + [0.01] * 3)[None], np.zeros((1, 6)))
-    seen = _observations(far[:, :3] + 0.01, np.array([1e-6]), np.array([np.inf]))._replace(range_m=np.array([np.nan]))
+    seen = _observations(far[:, :3] + 0.01, np.array([1e-6]), np.array([np.inf]))._replace(
+        range_m=np.array([np.nan])
+    )
     after = updated(states, innovations(states, seen))
     along, left = bearing_axes(far[0, :3] / np.linalg.norm(far[0, :3]))[[2, 0]]
     assert along @ after.covariance[0, :3, :3] @ along == pytest.approx(0.04, rel=2e-3)
-    assert left @ after.covariance[0, :3, :3] @ left == pytest.approx(1e-6 * 10.04 / (1 + 1e-6 * 10.04 / 0.04), rel=0.02)
+    assert left @ after.covariance[0, :3, :3] @ left == pytest.approx(
+        1e-6 * 10.04 / (1 + 1e-6 * 10.04 / 0.04), rel=0.02
+    )
 
 
 # --- truth from its own model ---
@@ -124,7 +130,11 @@ def simulated(case: Case, form: str, key: int, epsilon_m2: float = 1e-6) -> tupl
     rng = random(1611, key)
     spread = np.diag([0.05**2] * 3 + [0.1**2] * 3)
     truth = np.tile([case.range_m, 0.0, 0.1, 0.0, case.speed_m_per_s, 0.0], (RUNS, 1))
-    states = States(truth + rng.multivariate_normal(np.zeros(6), spread, RUNS), np.tile(spread, (RUNS, 1, 1)), np.zeros((RUNS, 6)))
+    states = States(
+        truth + rng.multivariate_normal(np.zeros(6), spread, RUNS),
+        np.tile(spread, (RUNS, 1, 1)),
+        np.zeros((RUNS, 6)),
+    )
     bound = np.tile(spread, (RUNS, 1, 1))
     walk = process_noise(case.interval_s, case.psd)
     nees, error2, least2 = [], 0.0, 0.0
@@ -142,7 +152,9 @@ def simulated(case: Case, form: str, key: int, epsilon_m2: float = 1e-6) -> tupl
         bound = predicted(States(truth, bound, states.common), case.interval_s, case.psd).covariance
         far = np.linalg.norm(truth[:, :3], axis=1)
         axes = bearing_axes(truth[:, :3] / far[:, None])
-        weights = np.stack([1 / (far * case.bearing_rad) ** 2] * 2 + [4.0 / (case.flux_noise_at_1_m * far**3) ** 2], axis=1)
+        weights = np.stack(
+            [1 / (far * case.bearing_rad) ** 2] * 2 + [4.0 / (case.flux_noise_at_1_m * far**3) ** 2], axis=1
+        )
         information = np.linalg.inv(bound)
         information[:, :3, :3] += axes.transpose(0, 2, 1) @ (weights[:, :, None] * axes)
         bound = np.linalg.inv(information)

@@ -332,11 +332,16 @@ def swarm(count: int, key: int, speed_m_per_s: float = 0.1) -> list[Robot]:
             centres.append(place)
 
     def round_about(centre: Array, turn_rad_per_s: float, phase: float) -> Path:
-        return lambda t: centre + 0.25 * np.array(
-            [math.cos(turn_rad_per_s * t + phase), math.sin(turn_rad_per_s * t + phase), 0.0]
+        return lambda t: (
+            centre
+            + 0.25
+            * np.array([math.cos(turn_rad_per_s * t + phase), math.sin(turn_rad_per_s * t + phase), 0.0])
         )
 
     return [
-        Robot(round_about(one, speed_m_per_s / 0.25 * rng.choice([-1.0, 1.0]), rng.uniform(0.0, 2.0 * np.pi)), talking(rng))
+        Robot(
+            round_about(one, speed_m_per_s / 0.25 * rng.choice([-1.0, 1.0]), rng.uniform(0.0, 2.0 * np.pi)),
+            talking(rng),
+        )
         for one in centres
     ]
