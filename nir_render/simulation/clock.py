@@ -3,8 +3,8 @@
 Light is rendered once for a geometry; exposing it is arithmetic.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,10 @@ SceneOrSnapshot = Scene | Snapshot
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame, its light, the truth about sources and lamps, its mean without noise, the render's noise."""
+    """A frame, its light, the truth about sources and lamps, its mean without noise, the render's noise.
+
+    `exposure` is what the camera's automatic exposure knows after it; None without one.
+    """
 
     frame: RawFrame
     light: Light
@@ -57,6 +60,15 @@ class Shot:
     lamps: tuple[LampTruth, ...]
     mean: MeanFrame
     noise: RenderNoise
+    exposure: ExposureState | None = None
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What is done of a run: so many frames, and what automatic exposures know after them, by camera."""
+
+    frames: int = 0
+    exposures: Mapping[str, ExposureState] = field(default_factory=dict)
 
 
 def render(
@@ -238,18 +250,23 @@ def _of_light(light: Light, world: SceneOrSnapshot) -> Snapshot:
     return world
 
 
-def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = None) -> Iterator[Shot]:
+def simulate(
+    scene: Scene, seed: int | None = None, cache: LightCache | None = None, begun: Begun | None = None
+) -> Iterator[Shot]:
     """Yield frames with their truth: for each time of the clock, each observing camera.
 
     `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
     Geometry stands still within a frame, as it is at mid-exposure of its middle row. Light is rendered only
-    where geometry is new; `cache` keeps it beyond this run.
+    where geometry is new; `cache` keeps it beyond this run. `begun` is what is done already: those frames are
+    left out, and the others are as they would be after them.
     """
     run_seed = scene.document.seed if seed is None else seed
     cache = LightCache() if cache is None else cache
     period_s = 1.0 / scene.document.clock.frame_rate_hz
     kept: dict[str, Rates] = {}
-    states: dict[str, ExposureState] = {}
+    begun = Begun() if begun is None else begun
+    states = dict(begun.exposures)
+    cameras = scene.cameras()
 
     def light_at(name: str, time_s: float) -> tuple[Light, Rates]:
         snapshot = scene.at(time_s)
@@ -258,7 +275,9 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
         return light, kept[name]
 
     for index, time_s in enumerate(scene.document.frame_times_s()):
-        for name in scene.cameras():
+        for number, name in enumerate(cameras):
+            if index * len(cameras) + number < begun.frames:
+                continue
             _, camera = scene.camera(name)
             control, setting = camera.auto_exposure, own_setting(camera, index)
             if control is not None:
@@ -268,9 +287,10 @@ def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = N
                 setting = states[name].upcoming[0]
             light, rates = light_at(name, time_s + mid_exposure_s(camera, setting.exposure_s))
             shot = _shot(light, rates, setting, time_s, RandomKey(run_seed, "read_out", name, index))
-            yield shot
             if control is not None:
                 states[name] = next_state(states[name], control, camera, shot.frame)
+                shot = replace(shot, exposure=states[name])
+            yield shot
 
 
 def frame_of(

@@ -117,6 +117,8 @@ class _Rendering:
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
         snapshot, name = self.site.snapshot, self.site.name
+        if not snapshot.has_indirect_light():
+            return None
         key = groups.light_seed(self.seed, "indirect", name, self._geometry)
         if not backend().vectorised:
             return stock.indirect(snapshot, name, key, self._direct)
