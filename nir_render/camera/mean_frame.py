@@ -5,6 +5,7 @@ that shines fully lit. A frame is their weighted sum: drives and the shutter act
 pixels, behind lens and point spread, so emitters of one drive share an image.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import zip_longest
@@ -50,6 +51,8 @@ class Rates:
         Electrons per second that each row of the light's direct table brings.
     centre_row
         The row of pixels of each window's centre, the nearest one where it is outside, shape (n,).
+    between
+        Of indirect light that is interpolated: the weights of other rates, of other times, and these.
     kept
         For what follows from the rates and takes long: it goes when they go.
     """
@@ -61,6 +64,7 @@ class Rates:
     images: NDArray[np.float32] | None
     windows: tuple[Window, ...]
     centre_row: NDArray[np.int64]
+    between: tuple[tuple[float, "Rates"], ...] = ()
     kept: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -83,9 +87,19 @@ class Rates:
 
     def group_image(self, group: int) -> NDArray[np.float64]:
         """Return the electrons per second that one group's indirect light brings, shape (rows, columns)."""
+        if self.between:
+            images = [weight * one.kept_group_image(group) for weight, one in self.between]
+            return np.asarray(np.sum(images, axis=0, dtype=np.float64))
         only = np.zeros(len(self.light.groups))
         only[group] = group_fluxes(self.light, self.snapshot)[group]
         return _blurred(self.light, self.snapshot, only)
+
+    def kept_group_image(self, group: int) -> NDArray[np.float32]:
+        """Return a group's image as float32, kept for the next frame."""
+        images: dict[int, NDArray[np.float32]] = self.kept.setdefault("group_images", {})
+        if group not in images:
+            images[group] = self.group_image(group).astype(np.float32)
+        return images[group]
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +177,33 @@ def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
     v_px = intrinsics_of(camera).project(light.direct.direction)[:, 1]
     nearest = np.clip(np.nan_to_num(v_px), 0, camera.sensor.rows - 1)
     return Rates(light, snapshot, drives, drive, images, windows, np.rint(nearest).astype(np.int64))
+
+
+def rates_between(direct: Rates, ends: Sequence[tuple[float, Rates]]) -> Rates:
+    """Return rates with the windows of some, without indirect light, and the indirect light of others.
+
+    The others' weights add up to 1; the light is said to hold the indirect part of the heaviest.
+    """
+    images = None if direct.images is None else direct.images.copy()
+    for weight, rates in ends:
+        of_end = indirect_images(rates)
+        if of_end is not None:
+            part = of_end * np.float32(weight)
+            images = part if images is None else np.add(images, part, out=images)
+    nearest = max(ends, key=lambda end: end[0])[1].light
+    light = replace(direct.light, indirect=nearest.indirect, short_pixels=nearest.short_pixels)
+    return replace(direct, light=light, images=images, between=tuple(ends), kept={})
+
+
+def indirect_images(rates: Rates) -> NDArray[np.float32] | None:
+    """Return the part of the images that is indirect light, with its glare; None where there is none."""
+    if rates.light.indirect is None or rates.camera.point_spread.core_share == 1.0:
+        return rates.images
+    if "indirect_images" not in rates.kept:
+        light, snapshot, drives = rates.light, rates.snapshot, len(rates.drives)
+        rates.kept["indirect_images"] = _images(light, snapshot, rates.drive, drives, None)
+    kept: NDArray[np.float32] | None = rates.kept["indirect_images"]
+    return kept
 
 
 def kept_rates(light: Light, snapshot: Snapshot) -> Rates:
@@ -261,11 +302,15 @@ def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
 
 
 def _images(
-    light: Light, snapshot: Snapshot, drive: NDArray[np.int64], drives: int, windows: tuple[Window, ...]
+    light: Light,
+    snapshot: Snapshot,
+    drive: NDArray[np.int64],
+    drives: int,
+    windows: tuple[Window, ...] | None,
 ) -> NDArray[np.float32] | None:
     """Return the electrons per second on the sensor, all but the windows, by drive; None where none are.
 
-    They are the indirect light, and what glare and ghosts bring of it and of the windows.
+    They are the indirect light, and what glare and ghosts bring of it and of the windows, if these are given.
     """
     camera = snapshot.camera(light.camera).camera
     veiled = camera.point_spread.core_share < 1.0
@@ -278,7 +323,8 @@ def _images(
         if veiled:
             core = image.copy()
             for row in np.flatnonzero(drive[light.direct.group] == number):
-                windows[row].add_into(core)
+                if windows is not None:
+                    windows[row].add_into(core)
             image += veil(camera, core)
         images[number] = image
     return images

@@ -33,6 +33,8 @@ class Entry:
         How many lights had been rendered, and how many reused, when the frame was done.
     first
         What is said of a camera by its first frame: samples and the error of enlarging; None of later ones.
+    refresh
+        What was measured on the way to it of the error of interpolated light.
     """
 
     camera: str
@@ -42,6 +44,7 @@ class Entry:
     exposure: ExposureState | None
     lights: tuple[int, int]
     first: dict[str, Any] | None
+    refresh: list[dict[str, Any]]
 
     @property
     def name(self) -> str:
@@ -108,4 +111,5 @@ def _entry(record: dict[str, Any]) -> Entry:
         exposure=exposure,
         lights=(record["lights"][0], record["lights"][1]),
         first=record["first"],
+        refresh=record["refresh"],
     )

@@ -19,7 +19,14 @@ from nir_render.light.exr import direct_document, write_light
 from nir_render.light.light import Light
 from nir_render.run import folder as run_folder
 from nir_render.run.journal import Entry, Journal
-from nir_render.run.manifest import enlarging_facts, noise_facts, noise_warning, sample_facts, versions
+from nir_render.run.manifest import (
+    enlarging_facts,
+    noise_facts,
+    noise_warning,
+    refresh_facts,
+    sample_facts,
+    versions,
+)
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Begun, Shot, simulate
@@ -117,6 +124,7 @@ class _FrameWriter:
         self.noises: dict[str, RenderNoise] = {}
         self.samples_by_camera: dict[str, dict[str, Any]] = {}
         self.enlarging_by_camera: dict[str, dict[str, Any]] = {}
+        self.refresh: list[dict[str, Any]] = []
         self.lights = (0, 0)
         self._folder = folder
         self._keep_light = keep_light
@@ -166,6 +174,7 @@ class _FrameWriter:
             exposure=shot.exposure,
             lights=(before[0] + lights[0], before[1] + lights[1]),
             first=first,
+            refresh=[error.record() for error in shot.refresh],
         )
         self._writing.append(self._pool.submit(self._write, entry, file, frame.data_dn))
         self._wait(_WAITING_FRAMES)
@@ -175,6 +184,7 @@ class _FrameWriter:
         for entry in self._journal.entries():
             self.noises[entry.name] = entry.noise
             self.lights = entry.lights
+            self.refresh += entry.refresh
             if entry.first is not None:
                 self.enlarging_by_camera[entry.camera] = entry.first["enlarging"]
                 if entry.first["samples"] is not None:
@@ -243,7 +253,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
         "variant": backend().variant,
         "variant_reason": backend().reason,
         "seconds": {"render": round(seconds, 3)},
-        "indirect": _indirect_facts(scene) | by_camera,
+        "indirect": _indirect_facts(scene) | by_camera | refresh_facts(scene, writer.refresh),
         "render_noise": noise,
         "lights": {"rendered": writer.lights[0], "reused": writer.lights[1]},
     }

@@ -34,6 +34,7 @@ from nir_render.scene.documents.camera import MOST_GAIN, AutoExposure, Camera
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.lamps import lamp_truth
+from nir_render.simulation.refresh import Refreshed, RefreshError
 from nir_render.simulation.truth import truth_of
 from nir_render.transport.cache import LightCache
 from nir_render.truth.lamps import LampTruth
@@ -51,7 +52,8 @@ SceneOrSnapshot = Scene | Snapshot
 class Shot:
     """A frame, its light, the truth about sources and lamps, its mean without noise, the render's noise.
 
-    `exposure` is what the camera's automatic exposure knows after it; None without one.
+    `exposure` is what the camera's automatic exposure knows after it; None without one. `refresh` is what was
+    measured on the way to it of the error of interpolated light.
     """
 
     frame: RawFrame
@@ -61,6 +63,7 @@ class Shot:
     mean: MeanFrame
     noise: RenderNoise
     exposure: ExposureState | None = None
+    refresh: tuple[RefreshError, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -268,7 +271,12 @@ def simulate(
     states = dict(begun.exposures)
     cameras = scene.cameras()
 
+    refreshed = _refreshed(scene, run_seed, cache)
+
     def light_at(name: str, time_s: float) -> tuple[Light, Rates]:
+        if refreshed is not None:
+            rates = refreshed.rates_at(name, time_s)
+            return rates.light, rates
         snapshot = scene.at(time_s)
         light = render(snapshot, name, seed=run_seed, cache=cache)
         kept[name] = _reused_rates(light, snapshot, kept.get(name))
@@ -290,6 +298,8 @@ def simulate(
             if control is not None:
                 states[name] = next_state(states[name], control, camera, shot.frame)
                 shot = replace(shot, exposure=states[name])
+            if refreshed is not None:
+                shot = replace(shot, refresh=tuple(refreshed.measured()))
             yield shot
 
 
@@ -321,6 +331,14 @@ def frame_of(
         line_time_s=camera.shutter.row_delay_s,
         gain=setting.gain,
     )
+
+
+def _refreshed(scene: Scene, seed: int, cache: LightCache) -> Refreshed | None:
+    """Return what interpolates indirect light; None where each frame's is rendered."""
+    settings = scene.document.render.indirect
+    if (settings.every_s is None and settings.error is None) or not scene.document.has_indirect_light():
+        return None
+    return Refreshed(scene, seed, cache)
 
 
 def _reused_rates(light: Light, snapshot: Snapshot, kept: Rates | None) -> Rates:
