@@ -26,7 +26,6 @@ from nir_render.camera.motion_blur import (
     stretch_weights_s,
     stretches,
 )
-from nir_render.camera.optics.apertures import Aperture, flare_aperture
 from nir_render.camera.optics.lens import intrinsics_of
 from nir_render.camera.optics.psf import Window, place_of
 from nir_render.camera.optics.veil import veil
@@ -61,6 +60,8 @@ class Rates:
         Electrons per second that each row of the light's direct table brings.
     centre_row
         The row of pixels of each window's centre, the nearest one where it is outside, shape (n,).
+    between
+        Of indirect light that is interpolated: the weights of other rates, of other times, and these.
     kept
         For what follows from the rates and takes long: it goes when they go.
     """
@@ -72,6 +73,7 @@ class Rates:
     images: NDArray[np.float32] | None
     windows: tuple[Window, ...]
     centre_row: NDArray[np.int64]
+    between: tuple[tuple[float, "Rates"], ...] = ()
     kept: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -94,9 +96,19 @@ class Rates:
 
     def group_image(self, group: int) -> NDArray[np.float64]:
         """Return the electrons per second that one group's indirect light brings, shape (rows, columns)."""
+        if self.between:
+            images = [weight * one.kept_group_image(group) for weight, one in self.between]
+            return np.asarray(np.sum(images, axis=0, dtype=np.float64))
         only = np.zeros(len(self.light.groups))
         only[group] = group_fluxes(self.light, self.snapshot)[group]
         return _blurred(self.light, self.snapshot, only)
+
+    def kept_group_image(self, group: int) -> NDArray[np.float32]:
+        """Return a group's image as float32, kept for the next frame."""
+        images: dict[int, NDArray[np.float32]] = self.kept.setdefault("group_images", {})
+        if group not in images:
+            images[group] = self.group_image(group).astype(np.float32)
+        return images[group]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +183,7 @@ def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
     drives = tuple(dict.fromkeys(of_groups))
     drive = np.array([drives.index(of_group) for of_group in of_groups], dtype=np.int64)
     windows = tuple(_windows(light, snapshot, camera))
-    images = _images(light, snapshot, drive, len(drives), windows)
+    images = images_of(light, snapshot, drive, len(drives), windows)
     parts = [window.values for window in windows] + ([] if images is None else [images])
     if not all(np.isfinite(part).all() for part in parts):
         raise InputError(
@@ -299,22 +311,16 @@ def _drive_of_rates(emitter: Emitter) -> Drive:
     return drive if drive.constant is None else FULL_DRIVE
 
 
-def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
-    """Return the apertures of what the direct table shows in the frame: sources, the sun, their ghosts."""
-    table = light.direct
-    shown = (
-        flare_aperture(camera, table.direction[row], float(table.angular_radius_rad[row]))
-        for row in table.shining
-    )
-    return [aperture for aperture in shown if aperture is not None]
-
-
-def _images(
-    light: Light, snapshot: Snapshot, drive: NDArray[np.int64], drives: int, windows: tuple[Window, ...]
+def images_of(
+    light: Light,
+    snapshot: Snapshot,
+    drive: NDArray[np.int64],
+    drives: int,
+    windows: tuple[Window, ...] | None,
 ) -> NDArray[np.float32] | None:
     """Return the electrons per second on the sensor, all but the windows, by drive; None where none are.
 
-    They are the indirect light, and what glare and ghosts bring of it and of the windows.
+    They are the indirect light, and what glare and ghosts bring of it and of the windows, if these are given.
     """
     camera = snapshot.camera(light.camera).camera
     veiled = camera.point_spread.core_share < 1.0
@@ -327,7 +333,8 @@ def _images(
         if veiled:
             core = image.copy()
             for row in np.flatnonzero(drive[light.direct.group] == number):
-                windows[row].add_into(core)
+                if windows is not None:
+                    windows[row].add_into(core)
             image += veil(camera, core)
         images[number] = image
     return images

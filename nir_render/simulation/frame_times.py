@@ -1,6 +1,6 @@
 """When each camera really takes its frames: by the scene's clock, and by how its own departs from it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,14 @@ def frame_times(scene: Scene, seed: int) -> Mapping[str, FrameTimes]:
     """
     planned_s = np.array(scene.document.frame_times_s())
     return {name: _of_camera(scene.camera(name)[1].clock, name, planned_s, seed) for name in scene.cameras()}
+
+
+def last_of_first(
+    turns: Sequence[tuple[int, str]], own_times: Mapping[str, FrameTimes], frames: int
+) -> dict[str, int]:
+    """Return the last frame of each camera among the first so many that were not dropped."""
+    kept = [(index, name) for index, name in turns if not own_times[name].dropped[index]]
+    return {name: index for index, name in kept[:frames]}
 
 
 def _of_camera(clock: CameraClock | None, name: str, planned_s: NDArray[np.float64], seed: int) -> FrameTimes:

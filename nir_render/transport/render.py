@@ -46,6 +46,11 @@ def render(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None 
     return replace(light, time_s=snapshot.time_s, seed=seed, short_pixels=short_pixels)
 
 
+def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
+    """Return the direct light alone that reaches a camera; errors as `render`. It is kept nowhere."""
+    return _rendering(snapshot, camera, seed, None).direct_light()
+
+
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
     """Return how many samples a pixel of the film gets on average; 0 without indirect light.
 
@@ -87,6 +92,10 @@ class _Rendering:
         """Return the light with so many samples in each pixel."""
         return self._kept(samples, lambda: self._light(self._indirect(samples)), counts=True)
 
+    def direct_light(self) -> Light:
+        """Return the light without its indirect part."""
+        return self._light(None)
+
     def _kept(self, samples: Sampled, rendered: Callable[[], Light], *, counts: bool) -> Light:
         made_by = _made_by()
         key = light_key(self.site, self._geometry, self.seed, self._power, samples, made_by)
@@ -118,6 +127,8 @@ class _Rendering:
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
         snapshot, name = self.site.snapshot, self.site.name
+        if not snapshot.has_indirect_light():
+            return None
         key = groups.light_seed(self.seed, "indirect", name, self._geometry)
         if not backend().vectorised:
             return stock.indirect(snapshot, name, key, self._direct)
