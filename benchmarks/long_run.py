@@ -4,9 +4,9 @@
 
 Five robots, four of which drive, seen by the four cameras of the fifth, 1280 × 960 pixels at 30 FPS; with
 `--hall` between a floor and a wall whose light is interpolated (`render.indirect.error`). `--frames` counts
-all cameras' frames, of 1200 for 10 s; `whole_s` scales what was measured up to these, and adds what is done once
-(`once`: a first run of a frame per camera). Each number of frames runs in a process of its own, for its peak
-memory; a run of twice the frames tells whether that grows. `-P` keeps this folder off Python's path.
+all cameras' frames, of 1200 for 10 s; `whole_s` scales what was measured up to these, and adds what is done
+once (`once`: a first run of a frame per camera). Each number of frames runs in a process of its own, for its
+peak memory; a run of twice the frames tells whether that grows. `-P` keeps this folder off Python's path.
 """
 
 import argparse

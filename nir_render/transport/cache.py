@@ -30,8 +30,8 @@ _MOST_HELD = 512  # small lights, of long runs: each new one looks through them
 class LightCache:
     """Lights by key; the least recently used go first.
 
-    The last light of each camera and film stays in memory whatever the limit, of others at most 512; on disk the folder may hold
-    `limit_bytes`.
+    The last light of each camera and film stays in memory whatever the limit, of others at most 512; on disk
+    the folder may hold `limit_bytes`.
     `reused` and `missed` count the lights that were asked for.
     """
 
