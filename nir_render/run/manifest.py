@@ -11,7 +11,7 @@ from nir_render.camera.render_noise import RenderNoise
 from nir_render.light.light import Light
 from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import Shot
-from nir_render.simulation.refresh import RefreshError
+from nir_render.simulation.refresh import HELD_OUT, RefreshError
 from nir_render.transport.fingerprint import package_versions
 from nir_render.transport.indirect.sample_plan import MOST_SAMPLES
 
@@ -87,7 +87,7 @@ def sample_facts(light: Light) -> dict[str, Any]:
 def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return how far interpolated light is off where it was held out, and the times between renders.
 
-    With a target for the error the halves of an interval that keeps it are used, and their error is smaller;
+    With a target for the error the parts of an interval that keeps it are used, and their error is smaller;
     intervals that do not are not used, nor counted here.
     """
     settings = scene.document.render.indirect
@@ -96,7 +96,7 @@ def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[s
     errors = [RefreshError(**one) for one in measured]
     if settings.error is not None:
         errors = [one for one in errors if one.keeps(settings.error)]
-    used = 1.0 if settings.error is None else 0.5
+    used = 1.0 if settings.error is None else 1.0 - HELD_OUT
     worst = max(errors, key=lambda one: one.flare_share, default=None)
     facts = {
         "every_s": settings.every_s,

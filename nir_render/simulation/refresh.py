@@ -2,7 +2,8 @@
 
 Direct light is reckoned anew for every frame: it is closed form. Indirect light takes long, and changes
 slowly: between two renders it is interpolated linearly, pixel by pixel, as electrons behind the lens. How far
-that is off is measured where it is largest, in the middle of two renders, by a render there that is held out.
+that is off is measured by a render that is held out, near the middle of two others, where it is largest. Not
+in the middle: what goes round and round could be in its place there each time.
 """
 
 import math
@@ -33,7 +34,10 @@ from nir_render.transport.cache import LightCache
 FLARE_SHARE = 0.002
 """Of any flare's flux, what interpolating may add or take away: a thousandth of its range."""
 
-_LONGEST_S = 1.0
+HELD_OUT = 0.381966
+"""Where in an interval, by the golden section: the error there is 0.94 of that in the middle."""
+
+_LONGEST_S = 2.0
 _FRAMES = 1.5  # shorter intervals save nothing
 _MEASURED_EACH = 8  # of so many intervals of a given length, the error of one is measured
 _SIGMAS = 2.0  # render noise in a flare's aperture is not the error of interpolating
@@ -41,7 +45,7 @@ _SIGMAS = 2.0  # render noise in a flare's aperture is not the error of interpol
 
 @dataclass(frozen=True)
 class RefreshError:
-    """How far interpolated light was off a render in the middle of two others.
+    """How far interpolated light was off a render between two others.
 
     Attributes
     ----------
@@ -75,9 +79,9 @@ class RefreshError:
 class Refreshed:
     """The rates of each camera over time, which goes on: what lies before an interval is forgotten.
 
-    With `render.indirect.every` light is rendered so often. With `render.indirect.error` intervals of a
-    second are halved until the error in their middle is kept, down to the time of a frame; then both halves
-    are used.
+    With `render.indirect.every` light is rendered so often. With `render.indirect.error` intervals of
+    two seconds are parted, by the golden section, until the error held out there is kept, down to the time of
+    a frame; then both parts are used.
     """
 
     def __init__(self, scene: Scene, seed: int, cache: LightCache) -> None:
@@ -124,30 +128,30 @@ class Refreshed:
             del known[old_s]
         self._kept = {key: kept for key, kept in self._kept.items() if key[0] != name or key[2] > begin_s}
         if self._share is not None:
-            return self._halved_s(name, begin_s, end_s, time_s, self._share)
+            return self._parted_s(name, begin_s, end_s, time_s, self._share)
         if number % _MEASURED_EACH == 0 and end_s - begin_s >= _FRAMES * self._period_s:
             self._keeps(name, begin_s, end_s, 0.0)
         return begin_s, end_s
 
-    def _halved_s(
+    def _parted_s(
         self, name: str, begin_s: float, end_s: float, time_s: float, share: float
     ) -> tuple[float, float]:
-        """Return the part of an interval, around a time, in the middle of which the error is kept."""
+        """Return the part of an interval, around a time, in which the error is kept."""
         if end_s - begin_s < _FRAMES * self._period_s:
             return begin_s, end_s
         middle_s = 0.5 * (begin_s + end_s)
         half = (begin_s, middle_s) if time_s < middle_s else (middle_s, end_s)
         return (
-            half if self._keeps(name, begin_s, end_s, share) else self._halved_s(name, *half, time_s, share)
+            half if self._keeps(name, begin_s, end_s, share) else self._parted_s(name, *half, time_s, share)
         )
 
     def _keeps(self, name: str, begin_s: float, end_s: float, share: float) -> bool:
-        """Measure the error in the middle of an interval, once, and tell whether it is small enough."""
+        """Measure the error within an interval, once, and tell whether it is small enough."""
         key = (name, begin_s, end_s)
         if key not in self._kept:
-            middle_s = 0.5 * (begin_s + end_s)
-            first, last, held_out = (self._at(name, time_s) for time_s in (begin_s, end_s, middle_s))
-            error = interpolation_error(first, last, held_out, middle_s, end_s - begin_s)
+            held_out_s = begin_s + HELD_OUT * (end_s - begin_s)
+            first, held_out, last = (self._at(name, time_s) for time_s in (begin_s, held_out_s, end_s))
+            error = interpolation_error(first, last, held_out, (begin_s, held_out_s, end_s))
             self._measured.append(error)
             self._kept[key] = error.keeps(share)
         return self._kept[key]
@@ -175,15 +179,18 @@ class Refreshed:
 
 
 def interpolation_error(
-    first: Rates, last: Rates, held_out: Rates, time_s: float, apart_s: float
+    first: Rates, last: Rates, held_out: Rates, times_s: tuple[float, float, float]
 ) -> RefreshError:
-    """Return how far the mean of two lights is off a third one, that of the middle, all fully lit.
+    """Return how far what is interpolated between two lights is off a third one, all fully lit.
 
-    It counts for the camera's own exposure.
+    Their times are those of the first, of the one held out, and of the last. It counts for the camera's own
+    exposure.
     """
     camera, light = held_out.camera, held_out.light
     exposure_s = own_setting(camera, 0).exposure_s
-    of = ((0.5, first), (0.5, last), (-1.0, held_out))
+    begin_s, time_s, end_s = times_s
+    part = (time_s - begin_s) / (end_s - begin_s)
+    of = ((1.0 - part, first), (part, last), (-1.0, held_out))
     frame = fully_lit_frame(held_out, exposure_s)
     error_e = np.zeros(frame.electrons.shape)
     noise_e2 = 0.0
@@ -210,7 +217,7 @@ def interpolation_error(
     return RefreshError(
         camera=light.camera,
         time_s=time_s,
-        apart_s=apart_s,
+        apart_s=end_s - begin_s,
         mean_share=float(((error_e**2).sum() - noise_e2) / temporal_variance_e2(frame).sum()),
         flare_share=float(worst),
         flare_sigma=sigma,
