@@ -1,0 +1,73 @@
+"""The filter beside Stone Soup's unscented one, on the same measurements: one JSON object.
+
+In an environment of its own (`pip install stonesoup`): `tracking.py --write runs.npz` writes the runs, then
+`python tracking_stone_soup.py runs.npz` reads them; of this project it needs nothing.
+"""
+
+import datetime
+import json
+import sys
+
+import numpy as np
+from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
+from stonesoup.models.transition.linear import (
+    CombinedLinearGaussianTransitionModel,
+    ConstantVelocity,
+)
+from stonesoup.predictor.kalman import UnscentedKalmanPredictor
+from stonesoup.types.angle import Bearing, Elevation
+from stonesoup.types.array import StateVector
+from stonesoup.types.detection import Detection
+from stonesoup.types.hypothesis import SingleHypothesis
+from stonesoup.types.state import GaussianState
+from stonesoup.updater.kalman import UnscentedKalmanUpdater
+
+TURNED = [0, 3, 1, 4, 2, 5]  # [p; v] to x, vx, y, vy, z, vz
+
+
+def followed(runs: dict[str, np.ndarray], name: str, start: np.ndarray) -> np.ndarray:
+    """Return its estimates of the places, shape (steps, runs, 3); σ of the range at the predicted range."""
+    interval_s, psd, bearing_rad, noise = runs[f"{name}.case"]
+    model = CombinedLinearGaussianTransitionModel([ConstantVelocity(psd)] * 3)
+    predictor, updater = UnscentedKalmanPredictor(model), UnscentedKalmanUpdater(None)
+    begin = datetime.datetime(2000, 1, 1)  # noqa: DTZ001
+    bearing, range_m = runs[f"{name}.bearing"], runs[f"{name}.range_m"]
+    found = np.empty((*range_m.shape, 3))
+    for run in range(range_m.shape[1]):
+        state = GaussianState(runs[f"{name}.first"][run][TURNED], start[np.ix_(TURNED, TURNED)], begin)
+        for step in range(len(range_m)):
+            when = begin + datetime.timedelta(seconds=float((step + 1) * interval_s))
+            ahead = predictor.predict(state, timestamp=when)
+            far = float(np.linalg.norm(np.asarray(ahead.state_vector, dtype=float)[[0, 2, 4]]))
+            x, y, z = bearing[step, run]
+            height = float(np.arcsin(z))
+            spread = np.diag(
+                [bearing_rad**2, (bearing_rad / np.cos(height)) ** 2, (0.5 * noise * far**3) ** 2]
+            )
+            seen = CartesianToElevationBearingRange(6, (0, 2, 4), spread)
+            unbiased = range_m[step, run] - 0.375 * (noise * far**2) ** 2 * far
+            vector = StateVector([Elevation(height), Bearing(np.arctan2(y, x)), unbiased])
+            state = updater.update(
+                SingleHypothesis(ahead, Detection(vector, timestamp=when, measurement_model=seen))
+            )
+            found[step, run] = np.asarray(state.state_vector, dtype=float)[[0, 2, 4], 0]
+    return found
+
+
+def main() -> None:
+    """Print RMSE of both, and their ratio, of each case."""
+    runs = dict(np.load(sys.argv[1]))
+    figures = {}
+    for key in [name for name in runs if name.endswith(".case")]:
+        name = key.removesuffix(".case")
+        truth = runs[f"{name}.truth"][..., :3]
+        ours, theirs = (
+            float(np.sqrt(np.mean(np.sum((places - truth) ** 2, axis=2))))
+            for places in (runs[f"{name}.estimates"][..., :3], followed(runs, name, runs["start"]))
+        )
+        figures[name] = {"ours_m": ours, "stone_soup_m": theirs, "ratio": round(ours / theirs, 4)}
+    print(json.dumps(figures, indent=2))
+
+
+if __name__ == "__main__":
+    main()
