@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from perception.track import Tracker
 from tests.unit.perception.simulation import random
 from tests.unit.perception.track.test_kalman import CASES, RUNS, START, simulated
-from tests.unit.perception.track.world import measurement, clutter
+from tests.unit.perception.track.world import clutter, measurement
 
 SETS, FPS = 90, 30.0
 
@@ -27,7 +27,9 @@ def timed(targets: int, false: int) -> dict[str, float | int]:
     """Time sets of so many blinking targets among so many false detections."""
     rng = random(1690, targets, false)
     azimuth, height = rng.uniform(-np.pi, np.pi, targets), rng.uniform(-0.5, 0.5, targets)
-    towards = np.stack([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)], axis=1)
+    towards = np.stack(
+        [np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)], axis=1
+    )
     place_m = towards * rng.uniform(1.0, 6.0, (targets, 1))
     velocity = rng.normal(0.0, 0.1, (targets, 3))
     lit = rng.uniform(size=(targets, 200)) < 0.6
@@ -51,7 +53,7 @@ def timed(targets: int, false: int) -> dict[str, float | int]:
 
 
 def filters() -> dict[str, dict[str, dict[str, float]]]:
-    """Return mean NEES (6 expected), the share of steps in its 95 % band, and RMSE over the root of the bound."""
+    """Return mean NEES (6 expected), the share of steps in its 95 % band, RMSE over the root of the bound."""
     low, high = stats.chi2.ppf([0.025, 0.975], 6 * RUNS) / RUNS
     forms = [("sound", 0.0), *(("paper", epsilon_m2) for epsilon_m2 in (1e-8, 1e-6, 1e-4))]
     found: dict[str, dict[str, dict[str, float]]] = {}
@@ -76,7 +78,9 @@ def written(path: Path) -> None:
         name = case.name.replace(" ", "_")
         for column in ("first", "truth", "estimates", "bearing", "range_m"):
             columns[f"{name}.{column}"] = getattr(runs, column)
-        columns[f"{name}.case"] = np.array([case.interval_s, case.psd, case.bearing_rad, case.flux_noise_at_1_m])
+        columns[f"{name}.case"] = np.array(
+            [case.interval_s, case.psd, case.bearing_rad, case.flux_noise_at_1_m]
+        )
     np.savez(path, start=START, **columns)
 
 

@@ -4,39 +4,40 @@ In an environment of its own (`pip install stonesoup`): `tracking.py --write run
 `python tracking_stone_soup.py runs.npz` reads them; of this project it needs nothing.
 """
 
-import datetime
+import datetime as dt
 import json
 import sys
 
 import numpy as np
-from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
-from stonesoup.models.transition.linear import (
-    CombinedLinearGaussianTransitionModel,
-    ConstantVelocity,
-)
-from stonesoup.predictor.kalman import UnscentedKalmanPredictor
-from stonesoup.types.angle import Bearing, Elevation
-from stonesoup.types.array import StateVector
-from stonesoup.types.detection import Detection
-from stonesoup.types.hypothesis import SingleHypothesis
-from stonesoup.types.state import GaussianState
-from stonesoup.updater.kalman import UnscentedKalmanUpdater
 
 TURNED = [0, 3, 1, 4, 2, 5]  # [p; v] to x, vx, y, vy, z, vz
 
 
 def followed(runs: dict[str, np.ndarray], name: str, start: np.ndarray) -> np.ndarray:
     """Return its estimates of the places, shape (steps, runs, 3); σ of the range at the predicted range."""
+    from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
+    from stonesoup.models.transition.linear import (
+        CombinedLinearGaussianTransitionModel,
+        ConstantVelocity,
+    )
+    from stonesoup.predictor.kalman import UnscentedKalmanPredictor
+    from stonesoup.types.angle import Bearing, Elevation
+    from stonesoup.types.array import StateVector
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import GaussianState
+    from stonesoup.updater.kalman import UnscentedKalmanUpdater
+
     interval_s, psd, bearing_rad, noise = runs[f"{name}.case"]
     model = CombinedLinearGaussianTransitionModel([ConstantVelocity(psd)] * 3)
     predictor, updater = UnscentedKalmanPredictor(model), UnscentedKalmanUpdater(None)
-    begin = datetime.datetime(2000, 1, 1)  # noqa: DTZ001
+    begin = dt.datetime(2000, 1, 1)
     bearing, range_m = runs[f"{name}.bearing"], runs[f"{name}.range_m"]
     found = np.empty((*range_m.shape, 3))
     for run in range(range_m.shape[1]):
         state = GaussianState(runs[f"{name}.first"][run][TURNED], start[np.ix_(TURNED, TURNED)], begin)
         for step in range(len(range_m)):
-            when = begin + datetime.timedelta(seconds=float((step + 1) * interval_s))
+            when = begin + dt.timedelta(seconds=float((step + 1) * interval_s))
             ahead = predictor.predict(state, timestamp=when)
             far = float(np.linalg.norm(np.asarray(ahead.state_vector, dtype=float)[[0, 2, 4]]))
             x, y, z = bearing[step, run]
@@ -56,6 +57,9 @@ def followed(runs: dict[str, np.ndarray], name: str, start: np.ndarray) -> np.nd
 
 def main() -> None:
     """Print RMSE of both, and their ratio, of each case."""
+    if len(sys.argv) < 2:
+        print(json.dumps({"skipped": "wants a file of tracking.py --write, and Stone Soup"}))
+        return
     runs = dict(np.load(sys.argv[1]))
     figures = {}
     for key in [name for name in runs if name.endswith(".case")]:

@@ -30,7 +30,9 @@ def test_assignment_is_the_best_of_all() -> None:
         rows, columns = (grid.ravel() for grid in np.indices(gain.shape))
         pairs = Pairs(rows, columns, gain.ravel(), np.zeros(20), np.zeros(20, dtype=np.int64))
         chosen = assigned(pairs)
-        best = max(sum(max(gain[r, c], 0.0) for r, c in enumerate(p)) for p in itertools.permutations(range(5), 4))
+        best = max(
+            sum(max(gain[r, c], 0.0) for r, c in enumerate(p)) for p in itertools.permutations(range(5), 4)
+        )
         assert pairs.gain[chosen].sum() == pytest.approx(best)
         assert (pairs.gain[chosen] > 0.0).all()
 
@@ -87,7 +89,8 @@ def test_the_papers_cost() -> None:
     seen = observed([ahead], poses_at((), np.zeros(1)), 0.0, HOW)._replace(range_m=np.array([2.3]))
     bank = newborn(seen, 0.0, HOW)
     bank = bank._replace(
-        mean=np.array([[2.0, side, 0.0, 0.0, 0.0, 0.0]]), anchor_mean=np.array([[2.3, -1.0, 0.0, 0.0, 0.0, 0.0]])
+        mean=np.array([[2.0, side, 0.0, 0.0, 0.0, 0.0]]),
+        anchor_mean=np.array([[2.3, -1.0, 0.0, 0.0, 0.0, 0.0]]),
     )
     bank = _moving(bank, np.array([1.0, 0.0, 0.0]))
     pairs = paper_pairs(bank, seen._replace(noise_m2=np.array([1e-16])), np.zeros(3), HOW)

@@ -50,7 +50,9 @@ def test_consider_update_is_the_joint_one_with_no_gain_for_u() -> None:
     states, found = _some_states(5)
     after = updated(states, found)
     for k in range(5):
-        joint = np.block([[states.covariance[k], states.common[k][:, None]], [states.common[k][None], np.ones((1, 1))]])
+        joint = np.block(
+            [[states.covariance[k], states.common[k][:, None]], [states.common[k][None], np.ones((1, 1))]]
+        )
         rows = np.hstack([found.rows[k], found.load_m[k][:, None]])
         known = joint[:6, :6] - np.outer(joint[:6, 6], joint[6, :6])
         spread = found.rows[k] @ known @ found.rows[k].T + found.noise_m2[k]
@@ -65,11 +67,15 @@ def test_consider_update_is_the_joint_one_with_no_gain_for_u() -> None:
 def test_a_range_that_is_not_known_leaves_the_range() -> None:
     far = np.array([[3.0, 1.0, 0.2, 0.0, 0.0, 0.0]])
     states = States(far, np.diag([0.04] * 3 + [0.01] * 3)[None], np.zeros((1, 6)))
-    seen = _observations(far[:, :3] + 0.01, np.array([1e-6]), np.array([np.inf]))._replace(range_m=np.array([np.nan]))
+    seen = _observations(far[:, :3] + 0.01, np.array([1e-6]), np.array([np.inf]))._replace(
+        range_m=np.array([np.nan])
+    )
     after = updated(states, innovations(states, seen))
     along, left = bearing_axes(far[0, :3] / np.linalg.norm(far[0, :3]))[[2, 0]]
     assert along @ after.covariance[0, :3, :3] @ along == pytest.approx(0.04, rel=2e-3)
-    assert left @ after.covariance[0, :3, :3] @ left == pytest.approx(1e-6 * 10.04 / (1 + 1e-6 * 10.04 / 0.04), rel=0.02)
+    assert left @ after.covariance[0, :3, :3] @ left == pytest.approx(
+        1e-6 * 10.04 / (1 + 1e-6 * 10.04 / 0.04), rel=0.02
+    )
 
 
 # --- truth from its own model ---
@@ -161,7 +167,9 @@ def simulated(case: Case, form: str, key: int, epsilon_m2: float = 1e-6) -> Runs
         bound = predicted(States(truth, bound, states.common), case.interval_s, case.psd).covariance
         far = np.linalg.norm(truth[:, :3], axis=1)
         axes = bearing_axes(truth[:, :3] / far[:, None])
-        weights = np.stack([1 / (far * case.bearing_rad) ** 2] * 2 + [4.0 / (case.flux_noise_at_1_m * far**3) ** 2], axis=1)
+        weights = np.stack(
+            [1 / (far * case.bearing_rad) ** 2] * 2 + [4.0 / (case.flux_noise_at_1_m * far**3) ** 2], axis=1
+        )
         information = np.linalg.inv(bound)
         information[:, :3, :3] += axes.transpose(0, 2, 1) @ (weights[:, :, None] * axes)
         bound = np.linalg.inv(information)
@@ -172,23 +180,32 @@ def simulated(case: Case, form: str, key: int, epsilon_m2: float = 1e-6) -> Runs
             column.append(value)
     truths, estimates, bearing, range_m = (np.array(column) for column in kept)
     error_m = np.sqrt(np.sum((estimates - truths)[..., :3] ** 2, axis=2).mean())
-    return Runs(np.array(nees), float(error_m), float(np.sqrt(np.mean(least_m2))), first, truths, estimates, bearing, range_m)
+    return Runs(
+        np.array(nees),
+        float(error_m),
+        float(np.sqrt(np.mean(least_m2))),
+        first,
+        truths,
+        estimates,
+        bearing,
+        range_m,
+    )
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_nees_and_bound(case: Case) -> None:
     # The NEES of steps that follow each other is correlated: five times 200 runs, each with its own band.
-    low, high = stats.chi2.ppf([0.025, 0.975], 6 * RUNS) / RUNS
+    low, high = (stats.chi2.ppf(p, 6 * RUNS) / RUNS for p in (0.025, 0.975))
     all_of = [simulated(case, "sound", key) for key in range(5)]
     nees = np.array([one.nees for one in all_of])
     assert np.mean((nees > low) & (nees < high)) >= 0.9
-    error_m2, bound_m2 = (np.mean([x**2 for x in xs]) for xs in zip(*((one.rmse_m, one.bound_m) for one in all_of), strict=True))
-    assert np.sqrt(error_m2) <= 1.05 * np.sqrt(bound_m2)
+    error_m2 = sum(one.rmse_m**2 for one in all_of)
+    assert error_m2 <= 1.05**2 * sum(one.bound_m**2 for one in all_of)
 
 
 @pytest.mark.parametrize("case", CASES[:2], ids=lambda case: case.name)
 def test_the_papers_form_is_not_consistent(case: Case) -> None:
-    low, high = stats.chi2.ppf([0.025, 0.975], 6 * RUNS) / RUNS
+    low, high = (stats.chi2.ppf(p, 6 * RUNS) / RUNS for p in (0.025, 0.975))
     for epsilon_m2 in (1e-8, 1e-6, 1e-4):
         nees = simulated(case, "paper", 2, epsilon_m2).nees
         assert np.mean((nees > low) & (nees < high)) < 0.5

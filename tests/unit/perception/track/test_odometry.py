@@ -18,7 +18,8 @@ RECORDS = [_record(0.0, 0.0, 0.0, 0.02), _record(1.0, 2.0, 0.6, 0.02), _record(3
 
 
 @pytest.mark.parametrize(
-    ("time_s", "x_m", "yaw"), [(0.25, 0.5, 0.15), (1.0, 2.0, 0.6), (2.0, 2.0, 0.8), (3.5, 2.0, 1.1), (-0.5, -1.0, -0.3)]
+    ("time_s", "x_m", "yaw"),
+    [(0.25, 0.5, 0.15), (1.0, 2.0, 0.6), (2.0, 2.0, 0.8), (3.5, 2.0, 1.1), (-0.5, -1.0, -0.3)],
 )
 def test_between_and_beyond(time_s: float, x_m: float, yaw: float) -> None:
     pose = pose_at(RECORDS, time_s)

@@ -45,7 +45,9 @@ def test_prediction_goes_on_in_the_odometrys_frame(tmp_path: Path) -> None:
     there = own.predicted(1.0, path)[0]
     expected = turn(0.5).T @ (one.position_body_m + np.array([0.0, 1.0, 0.0]) - np.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(there.position_body_m, expected, atol=1e-12)
-    np.testing.assert_allclose(there.velocity_body_m_per_s, turn(0.5).T @ np.array([0.0, 1.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(
+        there.velocity_body_m_per_s, turn(0.5).T @ np.array([0.0, 1.0, 0.0]), atol=1e-12
+    )
     assert (there.unseen_s, there.detections) == (1.0, ())
 
 
@@ -56,7 +58,10 @@ def test_prediction_goes_on_in_the_odometrys_frame(tmp_path: Path) -> None:
         ("def f(m, o, s): return [3]", "returned an object of type int among its tracks"),
         ("def f(m, o, s): return 1 / 0", r"ZeroDivisionError: division by zero \(mine.py, line 11\)"),
         ("def f(m, o, s): return [*nearest(m, o, s)] * 2", "two tracks have one number"),
-        ("def f(m, o, s): return [Track('a', 0.0, 1, np.zeros(2), np.zeros(3), np.eye(6))]", r"shape \(2,\); wanted \(3,\)"),
+        (
+            "def f(m, o, s): return [Track('a', 0.0, 1, np.zeros(2), np.zeros(3), np.eye(6))]",
+            r"shape \(2,\); wanted \(3,\)",
+        ),
     ],
 )
 def test_what_comes_back_is_checked(tmp_path: Path, text: str, line: str) -> None:

@@ -10,8 +10,26 @@ from perception.track import Tracker, TrackerSettings
 from perception.types import Measurement, Track
 from tests.unit.perception.simulation import random
 from tests.unit.perception.track.world import (
-    COMMON, MOVING, TURNING, Observer, Robot, blinking, bounce, clutter, covered, crossing, dark_crossing, matched,
-    measurement, occlusion, run, sets, straight, swarm, switches, turn,
+    COMMON,
+    MOVING,
+    TURNING,
+    Observer,
+    Robot,
+    blinking,
+    bounce,
+    clutter,
+    covered,
+    crossing,
+    dark_crossing,
+    matched,
+    measurement,
+    occlusion,
+    run,
+    sets,
+    straight,
+    swarm,
+    switches,
+    turn,
 )  # fmt: skip
 
 RUNS = {
@@ -23,7 +41,9 @@ RUNS = {
 }
 
 
-SLOW_100 = [pytest.param(name, 100.0, marks=[] if name == "crossing" else pytest.mark.verify) for name in RUNS]
+SLOW_100 = [
+    pytest.param(name, 100.0, marks=[] if name == "crossing" else pytest.mark.verify) for name in RUNS
+]
 
 
 @pytest.mark.parametrize(("name", "fps"), [*((name, 30.0) for name in RUNS), *SLOW_100])
@@ -70,7 +90,9 @@ def test_noise_alone_has_no_tracks() -> None:
 
 def test_born_within_a_second_of_blinking() -> None:
     # Zeros but for the start of each bit group: the darkest word, parity 0: one light bit pair in eleven.
-    simulated = sets([Robot(straight([3.0, 1.0, 0.0], [0.1, 0.0, 0.0]), blinking([0] * 9 + [1, 1]))], 3.0, 30.0, 3)
+    simulated = sets(
+        [Robot(straight([3.0, 1.0, 0.0], [0.1, 0.0, 0.0]), blinking([0] * 9 + [1, 1]))], 3.0, 30.0, 3
+    )
     out = run(simulated)
     first_s = next(one.time_s for one, tracks in zip(simulated, out, strict=True) if tracks)
     lit_s = next(one.time_s for one in simulated if one.measurements)
@@ -147,7 +169,9 @@ def test_claims_hold_for_an_observer_that_drives_and_drifts() -> None:
 # --- odd streams ---
 
 
-def _steady(tracker: Tracker, begin_s: float, count: int, place: tuple[float, float, float] = (3.0, 0.5, 0.0)) -> tuple[Track, ...]:
+def _steady(
+    tracker: Tracker, begin_s: float, count: int, place: tuple[float, float, float] = (3.0, 0.5, 0.0)
+) -> tuple[Track, ...]:
     rng = random(1660, count)
     out: tuple[Track, ...] = ()
     for n in range(count):
@@ -233,7 +257,9 @@ def test_followed_by_bearing_alone() -> None:
         tracks = tracker.update(when, [seen])
     assert [t.track for t in tracks] == [1]
     assert tracks[0].unseen_s == 0.0
-    assert tracks[0].position_body_m[1] / tracks[0].position_body_m[0] == pytest.approx(0.3 * 59 / 30 / 3.0, abs=5e-4)
+    assert tracks[0].position_body_m[1] / tracks[0].position_body_m[0] == pytest.approx(
+        0.3 * 59 / 30 / 3.0, abs=5e-4
+    )
 
 
 def _without_range(seen: Measurement) -> Measurement:
@@ -273,7 +299,9 @@ def test_light_of_an_edge_is_no_robot_behind() -> None:
     for n in range(300):
         level = (0.5, *[1.0] * 9, 0.5, *[0.0] * 9)[n % 20]
         place = np.array([2.0, 0.2, 0.0])
-        tracks = tracker.update(n / 100.0, [measurement(place, n / 100.0, rng, flux=level, common=0.0)] if level else [])
+        tracks = tracker.update(
+            n / 100.0, [measurement(place, n / 100.0, rng, flux=level, common=0.0)] if level else []
+        )
     assert [t.track for t in tracks] == [1]
     assert np.linalg.norm(tracks[0].position_body_m) == pytest.approx(2.01, rel=0.01)
 

@@ -50,7 +50,9 @@ def turn(yaw: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def talking(rng: np.random.Generator, packets_per_s: float = 0.12, seconds: float = 20.0) -> Callable[[float], float]:
+def talking(
+    rng: np.random.Generator, packets_per_s: float = 0.12, seconds: float = 20.0
+) -> Callable[[float], float]:
     """Blink words (PHYSICS.md 8) at 10 Hz: five frames of 11 bits and a stretch of idle light, again and again."""
     bits: list[int] = []
     while len(bits) * BIT_S < seconds:
@@ -120,7 +122,9 @@ def clutter(count: int, time_s: float, rng: np.random.Generator) -> list[Measure
     for k in range(count):
         azimuth, height = rng.uniform(-np.pi, np.pi), rng.uniform(-0.5, 0.5)
         range_m = math.exp(rng.uniform(math.log(0.4), math.log(12.0)))
-        place = range_m * np.array([math.cos(azimuth) * math.cos(height), math.sin(azimuth) * math.cos(height), math.sin(height)])
+        place = range_m * np.array(
+            [math.cos(azimuth) * math.cos(height), math.sin(azimuth) * math.cos(height), math.sin(height)]
+        )
         found.append(measurement(place, time_s, rng, 1000 + k))
     return found
 
@@ -166,17 +170,24 @@ def sets(
             if robot.seen(when) and robot.lit(when) > 0.05
         ]
         hits = [
-            measurement(p, when, rng, k, flux=f, common=0.0, merged=m) for k, (p, f, m) in enumerate(_merged(lights))
+            measurement(p, when, rng, k, flux=f, common=0.0, merged=m)
+            for k, (p, f, m) in enumerate(_merged(lights))
         ]
         hits += clutter(false, when, rng)
         seen = np.array([[robot.seen(when)] for robot in robots])
         if rng.uniform() >= dropped:
-            now = np.where(seen, np.array([turn(at.yaw(time_s)).T @ (r.path(time_s) - at.path(time_s)) for r in robots]), np.nan)
+            now = np.where(
+                seen,
+                np.array([turn(at.yaw(time_s)).T @ (r.path(time_s) - at.path(time_s)) for r in robots]),
+                np.nan,
+            )
             found.append(Set(time_s, hits, records[-3:], now))
     return found
 
 
-def _record(at: Observer, time_s: float, drift_m: Array, drift_rad: float, rng: np.random.Generator) -> Odometry:
+def _record(
+    at: Observer, time_s: float, drift_m: Array, drift_rad: float, rng: np.random.Generator
+) -> Odometry:
     tilt = bearing_noise(rng, at.rotation_sigma_rad)
     return Odometry(
         "a", time_s,
@@ -237,10 +248,12 @@ def matched(one: Set, tracks: Sequence[Track], within_m: float) -> list[tuple[in
     apart = np.linalg.norm(one.truth_m[:, None] - np.array([t.position_body_m for t in tracks]), axis=2)
     apart = np.where(apart < within_m, apart, 1e3)
     rows, columns = linear_sum_assignment(apart)
-    return [(int(r), tracks[c]) for r, c in zip(rows, columns, strict=True) if apart[r, c] < within_m]
+    return [(int(r), tracks[int(c)]) for r, c in zip(rows, columns, strict=True) if apart[r, c] < within_m]
 
 
-def covered(simulated: Sequence[Set], out: Sequence[tuple[Track, ...]], after_s: float, within_m: float = 0.4) -> float:
+def covered(
+    simulated: Sequence[Set], out: Sequence[tuple[Track, ...]], after_s: float, within_m: float = 0.4
+) -> float:
     """Return the share of robots in sight that have a track, from a time on."""
     has = could = 0
     for one, tracks in zip(simulated, out, strict=True):
@@ -319,11 +332,16 @@ def swarm(count: int, key: int, speed_m_per_s: float = 0.1) -> list[Robot]:
             centres.append(place)
 
     def round_about(centre: Array, turn_rad_per_s: float, phase: float) -> Path:
-        return lambda t: centre + 0.25 * np.array(
-            [math.cos(turn_rad_per_s * t + phase), math.sin(turn_rad_per_s * t + phase), 0.0]
+        return lambda t: (
+            centre
+            + 0.25
+            * np.array([math.cos(turn_rad_per_s * t + phase), math.sin(turn_rad_per_s * t + phase), 0.0])
         )
 
     return [
-        Robot(round_about(one, speed_m_per_s / 0.25 * rng.choice([-1.0, 1.0]), rng.uniform(0.0, 2.0 * np.pi)), talking(rng))
+        Robot(
+            round_about(one, speed_m_per_s / 0.25 * rng.choice([-1.0, 1.0]), rng.uniform(0.0, 2.0 * np.pi)),
+            talking(rng),
+        )
         for one in centres
     ]
