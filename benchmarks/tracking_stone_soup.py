@@ -56,7 +56,7 @@ def followed(runs: dict[str, np.ndarray], name: str, start: np.ndarray) -> np.nd
 
 
 def main() -> None:
-    """Print RMSE of both and their ratio, for each case."""
+    """Print RMSE of both and their ratio, also without the first third of steps, for each case."""
     if len(sys.argv) < 2:
         print(json.dumps({"skipped": "wants a file of tracking.py --write, and Stone Soup"}))
         return
