@@ -107,12 +107,15 @@ def innovation_covariance(states: States, innovations: Innovations) -> Array:
 def updated(states: States, innovations: Innovations) -> States:
     """Update each track by its measurement: Joseph's form, with the consider state.
 
-    The gain is the best that leaves the consider state alone (Jazwinski 1970, section 8.4).
+    The gain is that of a filter that is told u; the covariance is what it then does without knowing it. The
+    gain that is the best by Schmidt would choose between measurements by how far their shared errors differ
+    from the state's. These are a few per cent of ranges, and differ by what noise is in the predicted ranges:
+    it would follow measurements that happen to come out nearer, and be wrong about it.
     """
     rows, residual, noise, load = innovations
-    spread = innovation_covariance(states, innovations)
-    crossed = states.covariance @ rows.transpose(0, 2, 1) + states.common[:, :, None] * load[:, None, :]
-    gain = np.linalg.solve(spread, crossed.transpose(0, 2, 1)).transpose(0, 2, 1)
+    known = states.covariance - states.common[:, :, None] * states.common[:, None, :]
+    crossed = known @ rows.transpose(0, 2, 1)
+    gain = np.linalg.solve(rows @ crossed + noise, crossed.transpose(0, 2, 1)).transpose(0, 2, 1)
     left = np.eye(6) - gain @ rows
     turned = gain.transpose(0, 2, 1)
     pushed = np.einsum("nij,nj->ni", gain, load)

@@ -46,7 +46,7 @@ def _some_states(n: int) -> tuple[States, Innovations]:
     )
 
 
-def test_schmidt_update_is_the_joint_one_with_no_gain_for_u() -> None:
+def test_consider_update_is_the_joint_one_with_no_gain_for_u() -> None:
     states, found = _some_states(5)
     after = updated(states, found)
     for k in range(5):
@@ -54,8 +54,9 @@ def test_schmidt_update_is_the_joint_one_with_no_gain_for_u() -> None:
             [[states.covariance[k], states.common[k][:, None]], [states.common[k][None], np.ones((1, 1))]]
         )
         rows = np.hstack([found.rows[k], found.load_m[k][:, None]])
-        gain = joint @ rows.T @ np.linalg.inv(rows @ joint @ rows.T + found.noise_m2[k])
-        gain[6] = 0.0
+        known = joint[:6, :6] - np.outer(joint[:6, 6], joint[6, :6])
+        spread = found.rows[k] @ known @ found.rows[k].T + found.noise_m2[k]
+        gain = np.vstack([known @ found.rows[k].T @ np.linalg.inv(spread), np.zeros((1, 3))])
         left = np.eye(7) - gain @ rows
         expected = left @ joint @ left.T + gain @ found.noise_m2[k] @ gain.T
         np.testing.assert_allclose(after.covariance[k], expected[:6, :6], atol=1e-9)
@@ -125,19 +126,33 @@ def measured(truth_m: Array, case: Case, rng: np.random.Generator) -> Observatio
     return _observations(range_m[:, None] * bearing, np.full(n, case.bearing_rad**2), claimed**2)
 
 
-def simulated(case: Case, form: str, key: int, epsilon_m2: float = 1e-6) -> tuple[Array, float, float]:
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """What came of the runs of one case: truth and estimates, shape (steps, runs, 6), and what was measured."""
+
+    nees: Array
+    rmse_m: float
+    bound_m: float
+    first: Array
+    truth: Array
+    estimates: Array
+    bearing: Array
+    range_m: Array
+
+
+START = np.diag([0.05**2] * 3 + [0.1**2] * 3)
+
+
+def simulated(case: Case, form: str, key: int, epsilon_m2: float = 1e-6) -> Runs:
     """Return the mean NEES at each step, the RMSE of the place, and the root of its mean bound."""
     rng = random(1611, key)
-    spread = np.diag([0.05**2] * 3 + [0.1**2] * 3)
     truth = np.tile([case.range_m, 0.0, 0.1, 0.0, case.speed_m_per_s, 0.0], (RUNS, 1))
-    states = States(
-        truth + rng.multivariate_normal(np.zeros(6), spread, RUNS),
-        np.tile(spread, (RUNS, 1, 1)),
-        np.zeros((RUNS, 6)),
-    )
-    bound = np.tile(spread, (RUNS, 1, 1))
+    first = truth + rng.multivariate_normal(np.zeros(6), START, RUNS)
+    states = States(first, np.tile(START, (RUNS, 1, 1)), np.zeros((RUNS, 6)))
+    bound = states.covariance
     walk = process_noise(case.interval_s, case.psd)
-    nees, error2, least2 = [], 0.0, 0.0
+    nees, least_m2 = [], []
+    kept: tuple[list[Array], list[Array], list[Array], list[Array]] = ([], [], [], [])
     for _ in range(case.steps):
         truth = predicted(States(truth, bound, states.common), case.interval_s, 0.0).mean
         truth = truth + rng.multivariate_normal(np.zeros(6), walk, RUNS)
@@ -160,26 +175,37 @@ def simulated(case: Case, form: str, key: int, epsilon_m2: float = 1e-6) -> tupl
         bound = np.linalg.inv(information)
         error = states.mean - truth
         nees.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(states.covariance), error).mean())
-        error2 += np.sum(error[:, :3] ** 2)
-        least2 += float(np.trace(bound[:, :3, :3], axis1=1, axis2=2).sum())
-    count = RUNS * case.steps
-    return np.array(nees), float(np.sqrt(error2 / count)), float(np.sqrt(least2 / count))
+        least_m2.append(np.trace(bound[:, :3, :3], axis1=1, axis2=2).mean())
+        for column, value in zip(kept, (truth, states.mean, seen.bearing, seen.range_m), strict=True):
+            column.append(value)
+    truths, estimates, bearing, range_m = (np.array(column) for column in kept)
+    error_m = np.sqrt(np.sum((estimates - truths)[..., :3] ** 2, axis=2).mean())
+    return Runs(
+        np.array(nees),
+        float(error_m),
+        float(np.sqrt(np.mean(least_m2))),
+        first,
+        truths,
+        estimates,
+        bearing,
+        range_m,
+    )
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_nees_and_bound(case: Case) -> None:
     # The NEES of steps that follow each other is correlated: five times 200 runs, each with its own band.
-    low, high = stats.chi2.ppf([0.025, 0.975], 6 * RUNS) / RUNS
+    low, high = (stats.chi2.ppf(p, 6 * RUNS) / RUNS for p in (0.025, 0.975))
     all_of = [simulated(case, "sound", key) for key in range(5)]
-    nees = np.array([one[0] for one in all_of])
+    nees = np.array([one.nees for one in all_of])
     assert np.mean((nees > low) & (nees < high)) >= 0.9
-    error_m, least_m = (np.sqrt(np.mean([one[k] ** 2 for one in all_of])) for k in (1, 2))
-    assert error_m <= 1.05 * least_m
+    error_m2 = sum(one.rmse_m**2 for one in all_of)
+    assert error_m2 <= 1.05**2 * sum(one.bound_m**2 for one in all_of)
 
 
 @pytest.mark.parametrize("case", CASES[:2], ids=lambda case: case.name)
 def test_the_papers_form_is_not_consistent(case: Case) -> None:
-    low, high = stats.chi2.ppf([0.025, 0.975], 6 * RUNS) / RUNS
+    low, high = (stats.chi2.ppf(p, 6 * RUNS) / RUNS for p in (0.025, 0.975))
     for epsilon_m2 in (1e-8, 1e-6, 1e-4):
-        nees, _, _ = simulated(case, "paper", 2, epsilon_m2)
+        nees = simulated(case, "paper", 2, epsilon_m2).nees
         assert np.mean((nees > low) & (nees < high)) < 0.5

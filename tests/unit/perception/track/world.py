@@ -248,7 +248,7 @@ def matched(one: Set, tracks: Sequence[Track], within_m: float) -> list[tuple[in
     apart = np.linalg.norm(one.truth_m[:, None] - np.array([t.position_body_m for t in tracks]), axis=2)
     apart = np.where(apart < within_m, apart, 1e3)
     rows, columns = linear_sum_assignment(apart)
-    return [(int(r), tracks[c]) for r, c in zip(rows, columns, strict=True) if apart[r, c] < within_m]
+    return [(int(r), tracks[int(c)]) for r, c in zip(rows, columns, strict=True) if apart[r, c] < within_m]
 
 
 def covered(
