@@ -172,6 +172,20 @@ def parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
     return items
 
 
+def lines_of(
+    folder: Path, kind: str, names: Iterable[str], parse: Callable[[Any], Item]
+) -> dict[str, list[Item]]:
+    """Return the lines of `KIND.NAME.jsonl`, by estimator, of those that have such a file.
+
+    Raises
+    ------
+    InputError
+        As `parse_lines`.
+    """
+    paths = {name: folder / f"{kind}.{name}.jsonl" for name in names}
+    return {name: parse_lines(path, parse) for name, path in paths.items() if path.is_file()}
+
+
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
     """Write `manifest.json` with the given facts and the SHA-256 of every file of the folder."""
     write_json(folder / MANIFEST, {"format": 1, **facts, "sha256": _hashes(folder)})

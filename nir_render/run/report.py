@@ -7,7 +7,14 @@ from nir_render.errors import InputError
 from nir_render.evaluate.metrics import Evaluation
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds
-from perception import RecordingError, read_calibrations, read_frame, read_frame_records
+from perception import (
+    RecordingError,
+    parse_message,
+    parse_signal,
+    read_calibrations,
+    read_frame,
+    read_frame_records,
+)
 
 
 def report_run(folder: Path, result: Evaluation) -> Path:
@@ -19,8 +26,10 @@ def report_run(folder: Path, result: Evaluation) -> Path:
         A frame or the calibration cannot be read.
     """
     from nir_render.report.page import report_html
+    from nir_render.report.time.section import Said
 
     started = time.perf_counter()
+    names = list(result.summary["estimators"])
     has_manifest = (folder / run_folder.MANIFEST).is_file()
     try:
         records = {(record.camera, record.index): record for record in read_frame_records(folder)}
@@ -32,6 +41,10 @@ def report_run(folder: Path, result: Evaluation) -> Path:
             manifest=run_folder.read_json(folder / run_folder.MANIFEST) if has_manifest else {},
             folder_name=folder.resolve().name,
             files=run_folder.files_beside(folder / "report.html"),
+            said=Said(
+                run_folder.lines_of(folder, "signals", names, parse_signal),
+                run_folder.lines_of(folder, "messages", names, parse_message),
+            ),
         )
     except RecordingError as error:
         raise InputError(str(error)) from None
