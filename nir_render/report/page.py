@@ -39,6 +39,7 @@ def report_html(
     folder_name: str,
     files: Sequence[str],
     said: Said | None = None,
+    film: str = "",
 ) -> str:
     """Write the page.
 
@@ -60,6 +61,8 @@ def report_html(
         Names of files that lie beside the page, to link to.
     said
         Signals and messages, where there are any.
+    film
+        Name of the film beside the page, if there is one.
 
     Returns
     -------
@@ -86,6 +89,7 @@ def report_html(
         frames=_frames(keys, result, load, calibrations) if keys else None,
         around=around_section(result.around),
         over_time=time_section(result, said or Said()),
+        film=film,
         plots=_plots(by_estimator),
         cameras=_cameras(keys, result),
         more_cameras=counted(len(cameras) - MOST_CAMERAS, "more camera")

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+
 from nir_render.errors import InputError
 from nir_render.evaluate.messages import evaluate_messages
 from nir_render.evaluate.metrics import Evaluation, evaluate

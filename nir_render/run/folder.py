@@ -26,6 +26,7 @@ FRAMES = "frames.jsonl"
 TRUTH = "truth.jsonl"
 LAMPS = "lamps.jsonl"
 SENT = "sent.jsonl"
+FILM = "preview.gif"
 POSES = "poses.jsonl"
 
 Item = TypeVar("Item")

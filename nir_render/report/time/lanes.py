@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class Lane:
 
     @property
     def label(self) -> str:
-        """The robot's name; its source's too where that is not plainly on top; whose image it is."""
+        """Robot and source, and whose image it is where it is one."""
         robot, source, ghost_of = self.name
         return f"{robot}.{source}" + (f"' of {ghost_of}" if ghost_of else "")
 
@@ -50,12 +51,12 @@ class Lane:
     def bearing_error_deg(self) -> Values:
         """Angle between the bearing said and the true one, from the body's origin."""
         across = np.linalg.norm(np.cross(self.said_m, self.place_m), axis=1)
-        return np.degrees(np.arctan2(across, (self.said_m * self.place_m).sum(axis=1)))
+        return np.asarray(np.degrees(np.arctan2(across, (self.said_m * self.place_m).sum(axis=1))))
 
     def switches(self) -> list[int]:
         """Return the instants in which another track follows it than the last one that did."""
         found = np.flatnonzero(self.track >= 0)
-        return [int(b) for a, b in zip(found[:-1], found[1:], strict=True) if self.track[a] != self.track[b]]
+        return [int(b) for a, b in pairwise(found) if self.track[a] != self.track[b]]
 
 
 def lanes_of(moments: Sequence[Moment], observer: str, name: str) -> list[Lane]:

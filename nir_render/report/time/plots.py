@@ -13,7 +13,6 @@ from nir_render.report.time.lanes import Flags, Lane, Values, spans
 COLOURS = ("#70e000", "#ff9f1c", "#f72585", "#b392f0", "#ffd166", "#5e9bff", "#4dd6c1", "#ff8fab")
 """Of tracks, or of sources, in turn."""
 
-_MARGIN = 1.15
 _MOST_LANES = 8
 
 
@@ -21,7 +20,6 @@ def above_plot(lanes: Mapping[str, Sequence[Lane]], observer: str) -> Drawing:
     """Draw true ways and tracks from above in the observer's body axes, ahead up the page."""
     names = list(lanes)
     some = next(iter(lanes.values()))
-    reach_m = _MARGIN * max(0.5, *(float(np.nanmax(np.abs(lane.place_m[:, :2]))) for lane in some))
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(7.4)
         axes = figure.subplots()
@@ -40,9 +38,8 @@ def above_plot(lanes: Mapping[str, Sequence[Lane]], observer: str) -> Drawing:
                 label = f"{name}: predicted, not seen" if k == 0 else None
                 axes.plot(x, y, ".", color=colour, markersize=3.0, alpha=0.8, label=label)
         axes.plot(0.0, 0.0, "^", color=INK, markersize=9, label=f"{observer}, looking up the page")
-        axes.set_xlim(-reach_m, reach_m)
-        axes.set_ylim(-reach_m, reach_m)
-        axes.set_aspect("equal")
+        axes.margins(0.12)
+        axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("to the right, m")
         axes.set_ylabel("ahead, m")
         legend(axes)
@@ -50,7 +47,7 @@ def above_plot(lanes: Mapping[str, Sequence[Lane]], observer: str) -> Drawing:
 
 
 def error_plot(lanes: Sequence[Lane], name: str) -> Drawing:
-    """Draw the errors of range and bearing over time, a colour for each source, in bands of the claimed σ."""
+    """Draw the errors of range and bearing over time, a colour a source, in bands of the claimed σ."""
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(5.6)
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
@@ -85,7 +82,7 @@ def error_plot(lanes: Sequence[Lane], name: str) -> Drawing:
 
 
 def life_plot(lanes: Mapping[str, Sequence[Lane]]) -> Drawing:
-    """Draw a bar per source and estimator: which track followed it when, its darkness, where tracks change."""
+    """Draw a bar per source and estimator: which track followed it when, and when it was dark."""
     rows = [(name, lane) for name, own in lanes.items() for lane in own]
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(1.0 + 0.34 * len(rows))
@@ -143,7 +140,7 @@ def _page(place_m: Values) -> tuple[Values, Values]:
 
 
 def _reach(errors: Sequence[Values]) -> float:
-    """Return how far an axis goes: beyond the middle 99 % of errors, so that one start does not flatten all."""
+    """Return how far an axis goes: beyond 99 % of errors, so that one start does not flatten all."""
     sizes = np.abs(np.concatenate([*errors, np.empty(0)]))
     sizes = sizes[np.isfinite(sizes)]
     return 1.4 * max(float(np.quantile(sizes, 0.99)), 1e-6) if sizes.size else 1.0

@@ -49,7 +49,7 @@ def time_section(result: Evaluation, said: Said) -> OverTime | None:
     there = any(lanes.values())
     times_s = [moment.time_s for moment in moments]
     sentence = (
-        f"{counted(len(moments), 'set')} of frames over {max(times_s) - min(times_s):.1f} s. A source that is "
+        f"{counted(len(moments), 'set')} of frames in {max(times_s) - min(times_s):.1f} s. A source that is "
         "dark or hidden for up to a second is to keep its track"
         + ("." if len(sights) == 1 else f"; the plots show what {observer} saw, of {len(sights)} observers.")
     )
