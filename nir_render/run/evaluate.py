@@ -5,10 +5,9 @@ It reads files alone: a folder that another program wrote is scored like one tha
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
 
 from nir_render.errors import InputError
 from nir_render.evaluate.messages import evaluate_messages
@@ -38,8 +37,6 @@ from perception import (
 )
 from perception.rig.frame_sets import robot_of, set_time_s
 from perception.types import FrameKey
-
-Item = TypeVar("Item")
 
 
 def evaluate_run(folder: Path) -> Evaluation:
@@ -158,7 +155,7 @@ def _with_tracks(
 ) -> Evaluation:
     """Add the scores of tracks and of what they said, where the folder has `tracks.*.jsonl`."""
     folder = recording.folder
-    tracks = _lines_of(folder, "tracks", names, parse_track)
+    tracks = run_folder.lines_of(folder, "tracks", names, parse_track)
     if not tracks:
         return result
     sets = [
@@ -172,8 +169,8 @@ def _with_tracks(
         heard = evaluate_messages(
             over_time.moments,
             parse_lines(folder / run_folder.SENT, parse_sent),
-            _lines_of(folder, "messages", names, parse_message),
-            _lines_of(folder, "signals", names, parse_signal),
+            run_folder.lines_of(folder, "messages", names, parse_message),
+            run_folder.lines_of(folder, "signals", names, parse_signal),
         )
         summaries.append(heard.summary)
     summary = dict(result.summary)
@@ -186,14 +183,6 @@ def _with_tracks(
         for name, numbers in summary["estimators"].items()
     }
     return replace(result, summary=summary, over_time=over_time, heard=heard)
-
-
-def _lines_of(
-    folder: Path, kind: str, names: Sequence[str], parse: Callable[[Any], Item]
-) -> dict[str, list[Item]]:
-    """Return the lines of a kind of files, by estimator, of those that have such a file."""
-    paths = {name: folder / f"{kind}.{name}.jsonl" for name in names}
-    return {name: parse_lines(path, parse) for name, path in paths.items() if path.is_file()}
 
 
 def _preview(recording: Recording, keys: Sequence[FrameKey], result: Evaluation) -> bytes:

@@ -26,6 +26,7 @@ FRAMES = "frames.jsonl"
 TRUTH = "truth.jsonl"
 LAMPS = "lamps.jsonl"
 SENT = "sent.jsonl"
+FILM = "preview.gif"
 POSES = "poses.jsonl"
 _DIGEST = ".digest"
 
@@ -236,6 +237,20 @@ def parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
     if problems:
         raise InputError("\n".join(first_of(problems)))
     return items
+
+
+def lines_of(
+    folder: Path, kind: str, names: Iterable[str], parse: Callable[[Any], Item]
+) -> dict[str, list[Item]]:
+    """Return the lines of `KIND.NAME.jsonl`, by estimator, of those that have such a file.
+
+    Raises
+    ------
+    InputError
+        As `parse_lines`.
+    """
+    paths = {name: folder / f"{kind}.{name}.jsonl" for name in names}
+    return {name: parse_lines(path, parse) for name, path in paths.items() if path.is_file()}
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:

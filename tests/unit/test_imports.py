@@ -18,7 +18,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.regress": ("stages",),
     "nir_render.compare": (),
     "nir_render.run": ("recording",),
-    "nir_render.report": (),
+    "nir_render.report": ("time",),
     "nir_render.evaluate": (),
     "nir_render.simulation": (),
     "nir_render.transport": ("indirect", "direct", "world", "backend"),
