@@ -275,9 +275,7 @@ def _carrier_positions_m(carrier: Moving, times_s: Array) -> Array:
 
 def _carrier_rotations(carrier: Moving, times_s: Array) -> Array:
     return (
-        robot_rotations(carrier, times_s)
-        if isinstance(carrier, Robot)
-        else frame_rotations(carrier, times_s)
+        robot_rotations(carrier, times_s) if isinstance(carrier, Robot) else frame_rotations(carrier, times_s)
     )
 
 

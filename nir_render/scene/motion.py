@@ -112,9 +112,7 @@ def frame_rotations(moving: Moving, times_s: Array) -> Array:
     return np.asarray(Slerp(knots.times_s, Rotation.from_matrix(knots.rotations))(now_s).as_matrix())
 
 
-def _by_spline(
-    splines: tuple[Spline, ...], times_s: Array, value: Callable[[Spline, Array], Array]
-) -> Array:
+def _by_spline(splines: tuple[Spline, ...], times_s: Array, value: Callable[[Spline, Array], Array]) -> Array:
     """Return what splines say at times, each of the part of them that is its own."""
     which = along(splines, times_s)
     parts = {int(number): value(splines[number], times_s[which == number]) for number in np.unique(which)}
@@ -174,6 +172,7 @@ def _knots_of_ways(ways: tuple[Waypoint, ...], between: Between | None) -> _Knot
     ends = [*holds, len(stops) - 1]
     starts = [0, *(index + 1 for index in holds)]
     parts = [slice(start, end + 1) for start, end in zip(starts, ends, strict=True)]
-    splines = tuple(spline_of(times_s[part], positions_m[part], rotations[part], rests=True) for part in parts)
+    splines = tuple(
+        spline_of(times_s[part], positions_m[part], rotations[part], rests=True) for part in parts
+    )
     return _Knots(times_s, positions_m, rotations, splines)
-

@@ -28,9 +28,7 @@ def frame_times(scene: Scene, seed: int) -> Mapping[str, FrameTimes]:
     return {name: _of_camera(scene.camera(name)[1].clock, name, planned_s, seed) for name in scene.cameras()}
 
 
-def _of_camera(
-    clock: CameraClock | None, name: str, planned_s: NDArray[np.float64], seed: int
-) -> FrameTimes:
+def _of_camera(clock: CameraClock | None, name: str, planned_s: NDArray[np.float64], seed: int) -> FrameTimes:
     if clock is None:
         return FrameTimes(planned_s, np.zeros(len(planned_s), dtype=bool))
     time_s = planned_s[0] + clock.offset_s + (1.0 + clock.drift) * (planned_s - planned_s[0])

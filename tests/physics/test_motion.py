@@ -107,7 +107,11 @@ def test_what_a_moving_box_hides_of_a_disc() -> None:
                      "material": "black"}}  # fmt: skip
     lens = {"position": "[0, 0, 0.2] m"}
     source = {"top": {"position": "[0, 0, 0.2] m"}}
-    eye = {"preset": "infra_swarm", "cameras": {"front": lens}, "sources": {"top": {"position": "[0, 0, 1] m"}}}
+    eye = {
+        "preset": "infra_swarm",
+        "cameras": {"front": lens},
+        "sources": {"top": {"position": "[0, 0, 1] m"}},
+    }
     robots = {
         "r1": {"rig": eye},
         "r2": {"rig": {"preset": "infra_swarm", "sources": source}, "position": "[2, 0, 0] m"},

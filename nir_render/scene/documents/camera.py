@@ -167,5 +167,7 @@ class Rig(PresetDocument):
     def _bodies_move_with_the_robot(self) -> Self:
         for name, shape in self.body.items():
             if shape.moves:
-                raise ValueError(f"body.{name}: moves with its robot and has no motion of its own; leave it out")
+                raise ValueError(
+                    f"body.{name}: moves with its robot and has no motion of its own; leave it out"
+                )
         return self
