@@ -229,7 +229,7 @@ def _weighted_sum(
     drive_profiles: list[NDArray[np.float64]],
     drawn: Mapping[int, Window] = MappingProxyType({}),
 ) -> MeanFrame:
-    """Return the frame of profiles; windows that motion has drawn out stand in place of those of the rates."""
+    """Return the frame of profiles; windows that motion has `drawn` out stand in place of the rates'."""
     sensor = rates.camera.sensor
     profiles = np.reshape(drive_profiles, (len(drive_profiles), sensor.rows))
     weights = exposure_s * profiles

@@ -3,8 +3,9 @@
 Over an exposure the pose of each robot goes on at the velocity that it has in the middle: straight on, and
 turning evenly. So the place of a source in the camera's axes is known at each instant, and what it brings is
 an integral over the exposure of images of known place and size, weighted with the drive: by Gauss's rule
-where the drive does not change, else a sum over short stretches of time, the mean of the drive in each exact. What is hidden, and what a mirror or the fog leaves, is as at mid-exposure. The flare
-of a ghost moves as its source's image does in a mirror that stands still.
+where the drive does not change, else a sum over short stretches of time, the mean of the drive in each exact.
+What is hidden, and what a mirror or the fog leaves, is as at mid-exposure. The flare of a ghost moves as its
+source's image does in a mirror that stands still.
 
 With a rolling shutter each row has its own exposure, and the same geometry in the middle of it: rows of a
 frame differ in their drive, not in place.

@@ -9,12 +9,12 @@ import yaml
 from pydantic import ValidationError
 
 from nir_render.errors import InputError, shown
+from nir_render.scene.bodies import shapes_at
 from nir_render.scene.checks import check
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.emitters import Lamp, Source, Sun
 from nir_render.scene.explain import Places, explain
-from nir_render.scene.bodies import shapes_at
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
 from nir_render.scene.snapshot import PlacedRobot, Snapshot

@@ -327,8 +327,10 @@ def _as_fast(before: Snapshot, after: Snapshot) -> bool:
         and (
             one is None
             or other is None
-            or np.array_equal(one.linear_m_per_s, other.linear_m_per_s)
-            and np.array_equal(one.angular_rad_per_s, other.angular_rad_per_s)
+            or (
+                np.array_equal(one.linear_m_per_s, other.linear_m_per_s)
+                and np.array_equal(one.angular_rad_per_s, other.angular_rad_per_s)
+            )
         )
         for one, other in pairs
     )

@@ -1,5 +1,7 @@
 """Odometry: exact without noise, dead reckoning with the errors that it says."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -35,7 +37,7 @@ def test_errors_are_as_large_as_they_say() -> None:
     walk = odometry_of(_scene({"position_walk": "2 cm", "rotation_walk": "0.5 deg"}), "r1", 3)
     steps_m = np.diff([record.position_m for record in walk], axis=0)
     assert np.mean(steps_m**2) * 30.0 == pytest.approx(0.02**2, rel=4 * 0.047)
-    turns = [one.rotation.T @ other.rotation for one, other in zip(walk, walk[1:], strict=False)]
+    turns = [one.rotation.T @ other.rotation for one, other in itertools.pairwise(walk)]
     angles_rad = Rotation.from_matrix(np.array(turns)).as_rotvec()
     assert np.mean(angles_rad**2) * 30.0 == pytest.approx(np.radians(0.5) ** 2, rel=4 * 0.047)
     white = odometry_of(_scene({"position_noise": "1 mm", "rotation_noise": "0.1 deg"}), "r1", 3)
