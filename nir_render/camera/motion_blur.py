@@ -72,6 +72,8 @@ def path_of(
         normal = apart_m / max(float(np.linalg.norm(apart_m)), 1e-300)
         height_m = (there_m - 0.5 * (source_m + shown_m)) @ normal
         there_m = there_m - 2.0 * height_m[:, None] * normal
+    else:
+        there_m = there_m + (shown_m - source_m)  # the table says where the flare is in the middle
     lens_m = _carried(here.position_m, eye.pose, eye.velocity, offsets_s)
     offset_m = np.einsum("nji,nj->ni", _turns(eye.velocity, offsets_s), there_m - lens_m)
     distance_m = np.linalg.norm(offset_m, axis=1)
