@@ -20,11 +20,10 @@ from nir_render.camera.by_spectrum import by_spectrum, group_emitters, group_flu
 from nir_render.camera.motion_blur import (
     STILL_PX,
     drawn_out,
+    instants,
     may_move,
     moved_beam,
     path_of,
-    stretch_weights_s,
-    stretches,
 )
 from nir_render.camera.optics.lens import intrinsics_of
 from nir_render.camera.optics.psf import Window, place_of
@@ -242,7 +241,7 @@ def _weighted_sum(
     drive_profiles: list[NDArray[np.float64]],
     drawn: Mapping[int, Window] = MappingProxyType({}),
 ) -> MeanFrame:
-    """Return the frame of profiles; windows that motion has drawn out stand in place of those of the rates."""
+    """Return the frame of profiles; windows that motion has `drawn` out stand in place of the rates'."""
     sensor = rates.camera.sensor
     profiles = np.reshape(drive_profiles, (len(drive_profiles), sensor.rows))
     weights = exposure_s * profiles
@@ -285,20 +284,24 @@ def _drawn_out(rates: Rates, exposure_s: float, time_s: float) -> dict[int, Wind
         if not may_move(snapshot, light.camera, group):
             continue
         ends = path_of(snapshot, light.camera, group, table, row, exposure_s * np.array([-0.5, 0.0, 0.5]))
-        length_px = np.linalg.norm(np.diff(lens.project(ends.direction), axis=0), axis=1).sum()
-        if length_px < STILL_PX:
+        ends_px = lens.project(ends.direction)
+        length_px = float(np.linalg.norm(np.diff(ends_px, axis=0), axis=1).sum())
+        shown = rates.windows[row].values.any() or any(lens.contains(*end) for end in ends_px)
+        if not shown or length_px < STILL_PX:
             continue
-        count = stretches(float(length_px) if np.isfinite(length_px) else 0.0)
-        middles_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
-        path = path_of(snapshot, light.camera, group, table, row, middles_s)
+        drive = rates.drives[_drive_of_window(rates, row)]
+        length_px = length_px if np.isfinite(length_px) else 0.0
+        chosen = instants(camera, drive, time_s, exposure_s, length_px)
+        if not chosen.weight_s.any():
+            continue
+        path = path_of(snapshot, light.camera, group, table, row, chosen.offset_s)
         beam = _beam(light, snapshot, camera, row)
         seen = None if beam.seen is None else table.seen[row]
         windows = [
             beam_window(camera, moved_beam(beam, direction, float(distance_m), seen), 1.0)
             for direction, distance_m in zip(path.direction, path.distance_m, strict=True)
         ]
-        drive = rates.drives[_drive_of_window(rates, row)]
-        drawn[int(row)] = drawn_out(windows, stretch_weights_s(camera, drive, time_s, exposure_s, count))
+        drawn[int(row)] = drawn_out(windows, chosen.weight_s)
     return drawn
 
 

@@ -2,10 +2,10 @@
 
 Over an exposure the pose of each robot goes on at the velocity that it has in the middle: straight on, and
 turning evenly. So the place of a source in the camera's axes is known at each instant, and what it brings is
-an integral over the exposure of images of known place and size, weighted with the drive. The integral is a
-sum over short stretches of time; in each the drive's mean is exact, and the flare stands where it is in the
-middle of the stretch. What is hidden, and what a mirror or the fog leaves, is as at mid-exposure. The flare
-of a ghost moves as its source's image does in a mirror that stands still.
+an integral over the exposure of images of known place and size, weighted with the drive: by Gauss's rule
+where the drive does not change, else a sum over short stretches of time, the mean of the drive in each exact.
+What is hidden, and what a mirror or the fog leaves, is as at mid-exposure. The flare of a ghost moves as its
+source's image does in a mirror that stands still.
 
 With a rolling shutter each row has its own exposure, and the same geometry in the middle of it: rows of a
 frame differ in their drive, not in place.
@@ -22,7 +22,7 @@ from nir_render.camera.beams import Beam
 from nir_render.camera.optics.psf import Window, place_of
 from nir_render.camera.timing.drive import mean_level
 from nir_render.camera.timing.shutter import on_fractions, row_profile, row_starts_s
-from nir_render.geometry import sunflower
+from nir_render.geometry import legendre, sunflower
 from nir_render.light.light import DirectTable
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.emitters import Drive
@@ -37,6 +37,7 @@ STILL_PX = 0.01
 
 _LEAST_STRETCHES, _MOST_STRETCHES = 8, 256
 _STRETCH_PX = 0.2
+_NODE_PX, _MOST_NODES = 0.75, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,8 @@ def path_of(
         normal = apart_m / max(float(np.linalg.norm(apart_m)), 1e-300)
         height_m = (there_m - 0.5 * (source_m + shown_m)) @ normal
         there_m = there_m - 2.0 * height_m[:, None] * normal
+    else:
+        there_m = there_m + (shown_m - source_m)  # the table says where the flare is in the middle
     lens_m = _carried(here.position_m, eye.pose, eye.velocity, offsets_s)
     offset_m = np.einsum("nji,nj->ni", _turns(eye.velocity, offsets_s), there_m - lens_m)
     distance_m = np.linalg.norm(offset_m, axis=1)
@@ -122,23 +125,36 @@ def drawn_out(windows: Sequence[Window], weights_s: Array) -> Window:
     return Window(values, top, left, total)
 
 
-def stretch_weights_s(camera: Camera, drive: Drive, time_s: float, exposure_s: float, count: int) -> Array:
-    """Return how long each row is lit in each of `count` even stretches of its exposure, (count, rows).
+@dataclass(frozen=True, eq=False)
+class Instants:
+    """Times of an exposure that stand for all of it: from its middle on, shape (n,), and their weights.
 
-    What parasitic light adds while a row waits to be read counts to the last.
+    A weight is how long each row of pixels is lit there, in seconds, shape (n, rows).
     """
+
+    offset_s: Array
+    weight_s: Array
+
+
+def instants(camera: Camera, drive: Drive, time_s: float, exposure_s: float, length_px: float) -> Instants:
+    """Return the instants of an exposure in which a flare goes so far, row 0 beginning at a time.
+
+    Where the drive does not change in it they are those of Gauss and Legendre, enough for a path over a point
+    spread of 0.5 px and more; else the middles of even stretches, with the exact mean of the drive in each.
+    What parasitic light adds while a row waits to be read counts to the last one.
+    """
+    count = min(max(_LEAST_STRETCHES, math.ceil(length_px / _STRETCH_PX)), _MOST_STRETCHES)
     stretch_s = exposure_s / count
     starts_s = row_starts_s(camera, time_s) + stretch_s * np.arange(count)[:, None]
-    weights_s = stretch_s * mean_level(drive, starts_s, stretch_s)
-    profile = row_profile(camera, drive, time_s, exposure_s)
-    weights_s[-1] += exposure_s * (profile - on_fractions(camera, drive, time_s, exposure_s))
-    return weights_s
-
-
-def stretches(length_px: float) -> int:
-    """Return into how many stretches of time an exposure is divided, by how far the flare goes in it."""
-    wanted = max(_LEAST_STRETCHES, math.ceil(length_px / _STRETCH_PX))
-    return min(wanted, _MOST_STRETCHES)
+    levels = mean_level(drive, starts_s, stretch_s)
+    if (levels == levels[0]).all():
+        nodes, weights = legendre(min(2 + math.ceil(length_px / _NODE_PX), _MOST_NODES))
+        offset_s, weight_s = 0.5 * exposure_s * nodes, 0.5 * exposure_s * weights[:, None] * levels[0]
+    else:
+        offset_s, weight_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5), stretch_s * levels
+    waiting = row_profile(camera, drive, time_s, exposure_s) - on_fractions(camera, drive, time_s, exposure_s)
+    weight_s[-1] += exposure_s * waiting
+    return Instants(offset_s, weight_s)
 
 
 def _carried(point_m: Array, pose: Pose, velocity: Velocity | None, offsets_s: Array) -> Array:

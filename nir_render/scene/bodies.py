@@ -88,7 +88,7 @@ def _turned(orientation: Orientation, pose: Pose) -> Orientation:
 
 
 def _rotation_rad(shape: Rectangle, pose: Pose) -> float:
-    """Return the rotation about the turned normal at which the turned rectangle's width lies where it does."""
+    """Return the rotation about its turned normal that a turned rectangle has."""
     across = pose.rotation @ rectangle_frame(shape.normal, (2.0, 2.0), shape.rotation_rad)[:, 0]
     plain = rectangle_frame(_vector(pose.rotation @ np.array(shape.normal)), (2.0, 2.0), 0.0)
     return float(np.arctan2(across @ plain[:, 1], across @ plain[:, 0]))

@@ -226,8 +226,8 @@ def _first_time_inside(
 ) -> tuple[float, Array] | None:
     """Return when, of times, a camera is in a body for the first time, and where it is then.
 
-    `carrier` is what the body moves with. `places_m` is where its robot is, shape (n, 3): only where that is near enough is the camera looked for,
-    as this takes the robot's orientation.
+    `carrier` is what the body moves with. `places_m` is where the camera's robot is, shape (n, 3): only where
+    that is near enough is the camera looked for, as this takes the robot's orientation.
     """
     center_m, radius_m = _bounding_sphere(body)
     reach_m = (radius_m + float(np.linalg.norm(camera.position_m))) * (1.0 + _SLACK)
@@ -296,8 +296,8 @@ def _cameras_and_sources_inside_their_own_bodies(document: SceneDocument) -> lis
             if inside is not None:
                 problems.append(
                     f"robots.{name}.rig.{kind}.{one}: is inside the robot's own body.{inside}, at "
-                    f"[{', '.join(f'{x:.4g}' for x in position_m)}] m, and sees or shows nothing; move one of "
-                    "them, or make the body of parts that leave it free"
+                    f"[{', '.join(f'{x:.4g}' for x in position_m)}] m, and sees or shows nothing; move one "
+                    "of them, or make the body of parts that leave it free"
                 )
     return problems
 

@@ -24,7 +24,7 @@ _HALF_STEP_S = 5e-4
 
 @dataclass(frozen=True, eq=False)
 class Velocity:
-    """How a pose changes, in the world's axes: of its origin in m/s, and about it in rad/s, shape (3,) each."""
+    """How a pose changes, in the world's axes: its origin in m/s, and about it in rad/s, shape (3,)."""
 
     linear_m_per_s: Array
     angular_rad_per_s: Array
@@ -46,7 +46,10 @@ def frame_pose(moving: Moving, time_s: float) -> Pose:
 
 
 def robot_velocity(robot: Robot, time_s: float) -> Velocity | None:
-    """Return how fast the robot goes, or None where it has no motion: from its poses 0.5 ms about the time."""
+    """Return how fast a robot goes, by its poses 0.5 ms about the time; None where it has no motion.
+
+    At a knot between two speeds that is the mean of both.
+    """
     if not robot.moves:
         return None
     from scipy.spatial.transform import Rotation
@@ -73,7 +76,8 @@ def robot_rotations(robot: Robot, times_s: Array) -> Array:
 
 def camera_positions_m(robot: Robot, camera: Camera, times_s: Array) -> Array:
     """Return where a camera is at times, shape (n,), in the world, shape (n, 3)."""
-    return robot_positions_m(robot, times_s) + robot_rotations(robot, times_s) @ np.array(camera.position_m)
+    offsets_m = robot_rotations(robot, times_s) @ np.array(camera.position_m)
+    return np.asarray(robot_positions_m(robot, times_s) + offsets_m)
 
 
 def frame_positions_m(moving: Moving, times_s: Array) -> Array:

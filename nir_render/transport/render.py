@@ -186,8 +186,8 @@ def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | N
     inside = solid_around(snapshot.shapes, placed.pose.position_m)
     if inside is not None:
         raise InputError(
-            f"{snapshot.origin}: the camera {camera} is inside {place_of_shape(inside)} at {snapshot.time_s:g} s; "
-            "move one"
+            f"{snapshot.origin}: the camera {camera} is inside {place_of_shape(inside)} at "
+            f"{snapshot.time_s:g} s; move one"
         )
     if snapshot.has_indirect_light():
         indivisible = indivisible_sensor(camera, placed.camera.sensor, snapshot.render.indirect.scale)

@@ -11,7 +11,6 @@ that would need too many nodes are split into inside and edge (`camera/large_dis
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from nir_render.camera.optics.large_disc import Disc, image_of_large_disc
 from nir_render.camera.optics.lens import Intrinsics
 from nir_render.camera.optics.otf import Core
 from nir_render.camera.optics.waves import image_of_points
-from nir_render.geometry import cone_directions, cone_versine
+from nir_render.geometry import cone_directions, cone_versine, legendre
 
 _TAIL_SIGMAS = 8.0
 _WAVES_PER_SIGMA = 0.84
@@ -37,21 +36,13 @@ def cone_nodes(
     Gauss–Legendre in 1 − cos ψ (solid angle is even in it), evenly spaced in azimuth: exact for polynomials
     of degree 2·rings − 1 in the plane.
     """
-    nodes, weights = _gauss_legendre(rings)
+    nodes, weights = legendre(rings)
     spokes = 4 * rings
     versine = 0.5 * (nodes + 1.0) * cone_versine(angular_radius_rad)
     azimuth_rad = 2.0 * np.pi * (np.arange(spokes) + 0.5) / spokes
     directions = cone_directions(direction, *np.meshgrid(versine, azimuth_rad, indexing="ij"))
     shares = np.broadcast_to((0.5 * weights / spokes)[:, None], (rings, spokes))
     return directions.reshape(-1, 3), shares.ravel()
-
-
-@lru_cache(maxsize=_MOST_RINGS)
-def _gauss_legendre(rings: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    nodes, weights = np.polynomial.legendre.leggauss(rings)
-    nodes.setflags(write=False)
-    weights.setflags(write=False)
-    return nodes, weights
 
 
 @dataclass(frozen=True, eq=False)

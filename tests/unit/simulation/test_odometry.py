@@ -1,77 +1,56 @@
-"""What a robot believes of its motion: exact without errors, and as far astray as it says with them."""
+"""Odometry: exact without noise, dead reckoning with the errors that it says."""
 
-from typing import Any
+import itertools
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nir_render import parse_scene
-from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
+from nir_render.scene.motion import robot_pose
+from nir_render.scene.scene import Scene, parse_scene
+from nir_render.simulation.odometry import odometry_of, pose_records, pose_times_s
+
+CIRCLE = {"type": "circle", "center": "[1, 2, 0] m", "radius": "1 m", "period": "7 s"}
 
 
-def _scene(frames: int, **odometry: str) -> Any:
-    motion = [
-        {"time": "0 s", "position": "[1, 2, 0] m", "orientation": {"yaw": "90 deg"}},
-        {"time": "10 s", "position": "[1, 4, 0] m", "orientation": {"yaw": "180 deg"}},
-    ]
-    rig: dict[str, Any] = {"preset": "infra_swarm"}
-    if odometry:
-        rig["odometry"] = odometry
-    return parse_scene(
-        {
-            "format": 1, "name": "odometry", "seed": 1, "clock": {"frames": frames, "frame_rate": "10 Hz"},
-            "observe": ["r1.front"],
-            "robots": {"r1": {"rig": rig, "motion": motion}, "r2": {"rig": "infra_swarm"}},
-        }
-    )  # fmt: skip
+def _scene(odometry: dict[str, str], path: dict[str, str] | None = None, frames: int = 300) -> Scene:
+    robot = {"rig": {"preset": "infra_swarm", "odometry": odometry}, **({"path": path} if path else {})}
+    clock = {"frames": frames, "frame_rate": "30 Hz"}
+    return parse_scene({"format": 1, "observe": ["r1.front"], "clock": clock, "robots": {"r1": robot}})
 
 
-def test_without_errors_it_is_the_motion_seen_from_where_it_began() -> None:
-    lines = odometry_of(_scene(101), "r1", 1)
-    assert len(lines) == 102
-    np.testing.assert_allclose(lines[0].position_m, 0.0, atol=1e-12)
-    np.testing.assert_allclose(lines[0].rotation, np.eye(3), atol=1e-12)
-    # Two metres along the world's y, which lay ahead; half of the quarter turn to the left.
-    np.testing.assert_allclose(lines[50].position_m, [1.0, 0.0, 0.0], atol=1e-12)
-    yaw_deg = Rotation.from_matrix(lines[50].rotation).as_euler("ZYX", degrees=True)[0]
-    assert yaw_deg == pytest.approx(45.0, abs=1e-9)
+def test_without_noise_it_is_the_way_in_the_first_pose() -> None:
+    scene = _scene({}, CIRCLE)
+    records = odometry_of(scene, "r1", 1)
+    first, last = (robot_pose(scene.document.robots["r1"], records[k].time_s) for k in (0, -1))
+    np.testing.assert_allclose(records[0].position_m, 0.0, atol=1e-15)
+    np.testing.assert_allclose(records[-1].position_m, first.to_local(last.position_m), atol=1e-9)
+    np.testing.assert_allclose(records[-1].rotation, first.rotation.T @ last.rotation, atol=1e-9)
+    assert [record.time_s for record in records] == pose_times_s(scene).tolist()
+    poses = list(pose_records(scene))
+    assert poses[150]["position_m"] == pytest.approx(robot_pose(scene.document.robots["r1"], 5.0).position_m)
+    assert np.linalg.norm(poses[150]["velocity_m_per_s"]) == pytest.approx(2.0 * np.pi / 7.0, rel=1e-6)
 
 
 def test_errors_are_as_large_as_they_say() -> None:
-    errors = {
-        "position_noise": "2 mm", "rotation_noise": "0.2 deg", "position_walk": "1 cm", "rotation_walk": "0.5 deg",
-    }  # fmt: skip
-    runs = [odometry_of(_scene(41, **errors), "r1", seed) for seed in range(60)]
-    true = odometry_of(_scene(41), "r1", 1)
-    last, first = true[-1], true[0]
-    assert (runs[0][3].position_sigma_m, runs[0][3].position_walk_m_per_sqrt_s) == (2e-3, 1e-2)
-    # Where it is by its own account, had it not turned astray: upwards nothing bends.
-    off_m = np.array([(run[-1].position_m - last.position_m)[2] for run in runs])
-    turned = [Rotation.from_matrix(last.rotation.T @ run[-1].rotation).as_rotvec() for run in runs]
-    slack = 4.0 / np.sqrt(2 * len(runs))
-    seconds = last.time_s - first.time_s
-    assert off_m.std() == pytest.approx(np.hypot(2e-3, 1e-2 * np.sqrt(seconds)), rel=slack)
-    expected_rad = np.radians(np.hypot(0.2, 0.5 * np.sqrt(seconds)))
-    assert np.array(turned).std() == pytest.approx(expected_rad, rel=slack)
-    at_once_m = np.array([run[0].position_m for run in runs]).ravel()
-    assert at_once_m.std() == pytest.approx(2e-3, rel=slack)
+    """A robot at rest, 300 steps of 1/30 s, three axes: a mean square of 900 is right to 4.7 % (1 σ)."""
+    walk = odometry_of(_scene({"position_walk": "2 cm", "rotation_walk": "0.5 deg"}), "r1", 3)
+    steps_m = np.diff([record.position_m for record in walk], axis=0)
+    assert np.mean(steps_m**2) * 30.0 == pytest.approx(0.02**2, rel=4 * 0.047)
+    turns = [one.rotation.T @ other.rotation for one, other in itertools.pairwise(walk)]
+    angles_rad = Rotation.from_matrix(np.array(turns)).as_rotvec()
+    assert np.mean(angles_rad**2) * 30.0 == pytest.approx(np.radians(0.5) ** 2, rel=4 * 0.047)
+    white = odometry_of(_scene({"position_noise": "1 mm", "rotation_noise": "0.1 deg"}), "r1", 3)
+    assert np.mean([record.position_m**2 for record in white]) == pytest.approx(1e-6, rel=4 * 0.047)
+    tilts_rad = Rotation.from_matrix(np.array([record.rotation for record in white])).as_rotvec()
+    assert np.mean(tilts_rad**2) == pytest.approx(np.radians(0.1) ** 2, rel=4 * 0.047)
+    assert (white[0].position_sigma_m, walk[0].rotation_walk_rad_per_sqrt_s) == (0.001, np.radians(0.5))
 
 
-def test_the_same_seed_believes_the_same() -> None:
-    one, other = (odometry_of(_scene(5, position_walk="1 cm"), "r1", 3) for _ in range(2))
-    assert all((a.position_m == b.position_m).all() for a, b in zip(one, other, strict=True))
-
-
-def test_who_stands_still_and_says_nothing_of_odometry_has_none() -> None:
-    scene = _scene(3).with_({"robots.r1": {"rig": "infra_swarm"}})
-    assert observers_astir(scene) == []
-    assert observers_astir(_scene(3)) == ["r1"]
-
-
-def test_poses_are_the_worlds() -> None:
-    rows = [row for row in pose_records(_scene(51)) if row["robot"] == "r1"]
-    assert rows[50]["position_m"] == pytest.approx([1.0, 3.0, 0.0])
-    assert Rotation.from_quat(rows[50]["quaternion_xyzw"]).as_euler("ZYX", degrees=True)[0] == pytest.approx(
-        135.0
-    )
+def test_a_heading_that_is_off_bends_what_follows() -> None:
+    """Straight on for 10 m with a walk of heading alone: each step has its true length."""
+    scene = _scene({"rotation_walk": "2 deg"}, {**CIRCLE, "radius": "500 m", "period": "3000 s"})
+    records = odometry_of(scene, "r1", 5)
+    steps_m = np.linalg.norm(np.diff([record.position_m for record in records], axis=0), axis=1)
+    np.testing.assert_allclose(steps_m, 2.0 * np.pi * 500.0 / 3000.0 / 30.0, rtol=1e-6)
+    assert np.linalg.norm(records[-1].position_m[1:]) > 0.05

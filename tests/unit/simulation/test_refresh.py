@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import nir_render as nr
-from nir_render.camera.mean_frame import electron_rates, exposed_frame, rates_between
+from nir_render.camera.mean_frame import electron_rates, exposed_frame
 from nir_render.camera.render_noise import render_noise
 from nir_render.errors import InputError
 from nir_render.scene.scene import parse_scene
-from nir_render.simulation.refresh import RefreshError, interpolation_error
+from nir_render.simulation.refresh import RefreshError, interpolation_error, rates_between
 from nir_render.transport.render import direct_light
 
 ROWS, COLUMNS = 48, 64

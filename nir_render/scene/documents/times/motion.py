@@ -111,8 +111,9 @@ PathDocument = Annotated[
 class Moving(Document):
     """What moves: through the waypoints of `motion`, `straight` or `smooth` between them; or along a `path`.
 
-    They are straight where `between` is left out. Smooth is a cubic spline, twice continuously differentiable, through the positions, and one of the
-    angular velocity through the orientations; it comes to rest at both ends and at each hold.
+    They are straight where `between` is left out. Smooth is a cubic spline, twice continuously
+    differentiable, through the positions, and one of the angular velocity through the orientations; it comes
+    to rest at both ends and at each hold.
     """
 
     motion: tuple[Waypoint, ...] = ()

@@ -93,7 +93,7 @@ def test_the_papers_cost() -> None:
         anchor_mean=np.array([[2.3, -1.0, 0.0, 0.0, 0.0, 0.0]]),
     )
     bank = _moving(bank, np.array([1.0, 0.0, 0.0]))
-    pairs = paper_pairs(bank, seen._replace(noise_m2=np.array([1e-16])), np.zeros(3), HOW)
+    pairs = paper_pairs(bank, seen._replace(noise_m2=np.array([1e-16])), HOW)
     # Boxes overlap by half their width: IoU = ½ / (2 − ½). The way goes to the left, the velocity ahead: ½.
     cost = (1.0 - 1.0 / 3.0) + 0.5 + (1.0 - math.exp(-0.3))
     assert 3.0 - pairs.gain[0] == pytest.approx(cost, abs=2e-3)

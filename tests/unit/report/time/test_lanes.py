@@ -73,7 +73,7 @@ def test_the_section_has_all_its_plots_and_the_film_moves() -> None:
     result = evaluate(KEYS, [], {"r1.front": CAMERA}, {"robust": []})
     summary = {**result.summary, "estimators": {"robust": {**scored.summary["robust"]}}}
     result = dataclasses.replace(result, summary=summary, over_time=scored)
-    at = np.arange(4) * 0.1
+    at = np.arange(4, dtype=np.float64) * 0.1
     signal = Signal("r1", 7, at, np.full(4, 1e-3), np.array([1.0, 1.0, 0.0, 1.0]), np.full(4, 0.05),
                     np.array([0.05, 0.05, 0.05, np.inf]))  # fmt: skip
     section = time_section(result, Said({"robust": [signal]}, {}))
