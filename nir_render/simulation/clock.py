@@ -262,7 +262,7 @@ def simulate(
     `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
     Geometry is as at mid-exposure of a frame's middle row; only the flares of what moves are drawn out along
     their way (`camera/motion_blur.py`). Light is rendered only where geometry is new; `cache` keeps it beyond
-    this run. Frames that a camera's clock drops are taken, for automatic exposure, and not yielded. Those that
+    this run. Frames that a camera drops are taken, for automatic exposure, and not yielded. Those that
     are `begun`, done already, are left out, and the others are as they would be after them.
     """
     run_seed = scene.document.seed if seed is None else seed

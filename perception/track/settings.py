@@ -28,7 +28,7 @@ class TrackerSettings:
         What is known of a robot's velocity, per axis, before it is seen to move.
     life_s
         A confirmed track that is unseen for longer dies. The longest dark run of a message leaves 0.967 s
-        between lit samples at 30 FPS (PHYSICS.md 7).
+        between lit samples at 30 FPS (docs/physics.md, Tracking).
     merged_life_s
         A track that for so long was seen only together with another dies: it may never have been one.
     tentative_life_s

@@ -53,7 +53,7 @@ def turn(yaw: float) -> Array:
 def talking(
     rng: np.random.Generator, packets_per_s: float = 0.12, seconds: float = 20.0
 ) -> Callable[[float], float]:
-    """Blink words (PHYSICS.md 8) at 10 Hz: five frames of 11 bits and a stretch of idle light, again and again."""
+    """Blink words (docs/physics.md, Optical language) at 10 Hz: five frames of 11 bits and a stretch of idle light, again and again."""
     bits: list[int] = []
     while len(bits) * BIT_S < seconds:
         bits += [1] * int(rng.integers(5, max(int(10.0 / packets_per_s / 5), 6)))
