@@ -32,6 +32,7 @@ from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Begun, Shot, simulate
 from nir_render.simulation.frame_times import frame_times
 from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
+from nir_render.simulation.sent import sent_packets
 from nir_render.transport.cache import LightCache
 from nir_render.transport.cache_key import digest as digest_of
 from nir_render.transport.fingerprint import code_hash, matching
@@ -83,7 +84,7 @@ def render_run(
                 writer.add(shot, lights)
                 progress(done + 1, total)
         writer.finish()
-        _write_motion(scene, aside)
+        _write_times(scene, aside)
         run_folder.write_json(aside / run_folder.CALIBRATION, calibration_document(calibrations))
         run_folder.write_file(aside / run_folder.SCENE, scene.resolved_yaml().encode())
         noise = noise_facts(scene.document.render.noise, writer.noises)
@@ -113,8 +114,8 @@ def _digest(scene: Scene, keep_light: bool) -> str:
     return digest_of((scene.resolved_yaml(), backend().variant, backend().compiler, made_by, code, again))
 
 
-def _write_motion(scene: Scene, folder: Path) -> None:
-    """Write where robots were, and what those that take frames believe of it, where anything moves."""
+def _write_times(scene: Scene, folder: Path) -> None:
+    """Write what is true over time, poses and packets, and what robots believe of their motion."""
     if any(robot.moves for robot in scene.document.robots.values()):
         run_folder.write_lines(folder / run_folder.POSES, pose_records(scene))
     believed = [
@@ -122,6 +123,9 @@ def _write_motion(scene: Scene, folder: Path) -> None:
     ]
     if believed:
         run_folder.write_lines(folder / ODOMETRY, map(odometry_record, believed))
+    sent = [packet.record() for packet in sent_packets(scene)]
+    if sent:
+        run_folder.write_lines(folder / run_folder.SENT, sent)
 
 
 def calibrations_of(scene: Scene, progress: Progress = lambda *_: None) -> list[Calibration]:

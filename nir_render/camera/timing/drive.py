@@ -1,10 +1,14 @@
 """How much an emitter sends within a stretch of time, exactly: means of its drive, in closed form."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nir_render.scene.documents.emitters import FULL_DRIVE, BitString, Drive, SquareWave, Sun
+from nir_render.scene.documents.emitters import Sun
+from nir_render.scene.documents.times.drives import FULL_DRIVE, BitString, Drive, Sending, SquareWave
 from nir_render.scene.emission import Emitter
+from perception.messages.uart import FRAME_BITS, encode, word_of
 
 Array = NDArray[np.float64]
 
@@ -31,7 +35,9 @@ def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array
         return _of_square(drive.square, start, duration)
     if drive.bits is not None:
         return np.clip(_of_bits(drive.bits, start, duration), 0.0, 1.0)
-    assert drive.constant is not None  # the model admits no fourth form
+    if drive.sends is not None:
+        return _of_packets(drive.sends, start, duration)
+    assert drive.constant is not None  # the model admits no fifth form
     return np.full(start.shape, drive.constant)
 
 
@@ -71,6 +77,41 @@ def _of_bits(bits: BitString, start_s: Array, duration_s: Array) -> Array:
     summed = level(first) * (1.0 - begin) + total(first + further) - total(first + 1.0)
     summed += level(first + further) * rest
     return np.divide(summed, length, out=level(first), where=further > 0.0)
+
+
+def packet_times_s(sending: Sending) -> list[tuple[float, float]]:
+    """Return from when to when, by the scene's clock, each packet lasts, its last stop bit included."""
+    slow = 1.0 + sending.clock_drift
+    return [
+        (
+            sending.clock_offset_s + slow * packet.at_s,
+            sending.clock_offset_s + slow * (packet.at_s + packet.repeats * FRAME_BITS / sending.rate_hz),
+        )
+        for packet in sending.packets
+    ]
+
+
+@lru_cache(maxsize=256)
+def _edges(sending: Sending) -> tuple[Array, Array, Array]:
+    """Return the edges of bits, the level before each and after the last, and the dark time up to each."""
+    edges, levels = [], []
+    for packet, (start_s, end_s) in zip(sending.packets, packet_times_s(sending), strict=True):
+        bits = encode(word_of(packet.command), packet.repeats)
+        edges.append(np.linspace(start_s, end_s, len(bits) + 1))
+        levels += [1.0, *bits.astype(np.float64)]
+    all_edges = np.concatenate(edges)
+    dark_s = np.concatenate([[0.0], np.cumsum((1.0 - np.array(levels[1:])) * np.diff(all_edges))])
+    return all_edges, np.array([*levels, 1.0]), dark_s
+
+
+def _of_packets(sending: Sending, start_s: Array, duration_s: Array) -> Array:
+    """Return the mean by the dark time between the ends of each stretch."""
+    edges, levels, dark_s = _edges(sending)
+    end_s = start_s + duration_s
+    first, last = np.searchsorted(edges, start_s, side="right"), np.searchsorted(edges, end_s, side="left")
+    dark = np.interp(end_s, edges, dark_s) - np.interp(start_s, edges, dark_s)
+    mean = np.divide(dark, duration_s, out=np.zeros_like(dark), where=duration_s > 0.0)
+    return np.where(last <= first, levels[first], np.clip(1.0 - mean, 0.0, 1.0))
 
 
 def _whole_and_part(number: Array) -> tuple[Array, Array]:

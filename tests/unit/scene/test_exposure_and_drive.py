@@ -7,7 +7,7 @@ import pytest
 
 from nir_render import InputError, Scene, load_scene
 from nir_render.scene.documents.camera import GlobalShutter, RollingShutter
-from nir_render.scene.documents.emitters import FULL_DRIVE, Drive
+from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
 from tests.paths import SCENES
 
 CAMERA = "robots.r1.rig.cameras.front"
@@ -72,8 +72,8 @@ def test_one_form_replaces_another(scene: Scene) -> None:
     [
         (1.01, "less than or equal to 1"),
         (-0.1, "greater than or equal to 0"),
-        ({"constant": 1, "square": {"frequency": "1 kHz"}}, "wanted one of 'constant', 'square' and 'bits'"),
-        ({}, "wanted one of 'constant', 'square' and 'bits', not none"),
+        ({"constant": 1, "square": {"frequency": "1 kHz"}}, "wanted one of 'constant', 'square', 'bits' and 'sends'"),
+        ({}, "wanted one of 'constant', 'square', 'bits' and 'sends', not none"),
         ([1, 0], "is no drive; wanted 0.5"),
         ({"square": {"frequency": "1 kHz", "duty": 1.2}}, "duty.*less than or equal to 1"),
         ({"square": {"frequency": "1 kHz", "duty": -0.1}}, "duty.*greater than or equal to 0"),
