@@ -80,7 +80,7 @@ class Packet(Document):
 class Sending(Document):
     """Packets of the optical language at `rate`; between them it is idle, which is lit.
 
-    A list of packets may stand for it. The sender's clock is `clock_offset` behind the scene's and goes slow by
+    A list of packets may stand for it. The sender's clock is `clock_offset` behind the scene's, and slow by
     `clock_drift`: its time t is the scene's offset + (1 + drift) t, and its bits last as much longer.
     """
 
