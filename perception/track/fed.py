@@ -84,6 +84,24 @@ def fed(
     )
 
 
+def swerved(bank: Bank, tracks: Indices, time_s: float, settings: TrackerSettings) -> Bank:
+    """Return tracks as they are if, when they were last seen, their velocities changed at once.
+
+    Robots turn on the spot and stop: to a filter whose acceleration is white that is a jump.
+    """
+    some = bank.taken(tracks)
+    covariance = some.anchor_covariance.copy()
+    covariance[:, 3:, 3:] += settings.swerve_m_per_s**2 * np.eye(3)
+    began = States(some.anchor_mean, covariance, some.anchor_common)
+    after_s = time_s - some.seen_s
+    states = [
+        predicted(taken_states(began, np.array([k])), float(after_s[k]), settings.acceleration_psd_m2_per_s3)
+        for k in range(len(tracks))
+    ]
+    columns = zip(*states, strict=True)
+    return some.with_states(States(*(np.concatenate(column) for column in columns))) if states else some
+
+
 def _fed_paper(
     bank: Bank, tracks: Indices, states: States, seen: Observations, time_s: float, settings: TrackerSettings
 ) -> States:

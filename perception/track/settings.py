@@ -24,6 +24,8 @@ class TrackerSettings:
         radiometric signatures"), the other goes on by prediction.
     acceleration_psd_m2_per_s3
         Power spectral density q of the white acceleration, per axis.
+    swerve_m_per_s
+        By how much a velocity may change at once, standard deviation per axis: robots turn on the spot.
     speed_sigma_m_per_s
         What is known of a robot's velocity, per axis, before it is seen to move.
     life_s
@@ -68,6 +70,7 @@ class TrackerSettings:
     association: Form = "sound"
     overlap: Form = "sound"
     acceleration_psd_m2_per_s3: float = 0.05
+    swerve_m_per_s: float = 0.3
     speed_sigma_m_per_s: float = 0.5
     life_s: float = 1.25
     merged_life_s: float = 3.0

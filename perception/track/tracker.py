@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from perception.track import life
 from perception.track.association import Pairs, assigned, gated_pairs, paper_pairs
-from perception.track.bank import Bank, newborn
-from perception.track.fed import fed
+from perception.track.bank import Bank, newborn, replaced, taken_states
+from perception.track.fed import fed, swerved
 from perception.track.kalman import predicted, wandered
 from perception.track.merging import Shared, dimmed, shared_flares
 from perception.track.observations import Observations, observed
@@ -23,6 +23,8 @@ Indices = NDArray[np.int64]
 Keys = tuple[tuple[str, int, int], ...]
 
 LEAST_CLUTTER = 0.5
+SWERVE_COST = 4.0
+"""What it costs a measurement, in log-odds, that its track must have turned on the spot."""
 CLUTTER_MEMORY_S = 1.0
 
 SURE_ODDS = 6.0
@@ -212,6 +214,31 @@ class Tracker:
         if len(dim):
             old = fed(old, dim, seen.taken(edge), np.zeros(len(dim)), when, how, np.zeros(len(dim)))
             taken[dim] = edge
+        return self._feed_swerved(old, seen, taken, after_s)
+
+    def _feed_swerved(
+        self, old: Bank, seen: Observations, taken: Indices, after_s: float
+    ) -> tuple[Bank, Indices]:
+        """Feed tracks that have turned on the spot: seen a set ago, now a little beside where they must be."""
+        lost = np.flatnonzero((taken < 0) & (self._time_s - old.seen_s < 1.5 * after_s))
+        free = np.setdiff1d(np.arange(len(seen.range_m)), taken)
+        if self.settings.filter == "paper" or not (len(lost) and len(free)):
+            return old, taken
+        turned, there = swerved(old, lost, self._time_s, self.settings), seen.taken(free)
+        pairs = self._pairs(turned, there, self._clutter)
+        pairs = pairs._replace(gain=pairs.gain - SWERVE_COST)
+        chosen = assigned(pairs)
+        chosen = chosen[pairs.gain[chosen] > SURE_ODDS]
+        if not len(chosen):
+            return old, taken
+        track, measurement = pairs.track[chosen], pairs.measurement[chosen]
+        rows = lost[track]
+        old = old.with_states(replaced(old.states, rows, taken_states(turned.states, track)))
+        chosen_there = there.taken(measurement)
+        old = fed(old, rows, chosen_there, pairs.chi2[chosen], self._time_s, self.settings)
+        old = life.judged_ghosts(old, rows, chosen_there.ghost)
+        taken = taken.copy()
+        taken[rows] = free[measurement]
         return old, taken
 
     def _pairs(self, bank: Bank, seen: Observations, clutter: float) -> Pairs:
