@@ -3,6 +3,8 @@
 
 PYTHON ?= python3
 ARGS ?=
+# Files of tests side by side, on all cores up to four: each process loads Mitsuba.
+SIDE_BY_SIDE := -n auto --maxprocesses 4 --dist loadfile
 
 ifeq ($(OS),Windows_NT)
 BIN := .venv/Scripts
@@ -30,11 +32,11 @@ demo: setup
 	$(BIN)/nir-render run scenes/arena.yaml -o outputs/arena --overwrite
 
 test: setup
-	$(BIN)/python -m pytest -m "not verify" $(ARGS)
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not verify" $(ARGS)
 
 # Status 5 is pytest's for "no test was selected".
 verify: setup
-	$(BIN)/python -m pytest -m verify $(ARGS) || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m verify $(ARGS) || [ $$? -eq 5 ]
 
 lint: setup docs
 	$(BIN)/python -m ruff check

@@ -54,12 +54,38 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
         "range_bias_m": ("range bias\nm", "{:+.4f}"),
         "bearing_rms_deg": ("bearing RMS\ndeg", "{:.4f}"),
     }
+    return _filled(table, columns, summary["estimators"])
+
+
+def time_table(summary: Mapping[str, Any]) -> Table | None:
+    """Return a table of tracks and messages; None where there are none."""
+    followed = {name: numbers for name, numbers in summary["estimators"].items() if "track_hota" in numbers}
+    if not followed:
+        return None
+    columns = {
+        "track_hota": ("HOTA", "{:.3f}"),
+        "track_idf1": ("IDF1", "{:.3f}"),
+        "track_switches": ("switches", "{}"),
+        "tracks": ("tracks", "{}"),
+        "track_sources": ("of sources", "{}"),
+        "track_position_rmse_m": ("place RMSE\nm", "{:.4f}"),
+        "message_received": ("packets\nreceived", "{}"),
+        "message_sent": ("of", "{}"),
+        "message_wrong": ("wrong", "{}"),
+    }
+    return _filled(Table(title="Over time: tracks and messages", title_justify="left"), columns, followed)
+
+
+def _filled(
+    table: Table, columns: Mapping[str, tuple[str, str]], estimators: Mapping[str, Mapping[str, Any]]
+) -> Table:
+    """Return a table with a row for each estimator; what it has no number for is a dash."""
     table.add_column("estimator")
     for heading, _ in columns.values():
         table.add_column(heading, justify="right")
-    for name, numbers in summary["estimators"].items():
+    for name, numbers in estimators.items():
         cells = [
-            form.format(numbers[key]) if numbers[key] is not None else "–"
+            form.format(numbers[key]) if numbers.get(key) is not None else "–"
             for key, (_, form) in columns.items()
         ]
         table.add_row(name, *cells)
