@@ -1,6 +1,7 @@
 """Directions in cones, for whoever looks at a small sphere from outside; frames of rectangles."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,15 @@ def cone_directions(direction: Array, versine: Array, azimuth_rad: Array) -> Arr
     sine = np.sqrt(versine * (2.0 - versine))[..., None]
     around = np.cos(azimuth_rad)[..., None] * x_axis + np.sin(azimuth_rad)[..., None] * y_axis
     return (1.0 - versine)[..., None] * direction + sine * around
+
+
+@lru_cache(maxsize=256)
+def legendre(count: int) -> tuple[Array, Array]:
+    """Return nodes in −1 to 1 and weights of Gauss–Legendre quadrature, shape (count,) each, read-only."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    nodes.setflags(write=False)
+    weights.setflags(write=False)
+    return nodes, weights
 
 
 def sunflower(direction: Array, angular_radius_rad: float, count: int) -> Array:

@@ -59,11 +59,24 @@ from perception.files.recording import (
     read_frames,
     read_recording,
 )
+from perception.files.tracks import (
+    message_record,
+    odometry_record,
+    parse_message,
+    parse_odometry,
+    parse_signal,
+    parse_track,
+    read_odometry,
+    signal_record,
+    track_record,
+)
 from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
+from perception.pipeline import Heard, Pipeline
 from perception.rig.frame_sets import frame_sets
 from perception.rig.measure_set import detect_set, measure_set
 from perception.rig.warm_up import warm_up
+from perception.track.tracker import Tracker
 from perception.types import (
     Calibration,
     Detection,
@@ -87,6 +100,7 @@ __all__ = [
     "EstimatorError",
     "FlareLimit",
     "FrameRecord",
+    "Heard",
     "Measurement",
     "Message",
     "MirrorPlane",
@@ -95,6 +109,7 @@ __all__ = [
     "OwnSetEstimator",
     "PaperRegression",
     "Picture",
+    "Pipeline",
     "RailCalibration",
     "RangeConstantFit",
     "RawFrame",
@@ -103,6 +118,7 @@ __all__ = [
     "SetMeasurements",
     "Signal",
     "Track",
+    "Tracker",
     "calibrate_rail",
     "calibration_document",
     "detect",
@@ -119,20 +135,29 @@ __all__ = [
     "load_estimator",
     "measure_set",
     "measurement_record",
+    "message_record",
     "mirror_record",
+    "odometry_record",
     "parse_calibration_document",
     "parse_detection",
     "parse_frame_record",
     "parse_measurement",
+    "parse_message",
     "parse_mirror",
+    "parse_odometry",
+    "parse_signal",
+    "parse_track",
     "read_calibrations",
     "read_frame",
     "read_frame_records",
     "read_frames",
+    "read_odometry",
     "read_picture",
     "read_ranges",
     "read_recording",
     "regress_paper_range_constant",
     "regress_range_constant",
+    "signal_record",
+    "track_record",
     "warm_up",
 ]

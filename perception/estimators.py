@@ -5,21 +5,17 @@ goes wrong in code that somebody is still writing becomes one line that says whe
 """
 
 import dataclasses
-import importlib.util
 import inspect
 import math
 import operator
 import os
-import re
-import sys
-import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from perception.own_code import error_line, kind_of, load_function
 from perception.paper import detect_paper
 from perception.robust.detect import detect_robust
 from perception.types import Calibration, Detection, RawFrame
@@ -227,22 +223,9 @@ def load_estimator(reference: str) -> OwnEstimator | OwnSetEstimator:
         If there is no such file or function, it cannot be called, the file raises while it is imported,
         the function's name cannot name a file of detections, or its parameters are neither kind's.
     """
-    file, _, name = reference.rpartition(":")
-    if not (file and name.isidentifier()):
-        raise EstimatorError(f"{reference}: wanted file.py:function, such as my_estimator.py:brightest_blob")
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-        raise EstimatorError(f"{reference}: the name may hold letters a to z, digits and _; rename it")
-    if name.lower() in ESTIMATORS:
-        raise EstimatorError(f"{reference}: {name.lower()!r} is an estimator that is built in; rename yours")
-    path = Path(file)
-    if not path.is_file():
-        raise EstimatorError(f"{reference}: there is no file {file!r}")
-    contents = _import_file(path, reference)
-    if name not in contents:
-        raise EstimatorError(f"{reference}: there is no {name!r} in the file{_functions_listed(contents)}")
-    function = contents[name]
-    if not callable(function):
-        raise EstimatorError(f"{reference}: {name!r} is {_kind(function)}, which cannot be called")
+    name, path, function = load_function(
+        reference, "estimator", "my_estimator.py:brightest_blob", ESTIMATORS, EstimatorError
+    )
     if _wants_sets(function, reference):
         return OwnSetEstimator(name, reference, path, function)
     return OwnEstimator(name, reference, path, function)
@@ -277,47 +260,18 @@ def _listed(call: Callable[[], Any], path: Path, where: str) -> list[Any]:
         found = call()
         listed = list(found) if isinstance(found, Iterable) else None
     except Exception as error:
-        raise EstimatorError(f"{where}: {_error_line(error, path)}") from error
+        raise EstimatorError(f"{where}: {error_line(error, path)}") from error
     if listed is None:
-        raise EstimatorError(f"{where}: returned {_kind(found)}; wanted a list of detections")
+        raise EstimatorError(f"{where}: returned {kind_of(found)}; wanted a list of detections")
     return listed
-
-
-def _import_file(path: Path, reference: str) -> dict[str, Any]:
-    """Import a file and return what it defines."""
-    # A name that no other module has: a file may be called numpy.py.
-    module_name = f"own_estimator_{path.stem}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None or spec.loader is None:
-        raise EstimatorError(f"{reference}: {path.name!r} is no Python file; its name must end in .py")
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses with annotations look their module up while it is being imported.
-    sys.modules[module_name] = module
-    try:
-        with _importing_from(path.parent):
-            spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        raise EstimatorError(f"{reference}: importing it failed: {_error_line(error, path)}") from error
-    finally:
-        del sys.modules[module_name]
-    return vars(module)
-
-
-@contextmanager
-def _importing_from(folder: Path) -> Iterator[None]:
-    """Let modules that lie in a folder be imported; installed ones come first."""
-    entry = str(folder.resolve())
-    sys.path.append(entry)
-    try:
-        yield
-    finally:
-        sys.path.remove(entry)
 
 
 def _checked_detection(detection: object, frames: Sequence[RawFrame], where: str) -> Detection:
     """Return a detection with plain numbers, or say what about it is wrong."""
     if not isinstance(detection, Detection):
-        raise EstimatorError(f"{where}: returned {_kind(detection)} among its detections; wanted a Detection")
+        raise EstimatorError(
+            f"{where}: returned {kind_of(detection)} among its detections; wanted a Detection"
+        )
     if (detection.camera, detection.index) not in {(frame.camera, frame.index) for frame in frames}:
         raise EstimatorError(
             f"{where}: returned a detection of frame {detection.index} of {detection.camera}; "
@@ -355,30 +309,3 @@ _KINDS: dict[Any, Callable[[Any], Any]] = {
     bool: bool,
     tuple[float, float, float]: _vector,
 }
-
-
-def _error_line(error: BaseException, path: Path) -> str:
-    """Say in one line what was raised, and in which line of the user's file."""
-    text = " ".join(f"{type(error).__name__}: {error}".split())
-    lines = [
-        entry.lineno
-        for entry in traceback.extract_tb(error.__traceback__)
-        if Path(entry.filename).resolve() == path.resolve()
-    ]
-    return f"{text} ({path.name}, line {lines[-1]})" if lines else text
-
-
-def _functions_listed(contents: dict[str, Any]) -> str:
-    """List the functions that a file itself defines."""
-    there = [
-        name
-        for name, value in contents.items()
-        if callable(value)
-        and not name.startswith("_")
-        and getattr(value, "__module__", None) == contents["__name__"]
-    ]
-    return f"; it has {', '.join(there)}" if there else ""
-
-
-def _kind(value: object) -> str:
-    return "None" if value is None else f"an object of type {type(value).__name__}"

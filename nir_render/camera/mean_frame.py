@@ -5,9 +5,11 @@ that shines fully lit. A frame is their weighted sum: drives and the shutter act
 pixels, behind lens and point spread, so emitters of one drive share an image.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import zip_longest
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,16 @@ from numpy.typing import NDArray
 
 from nir_render.camera.beams import Beam, beam_window, blur, diffuse_electrons
 from nir_render.camera.by_spectrum import by_spectrum, group_emitters, group_fluxes, row_response
-from nir_render.camera.optics.apertures import Aperture, flare_aperture
+from nir_render.camera.motion_blur import (
+    STILL_PX,
+    drawn_out,
+    instants,
+    may_move,
+    moved_beam,
+    path_of,
+)
 from nir_render.camera.optics.lens import intrinsics_of
-from nir_render.camera.optics.psf import Window
+from nir_render.camera.optics.psf import Window, place_of
 from nir_render.camera.optics.veil import veil
 from nir_render.camera.timing.drive import drive_of
 from nir_render.camera.timing.shutter import mid_exposure_s, row_profile
@@ -50,6 +59,8 @@ class Rates:
         Electrons per second that each row of the light's direct table brings.
     centre_row
         The row of pixels of each window's centre, the nearest one where it is outside, shape (n,).
+    between
+        Of indirect light that is interpolated: the weights of other rates, of other times, and these.
     kept
         For what follows from the rates and takes long: it goes when they go.
     """
@@ -61,6 +72,7 @@ class Rates:
     images: NDArray[np.float32] | None
     windows: tuple[Window, ...]
     centre_row: NDArray[np.int64]
+    between: tuple[tuple[float, "Rates"], ...] = ()
     kept: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -83,9 +95,19 @@ class Rates:
 
     def group_image(self, group: int) -> NDArray[np.float64]:
         """Return the electrons per second that one group's indirect light brings, shape (rows, columns)."""
+        if self.between:
+            images = [weight * one.kept_group_image(group) for weight, one in self.between]
+            return np.asarray(np.sum(images, axis=0, dtype=np.float64))
         only = np.zeros(len(self.light.groups))
         only[group] = group_fluxes(self.light, self.snapshot)[group]
         return _blurred(self.light, self.snapshot, only)
+
+    def kept_group_image(self, group: int) -> NDArray[np.float32]:
+        """Return a group's image as float32, kept for the next frame."""
+        images: dict[int, NDArray[np.float32]] = self.kept.setdefault("group_images", {})
+        if group not in images:
+            images[group] = self.group_image(group).astype(np.float32)
+        return images[group]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +151,14 @@ class MeanFrame:
 
     def scattered(self, row: int) -> NDArray[np.float64]:
         """Return the electrons in a window that its own group brings indirectly, the window's shape."""
-        weights = _window_weights(self.rates, row, self.profiles * self.exposure_s)
-        return np.asarray(self.rates.scattered[row] * weights[:, None])
+        window = self.windows[row]
+        weights = _window_weights(self.rates, row, window, self.profiles * self.exposure_s)
+        if place_of(window) == place_of(self.rates.windows[row]):
+            return np.asarray(self.rates.scattered[row] * weights[:, None])
+        if self.light.indirect is None:
+            return np.zeros_like(window.values)
+        image = self.rates.group_image(int(self.light.direct.group[row]))  # it was drawn out by motion
+        return np.asarray(image[place_of(window)] * weights[:, None])
 
 
 def mean_frame(light: Light, snapshot: Snapshot, exposure_s: float, time_s: float | None = None) -> MeanFrame:
@@ -154,7 +182,7 @@ def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
     drives = tuple(dict.fromkeys(of_groups))
     drive = np.array([drives.index(of_group) for of_group in of_groups], dtype=np.int64)
     windows = tuple(_windows(light, snapshot, camera))
-    images = _images(light, snapshot, drive, len(drives), windows)
+    images = images_of(light, snapshot, drive, len(drives), windows)
     parts = [window.values for window in windows] + ([] if images is None else [images])
     if not all(np.isfinite(part).all() for part in parts):
         raise InputError(
@@ -191,7 +219,8 @@ def exposed_frame(rates: Rates, exposure_s: float, time_s: float | None = None) 
     if not np.isfinite(time_s):
         raise InputError(f"time_s is {time_s!r}; wanted seconds")
     profiles = [row_profile(camera, drive, time_s, exposure_s) for drive in rates.drives]
-    return _weighted_sum(rates, exposure_s, time_s, profiles)
+    drawn = _drawn_out(rates, exposure_s, time_s)
+    return _weighted_sum(rates, exposure_s, time_s, profiles, drawn)
 
 
 def fully_lit_frame(rates: Rates, exposure_s: float) -> MeanFrame:
@@ -206,8 +235,13 @@ def _check_exposure(exposure_s: float) -> None:
 
 
 def _weighted_sum(
-    rates: Rates, exposure_s: float, time_s: float, drive_profiles: list[NDArray[np.float64]]
+    rates: Rates,
+    exposure_s: float,
+    time_s: float,
+    drive_profiles: list[NDArray[np.float64]],
+    drawn: Mapping[int, Window] = MappingProxyType({}),
 ) -> MeanFrame:
+    """Return the frame of profiles; windows that motion has `drawn` out stand in place of the rates'."""
     sensor = rates.camera.sensor
     profiles = np.reshape(drive_profiles, (len(drive_profiles), sensor.rows))
     weights = exposure_s * profiles
@@ -215,7 +249,10 @@ def _weighted_sum(
         electrons = np.zeros((sensor.rows, sensor.columns))
     else:
         electrons = np.einsum("dr,drc->rc", weights.astype(np.float32), rates.images).astype(np.float64)
-    windows = tuple(_weighted_window(rates, row, weights) for row in range(len(rates.windows)))
+    windows = tuple(
+        drawn[row] if row in drawn else _weighted_window(rates, row, weights)
+        for row in range(len(rates.windows))
+    )
     for window in windows:
         window.add_into(electrons)
     return MeanFrame(rates, exposure_s, time_s, electrons, windows, profiles)
@@ -224,21 +261,48 @@ def _weighted_sum(
 def _weighted_window(rates: Rates, row: int, weights: NDArray[np.float64]) -> Window:
     """Return a window of rates, weighted; what of its total lies elsewhere counts as its centre's row."""
     window = rates.windows[row]
-    values = window.values * _window_weights(rates, row, weights)[:, None]
+    values = window.values * _window_weights(rates, row, window, weights)[:, None]
     beyond = window.total - float(window.values.sum())
     of_centre = float(weights[_drive_of_window(rates, row), rates.centre_row[row]])
     return replace(window, values=values, total=float(values.sum()) + beyond * of_centre)
 
 
-def _window_weights(rates: Rates, row: int, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _window_weights(
+    rates: Rates, row: int, window: Window, weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the weights, shape (drives, rows), that hold for the rows of a window."""
-    return weights[_drive_of_window(rates, row), place_of(rates.windows[row])[0]]
+    return weights[_drive_of_window(rates, row), place_of(window)[0]]
 
 
-def place_of(window: Window) -> tuple[slice, slice]:
-    """Return the rows and the columns of pixels that a window lies on."""
-    rows, columns = window.values.shape
-    return slice(window.row, window.row + rows), slice(window.column, window.column + columns)
+def _drawn_out(rates: Rates, exposure_s: float, time_s: float) -> dict[int, Window]:
+    """Return the windows of the exposure, by row of the direct table, of flares that move while it lasts."""
+    light, snapshot, camera = rates.light, rates.snapshot, rates.camera
+    table, lens = light.direct, intrinsics_of(camera)
+    drawn = {}
+    for row in table.shining:
+        group = light.groups[table.group[row]]
+        if not may_move(snapshot, light.camera, group):
+            continue
+        ends = path_of(snapshot, light.camera, group, table, row, exposure_s * np.array([-0.5, 0.0, 0.5]))
+        ends_px = lens.project(ends.direction)
+        length_px = float(np.linalg.norm(np.diff(ends_px, axis=0), axis=1).sum())
+        shown = rates.windows[row].values.any() or any(lens.contains(*end) for end in ends_px)
+        if not shown or length_px < STILL_PX:
+            continue
+        drive = rates.drives[_drive_of_window(rates, row)]
+        length_px = length_px if np.isfinite(length_px) else 0.0
+        chosen = instants(camera, drive, time_s, exposure_s, length_px)
+        if not chosen.weight_s.any():
+            continue
+        path = path_of(snapshot, light.camera, group, table, row, chosen.offset_s)
+        beam = _beam(light, snapshot, camera, row)
+        seen = None if beam.seen is None else table.seen[row]
+        windows = [
+            beam_window(camera, moved_beam(beam, direction, float(distance_m), seen), 1.0)
+            for direction, distance_m in zip(path.direction, path.distance_m, strict=True)
+        ]
+        drawn[int(row)] = drawn_out(windows, chosen.weight_s)
+    return drawn
 
 
 def _drive_of_window(rates: Rates, row: int) -> int:
@@ -250,22 +314,16 @@ def _drive_of_rates(emitter: Emitter) -> Drive:
     return drive if drive.constant is None else FULL_DRIVE
 
 
-def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
-    """Return the apertures of what the direct table shows in the frame: sources, the sun, their ghosts."""
-    table = light.direct
-    shown = (
-        flare_aperture(camera, table.direction[row], float(table.angular_radius_rad[row]))
-        for row in table.shining
-    )
-    return [aperture for aperture in shown if aperture is not None]
-
-
-def _images(
-    light: Light, snapshot: Snapshot, drive: NDArray[np.int64], drives: int, windows: tuple[Window, ...]
+def images_of(
+    light: Light,
+    snapshot: Snapshot,
+    drive: NDArray[np.int64],
+    drives: int,
+    windows: tuple[Window, ...] | None,
 ) -> NDArray[np.float32] | None:
     """Return the electrons per second on the sensor, all but the windows, by drive; None where none are.
 
-    They are the indirect light, and what glare and ghosts bring of it and of the windows.
+    They are the indirect light, and what glare and ghosts bring of it and of the windows, if these are given.
     """
     camera = snapshot.camera(light.camera).camera
     veiled = camera.point_spread.core_share < 1.0
@@ -278,7 +336,8 @@ def _images(
         if veiled:
             core = image.copy()
             for row in np.flatnonzero(drive[light.direct.group] == number):
-                windows[row].add_into(core)
+                if windows is not None:
+                    windows[row].add_into(core)
             image += veil(camera, core)
         images[number] = image
     return images
@@ -312,22 +371,24 @@ def diffuse_image(
 
 def _windows(light: Light, snapshot: Snapshot, camera: Camera) -> list[Window]:
     """Return the electrons per second of each row of the direct table."""
-    emitters, fluxes = group_emitters(light, snapshot), group_fluxes(light, snapshot)
-    table = light.direct
-    windows = []
-    for row, group in enumerate(table.group):
-        direction, angular_radius_rad = table.direction[row], float(table.angular_radius_rad[row])
-        seen = None
-        if 0.0 < table.visible_fraction[row] < 1.0:
-            seen = sunflower(direction, angular_radius_rad, table.visibility_rays)[table.seen[row]]
-        irradiance_per_unit, response = row_response(camera, light, row, emitters[group])
-        beam = Beam(
-            direction=direction,
-            angular_radius_rad=angular_radius_rad,
-            irradiance_w_per_m2=irradiance_per_unit * float(fluxes[group]),
-            response=response,
-            seen=seen,
-            distance_m=float(table.distance_m[row]),
-        )
-        windows.append(beam_window(camera, beam, 1.0))
-    return windows
+    rows = range(len(light.direct.group))
+    return [beam_window(camera, _beam(light, snapshot, camera, row), 1.0) for row in rows]
+
+
+def _beam(light: Light, snapshot: Snapshot, camera: Camera, row: int) -> Beam:
+    """Return the beam of a row of the direct table, fully lit where its drive is not constant."""
+    table, group = light.direct, light.direct.group[row]
+    direction, angular_radius_rad = table.direction[row], float(table.angular_radius_rad[row])
+    seen = None
+    if 0.0 < table.visible_fraction[row] < 1.0:
+        seen = sunflower(direction, angular_radius_rad, table.visibility_rays)[table.seen[row]]
+    emitter = group_emitters(light, snapshot)[group]
+    irradiance_per_unit, response = row_response(camera, light, row, emitter)
+    return Beam(
+        direction=direction,
+        angular_radius_rad=angular_radius_rad,
+        irradiance_w_per_m2=irradiance_per_unit * float(group_fluxes(light, snapshot)[group]),
+        response=response,
+        seen=seen,
+        distance_m=float(table.distance_m[row]),
+    )

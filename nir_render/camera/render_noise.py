@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from nir_render.camera.beams import blur, diffuse_electrons
 from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
-from nir_render.camera.mean_frame import MeanFrame, Rates, flare_apertures
-from nir_render.camera.optics.apertures import Aperture, aperture_weights
+from nir_render.camera.mean_frame import MeanFrame, Rates
+from nir_render.camera.optics.apertures import Aperture, aperture_weights, flare_apertures
 from nir_render.camera.sensor.read_out import dark_variance_e2
 from nir_render.light.enlarge import enlarge, enlarge_variance, without_edges
 from nir_render.light.light import Light
@@ -127,6 +127,20 @@ def _variance_of(rates: Rates) -> _Variance:
     light, snapshot = rates.light, rates.snapshot
     apertures = flare_apertures(light, rates.camera)
     levels = [np.where(rates.drive == number, 1.0, 0.0) for number in range(len(rates.drives))]
+    if rates.between:
+        ends = [(weight**2, one, _variance_per_s2(one)) for weight, one in rates.between]
+        of_apertures = [
+            sum(
+                square * aperture_variances_e2(one.light, one.snapshot, 1.0, apertures, of_drive)
+                for square, one, _ in ends
+            )
+            for of_drive in levels
+        ]
+        return _Variance(
+            np.sum([np.float32(square) * one.of_pixels_e2 for square, _, one in ends], axis=0),
+            np.stack([np.asarray(of_drive) for of_drive in of_apertures]),
+            np.sum([square * one.behind_lens_e2 for square, _, one in ends], axis=0),
+        )
     return _Variance(
         np.stack(
             [render_variance_e2(light, snapshot, 1.0, of_drive).astype(np.float32) for of_drive in levels]
@@ -134,6 +148,14 @@ def _variance_of(rates: Rates) -> _Variance:
         np.stack([aperture_variances_e2(light, snapshot, 1.0, apertures, of_drive) for of_drive in levels]),
         np.stack([_behind_lens_e2(light, snapshot, of_drive) for of_drive in levels]),
     )
+
+
+def variance_behind_lens_e2(rates: Rates) -> Array:
+    """Return the variance per s² that rendering adds behind the lens, fully lit, shape (drives, rows).
+
+    It is the sum over each row of pixels.
+    """
+    return _variance_per_s2(rates).behind_lens_e2
 
 
 def _behind_lens_e2(light: Light, snapshot: Snapshot, levels: Array) -> Array:

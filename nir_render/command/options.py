@@ -40,6 +40,18 @@ Estimators = Annotated[
         "default. Repeatable.",
     ),
 ]
+OwnTracker = Annotated[
+    str | None,
+    typer.Option(
+        "--tracker", metavar="FILE", help="One's own tracker as file.py:function, in place of those built in."
+    ),
+]
+OwnDecoder = Annotated[
+    str | None,
+    typer.Option(
+        "--decoder", metavar="FILE", help="One's own decoder as file.py:function, in place of those built in."
+    ),
+]
 TimeLimit = Annotated[
     float,
     typer.Option(

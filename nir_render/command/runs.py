@@ -14,6 +14,8 @@ from nir_render.command.options import (
     LightLimit,
     Output,
     Overwrite,
+    OwnDecoder,
+    OwnTracker,
     SceneArgument,
     Seed,
     Settings,
@@ -37,6 +39,8 @@ def run(
     output: Output = None,
     settings: Settings = None,
     estimators: Estimators = None,
+    tracker: OwnTracker = None,
+    decoder: OwnDecoder = None,
     time_limit_s: TimeLimit = 60.0,
     overwrite: Overwrite = False,
     seed: Seed = None,
@@ -49,14 +53,16 @@ def run(
     """Render, perceive, evaluate and report a scene in one go."""
     from nir_render.command.progress import progress_bar
     from nir_render.run.evaluate import evaluate_run
+    from nir_render.run.follow import OwnParts
     from nir_render.run.perceive import perceive_run
     from nir_render.run.report import report_run
 
     chosen = chosen_estimators(estimators, time_limit_s)
+    own = OwnParts.of(tracker, decoder)
     cache = light_cache(light_folder, light_gib)
     folder = _render(read_scene(scene, settings, seed), output, overwrite, threads, keep_light, cache)
     with progress_bar("perceive") as progress:
-        perceived = perceive_run(folder, estimators=chosen, progress=progress)
+        perceived = perceive_run(folder, estimators=chosen, progress=progress, own=own)
     if not perceived.detections:
         raise InputError(*perceived.problems)
     result = evaluate_run(folder)
@@ -103,17 +109,21 @@ def render(
 def perceive(
     folder: FolderArgument,
     estimators: Estimators = None,
+    tracker: OwnTracker = None,
+    decoder: OwnDecoder = None,
     time_limit_s: TimeLimit = 60.0,
     as_json: Json = False,
 ) -> None:
     """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
     from nir_render.command.console import print_json
     from nir_render.command.progress import progress_bar
+    from nir_render.run.follow import OwnParts
     from nir_render.run.perceive import perceive_run
 
     chosen = chosen_estimators(estimators, time_limit_s)
+    own = OwnParts.of(tracker, decoder)
     with progress_bar("perceive") as progress:
-        perceived = perceive_run(folder, estimators=chosen, progress=progress)
+        perceived = perceive_run(folder, estimators=chosen, progress=progress, own=own)
     if as_json:
         failed = {"failed": dict(perceived.failures)} if perceived.failures else {}
         print_json({"folder": str(folder), "detections": dict(perceived.detections), **failed})

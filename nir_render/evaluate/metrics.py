@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.evaluate.match import by_frame, countable, image_radius_px, match, on_a_lamp
+from nir_render.evaluate.messages import MessageEvaluation
 from nir_render.evaluate.sets import SetEvaluation
+from nir_render.evaluate.tracks import TrackEvaluation
 from nir_render.truth.lamps import LampTruth, Outline
 from nir_render.truth.sources import SourceTruth
 from perception.model.bearing import pixel_turn
@@ -38,7 +40,7 @@ class Evaluation:
     """All scores, each estimator's false alarms, and the numbers of `summary.json`.
 
     `ghosts` are the scores of the sources' mirror images, none of which counts; `around` those of the rigs'
-    measurements, where there are any.
+    measurements, `over_time` those of tracks and `heard` those of messages, where there are any.
     """
 
     scores: tuple[Score, ...]
@@ -46,6 +48,8 @@ class Evaluation:
     summary: Mapping[str, Any]
     ghosts: tuple[Score, ...] = ()
     around: SetEvaluation | None = None
+    over_time: TrackEvaluation | None = None
+    heard: MessageEvaluation | None = None
 
 
 def evaluate(

@@ -120,7 +120,7 @@ def _short(value: Any) -> str:
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:
-    """Return every leaf of nested data by its dotted path."""
+    """Return every leaf of nested data by its dotted path; what is empty is as good as left out."""
     children = (
         node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
     )
@@ -129,7 +129,7 @@ def leaves(node: Any, path: str = "") -> dict[str, Any]:
         for key, value in children
         for inner, leaf in leaves(value, f"{path}.{key}" if path else str(key)).items()
     }
-    return found or {path: node}
+    return found if isinstance(node, Mapping | list) else {path: node}
 
 
 def made_by() -> dict[str, dict[str, str]]:

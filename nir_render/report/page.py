@@ -20,6 +20,7 @@ from nir_render.report.pictures import (
     whole_pictures,
 )
 from nir_render.report.plots import bearing_plot, pull_plot, range_error_plot
+from nir_render.report.time.section import Said, time_section
 from nir_render.report.verdicts import RULES, verdicts_of
 from nir_render.report.wording import counted, degrees, metres, share
 from perception.types import Calibration, FrameKey, RawFrame
@@ -37,6 +38,8 @@ def report_html(
     manifest: Mapping[str, Any],
     folder_name: str,
     files: Sequence[str],
+    said: Said | None = None,
+    film: str = "",
 ) -> str:
     """Write the page.
 
@@ -56,6 +59,10 @@ def report_html(
         The run folder's name: the title where the manifest names no scene.
     files
         Names of files that lie beside the page, to link to.
+    said
+        Signals and messages, where there are any.
+    film
+        Name of the film beside the page, if there is one.
 
     Returns
     -------
@@ -81,6 +88,8 @@ def report_html(
         numbers=_numbers(result),
         frames=_frames(keys, result, load, calibrations) if keys else None,
         around=around_section(result.around),
+        over_time=time_section(result, said or Said()),
+        film=film,
         plots=_plots(by_estimator),
         cameras=_cameras(keys, result),
         more_cameras=counted(len(cameras) - MOST_CAMERAS, "more camera")

@@ -10,12 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from nir_render.errors import InputError
+from nir_render.evaluate.messages import evaluate_messages
 from nir_render.evaluate.metrics import Evaluation, evaluate
 from nir_render.evaluate.sets import evaluate_sets
+from nir_render.evaluate.tracks import evaluate_tracks
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds, parse_lines
 from nir_render.run.perceive import unknown_camera
 from nir_render.truth.lamps import LampTruth, parse_lamp
+from nir_render.truth.sent import parse_sent
 from nir_render.truth.sources import SourceTruth, parse_truth
 from perception import (
     Calibration,
@@ -25,11 +28,14 @@ from perception import (
     frame_sets,
     parse_detection,
     parse_measurement,
+    parse_message,
     parse_mirror,
+    parse_signal,
+    parse_track,
     read_frame,
     read_recording,
 )
-from perception.rig.frame_sets import robot_of
+from perception.rig.frame_sets import robot_of, set_time_s
 from perception.types import FrameKey
 
 
@@ -62,6 +68,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         check_frames_known(keys, truth, lamps, detections, calibrations, folder)
         result = evaluate(keys, truth, calibrations, detections, lamps)
         result = _with_sets(recording, result, truth, detections, lamps)
+        result = _with_tracks(recording, result, truth, list(detections))
         preview = _preview(recording, keys, result)
     except InputError:
         raise
@@ -141,6 +148,41 @@ def _with_sets(
         name: {**numbers, **around.summary.get(name, {})} for name, numbers in summary["estimators"].items()
     }
     return replace(result, summary=summary, around=around)
+
+
+def _with_tracks(
+    recording: Recording, result: Evaluation, truth: Sequence[SourceTruth], names: Sequence[str]
+) -> Evaluation:
+    """Add the scores of tracks and of what they said, where the folder has `tracks.*.jsonl`."""
+    folder = recording.folder
+    tracks = run_folder.lines_of(folder, "tracks", names, parse_track)
+    if not tracks:
+        return result
+    sets = [
+        (robot_of(each[0].camera), set_time_s(each), [(frame.camera, frame.index) for frame in each])
+        for each in frame_sets(recording.records)
+    ]
+    over_time = evaluate_tracks(sets, truth, recording.calibrations, tracks)
+    summaries = [over_time.summary]
+    heard = None
+    if (folder / run_folder.SENT).is_file():
+        heard = evaluate_messages(
+            over_time.moments,
+            parse_lines(folder / run_folder.SENT, parse_sent),
+            run_folder.lines_of(folder, "messages", names, parse_message),
+            run_folder.lines_of(folder, "signals", names, parse_signal),
+        )
+        summaries.append(heard.summary)
+    summary = dict(result.summary)
+    summary["estimators"] = {
+        name: {
+            key: value
+            for part in (numbers, *(each.get(name, {}) for each in summaries))
+            for key, value in part.items()
+        }
+        for name, numbers in summary["estimators"].items()
+    }
+    return replace(result, summary=summary, over_time=over_time, heard=heard)
 
 
 def _preview(recording: Recording, keys: Sequence[FrameKey], result: Evaluation) -> bytes:

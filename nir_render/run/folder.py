@@ -1,7 +1,7 @@
 """The run folder: everything that a run leaves on disk, written so that nothing is ever half there.
 
-A new folder is written aside, beside its place, and renamed into it when it is whole. A file that is added
-later is written aside, synced and renamed.
+A new folder is written aside, beside its place, and renamed into it when it is whole; there a render that was
+killed goes on. A file that is added later is written aside, synced and renamed.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from nir_render.errors import InputError
 from perception.files.fields import Place, RecordingError, first_of, parse_json
@@ -25,6 +25,10 @@ SCENE = "scene.yaml"
 FRAMES = "frames.jsonl"
 TRUTH = "truth.jsonl"
 LAMPS = "lamps.jsonl"
+SENT = "sent.jsonl"
+FILM = "preview.gif"
+POSES = "poses.jsonl"
+_DIGEST = ".digest"
 
 Item = TypeVar("Item")
 
@@ -54,6 +58,57 @@ def new_run_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
         raise disk_error(folder, error) from None
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def resumed_run_folder(folder: Path, overwrite: bool, digest: str) -> Iterator[tuple[Path, str]]:
+    """Give a folder to write a run into, as `new_run_folder`; a killed run's is given again, to go on with.
+
+    That is where `digest`, the hash of all that decides the run's files, is the same; what else lies there is
+    removed. It is kept where the process is killed or interrupted, not after an error. The second value says
+    what was found: "goes on", "anew" where it was of another digest, "" where nothing was there.
+
+    Raises
+    ------
+    InputError
+        As `new_run_folder`, or another process is writing this run.
+    """
+    check_free(folder, overwrite)
+    aside = folder.parent / f".{folder.name}.unfinished"
+    lock = aside.with_name(f"{aside.name}.lock")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(folder, error) from None
+    taken = f"{folder}: another process is rendering this run; wait for it, or give another folder"
+    try:
+        with locked(lock, taken):
+            found = _prepared(aside, digest)
+            try:
+                yield aside, found
+                (aside / _DIGEST).unlink()
+                _sync_folder(aside)
+                _replace(folder, aside)
+            except Exception:
+                shutil.rmtree(aside, ignore_errors=True)
+                raise
+    except OSError as error:
+        raise disk_error(folder, error) from None
+    lock.unlink(missing_ok=True)
+
+
+def _prepared(aside: Path, digest: str) -> str:
+    """Make a folder ready for a run of a digest; what was found there: see `resumed_run_folder`."""
+    there = aside.is_dir()
+    known = aside / _DIGEST
+    if there and known.is_file() and known.read_text(encoding="utf-8") == digest:
+        for half_written in aside.rglob(".*.partial-*"):
+            half_written.unlink()
+        return "goes on"
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir()
+    write_file(known, digest.encode())
+    return "anew" if there else ""
 
 
 def check_free(folder: Path, overwrite: bool) -> None:
@@ -116,12 +171,25 @@ def write_file(path: Path, data: bytes) -> None:
     InputError
         The disk is full, the folder cannot be written, ….
     """
+    with write_stream(path) as file:
+        file.write(data)
+
+
+@contextlib.contextmanager
+def write_stream(path: Path) -> Iterator[BinaryIO]:
+    """Give a file to write aside; it is synced and renamed into its place when the block ends without error.
+
+    Raises
+    ------
+    InputError
+        As `write_file`.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, aside = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(data)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             Path(aside).chmod(0o666 & ~_umask())
@@ -139,8 +207,9 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 def write_lines(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
     """Write one JSON object per line."""
-    text = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records)
-    write_file(path, text.encode())
+    with write_stream(path) as file:
+        for record in records:
+            file.write((json.dumps(record, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path) -> Any:
@@ -168,6 +237,20 @@ def parse_lines(path: Path, parse: Callable[[Any], Item]) -> list[Item]:
     if problems:
         raise InputError("\n".join(first_of(problems)))
     return items
+
+
+def lines_of(
+    folder: Path, kind: str, names: Iterable[str], parse: Callable[[Any], Item]
+) -> dict[str, list[Item]]:
+    """Return the lines of `KIND.NAME.jsonl`, by estimator, of those that have such a file.
+
+    Raises
+    ------
+    InputError
+        As `parse_lines`.
+    """
+    paths = {name: folder / f"{kind}.{name}.jsonl" for name in names}
+    return {name: parse_lines(path, parse) for name, path in paths.items() if path.is_file()}
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
@@ -218,7 +301,9 @@ def _parse(text: str, name: str) -> Any:
 
 
 def _hashes(folder: Path) -> dict[str, str]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST)
+    files = sorted(
+        path for path in folder.rglob("*") if path.is_file() and path.name not in (MANIFEST, _DIGEST)
+    )
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
     }

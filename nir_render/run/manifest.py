@@ -1,14 +1,17 @@
 """What the manifest of a run states: versions, seconds, render noise, samples, the error of enlarging."""
 
+import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from nir_render.camera.render_noise import RenderNoise
 from nir_render.light.light import Light
+from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import Shot
+from nir_render.simulation.refresh import HELD_OUT, RefreshError
 from nir_render.transport.fingerprint import package_versions
 from nir_render.transport.indirect.sample_plan import MOST_SAMPLES
 
@@ -81,10 +84,40 @@ def sample_facts(light: Light) -> dict[str, Any]:
     }
 
 
+def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return how far interpolated light is off where it was held out, and the times between renders.
+
+    With a target for the error the parts of an interval that keeps it are used, and their error is smaller;
+    intervals that do not are not used, nor counted here.
+    """
+    settings = scene.document.render.indirect
+    if settings.every_s is None and settings.error is None:
+        return {}
+    errors = [RefreshError(**one) for one in measured]
+    if settings.error is not None:
+        errors = [one for one in errors if one.keeps(settings.error)]
+    used = 1.0 if settings.error is None else 1.0 - HELD_OUT
+    worst = max(errors, key=lambda one: one.flare_share, default=None)
+    facts = {
+        "every_s": settings.every_s,
+        "target_share": settings.error,
+        "held_out": len(errors),
+        "longest_apart_s": _rounded(used * max((one.apart_s for one in errors), default=math.nan)),
+        "mean_share": _rounded(np.mean([one.mean_share for one in errors] or [math.nan])),
+        "largest_share": _rounded(max((one.mean_share for one in errors), default=math.nan)),
+        "largest_flare_share": _rounded(worst.flare_share if worst else math.nan),
+        "flare_sigma": _rounded(worst.flare_sigma if worst else math.nan),
+    }
+    known = {name: None if isinstance(one, float) and math.isnan(one) else one for name, one in facts.items()}
+    return {"refresh": known}
+
+
 def enlarging_facts(shot: Shot) -> dict[str, Any]:
     """Return how far a frame's enlarged light is off the full render; null and why where it is not known."""
     from nir_render.transport.indirect.enlarging_error import upsampling_error
 
+    if shot.mean.rates.between:
+        return {"mean": None, "reason": "the light of the first frame lies between two renders"}
     error = upsampling_error(shot.mean)
     if isinstance(error, str):
         return {"mean": None, "reason": error}

@@ -1,6 +1,5 @@
-"""The stage `perceive`: the frames of any folder become detections, by one or several estimators."""
+"""The stage `perceive`: the frames of any folder become detections, tracks, messages, by some estimators."""
 
-import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -11,6 +10,7 @@ from pathlib import Path
 from nir_render.errors import InputError
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds
+from nir_render.run.follow import Follower, OwnParts
 from nir_render.run.render import Progress
 from perception import (
     ESTIMATORS,
@@ -19,7 +19,6 @@ from perception import (
     Detection,
     Estimator,
     EstimatorError,
-    FrameRecord,
     OwnSetEstimator,
     RawFrame,
     Recording,
@@ -28,14 +27,13 @@ from perception import (
     frame_sets,
     load_command,
     load_estimator,
-    measure_set,
-    measurement_record,
-    mirror_record,
     read_frame_records,
+    read_odometry,
     read_recording,
 )
 from perception.command_estimator import LIMIT_S, is_command
-from perception.rig.frame_sets import robot_of
+from perception.messages.own import DecoderError
+from perception.track.own import TrackerError
 from perception.types import FrameKey
 
 RunEstimator = Estimator | OwnSetEstimator | CommandEstimator
@@ -112,11 +110,17 @@ def frame_estimators(names: Sequence[str]) -> dict[str, Estimator]:
     return chosen
 
 
-def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progress: Progress) -> Perceived:
+def perceive_run(
+    folder: Path,
+    *,
+    estimators: Mapping[str, RunEstimator],
+    progress: Progress,
+    own: OwnParts = OwnParts(),  # noqa: B008
+) -> Perceived:
     """Run estimators over the frames of a folder; write the detections of each that reads them all.
 
     One's own that fails on a frame is left out from there on, and the others go on. Of it nothing is written;
-    detections of an earlier call stay.
+    detections of an earlier call stay. `own` are a tracker and a decoder of one's own, for all of them.
 
     Raises
     ------
@@ -126,19 +130,17 @@ def perceive_run(folder: Path, *, estimators: Mapping[str, RunEstimator], progre
     started = time.perf_counter()
     try:
         recording = read_recording(folder)
-        records, calibrations = recording.records, recording.calibrations
-        found, failures = _read_all(recording, estimators, progress)
+        found, failures = _read_all(recording, estimators, progress, own)
     except InputError:
         raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
-    keys = dict.fromkeys((record.camera, record.index) for record in records)
+    keys = dict.fromkeys((record.camera, record.index) for record in recording.records)
     counts = {}
-    for name, of_frames in found.items():
+    for name, (of_frames, follower) in found.items():
         listed = [detection for key in keys for detection in of_frames.get(key, [])]
         run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, listed))
-        by_record = [of_frames.get((record.camera, record.index), []) for record in records]
-        _measure_sets(folder, name, records, by_record, calibrations)
+        follower.write(folder)
         counts[name] = len(listed)
     for name, text in failures.items():
         if (folder / f"detections.{name}.jsonl").is_file():
@@ -152,13 +154,13 @@ def _read_all(
     recording: Recording,
     estimators: Mapping[str, RunEstimator],
     progress: Progress,
-) -> tuple[dict[str, Found], dict[str, str]]:
-    """Return what each estimator found that came to the end, and what went wrong with the others."""
+    own: OwnParts,
+) -> tuple[dict[str, tuple[Found, Follower]], dict[str, str]]:
+    """Return what each estimator found and followed that came to the end, and what went wrong with others."""
     records, calibrations = recording.records, recording.calibrations
-    found: dict[str, Found] = {}
+    odometry = read_odometry(recording.folder)
+    found: dict[str, tuple[Found, Follower]] = {}
     failures: dict[str, str] = {}
-    sets = any(isinstance(estimator, OwnSetEstimator) for estimator in estimators.values())
-    groups = frame_sets(records) if sets else [[record] for record in records]
     done = 0
     with ExitStack() as stack:
         readers: dict[str, _Reader] = {}
@@ -166,21 +168,23 @@ def _read_all(
         def attempt(name: str, work: Callable[[], None]) -> None:
             try:
                 work()
-            except EstimatorError as error:
+            except (EstimatorError, TrackerError, DecoderError) as error:
                 failures[name] = str(error)
                 found.pop(name, None)
 
         def start(name: str, estimator: RunEstimator) -> None:
             readers[name] = _Reader.of(estimator, calibrations, stack)
-            found[name] = {}
+            found[name] = {}, Follower(name, calibrations, odometry, own)
 
         def read(name: str, frames: Sequence[RawFrame], files: Sequence[Path]) -> None:
+            hits, follower = found[name]
             for detection in readers[name].read(frames, files):
-                found[name].setdefault((detection.camera, detection.index), []).append(detection)
+                hits.setdefault((detection.camera, detection.index), []).append(detection)
+            follower.take(frames, [hits.get((frame.camera, frame.index), []) for frame in frames])
 
         for name, estimator in estimators.items():
             attempt(name, partial(start, name, estimator))
-        for group in groups:
+        for group in frame_sets(records):
             if not found:
                 break
             frames = [recording.frame(record) for record in group]
@@ -191,6 +195,8 @@ def _read_all(
             progress(done, len(records))
         for name in list(found):
             attempt(name, readers[name].finish)
+        for name, (_, follower) in list(found.items()):
+            attempt(name, follower.finish)
     return found, failures
 
 
@@ -223,33 +229,6 @@ class _Reader:
                 for detection in detect(frame, calibrations[frame.camera], estimator)
             ]
         )
-
-
-def _measure_sets(
-    folder: Path,
-    name: str,
-    records: Sequence[FrameRecord],
-    detections: Sequence[Sequence[Detection]],
-    calibrations: Mapping[str, Calibration],
-) -> None:
-    """Write what each robot's cameras measure together, set by set, and the mirrors and the fog in it."""
-    of_frame = {(record.camera, record.index): hits for record, hits in zip(records, detections, strict=True)}
-    measurements, mirrors, fog = [], [], []
-    for frames in frame_sets(records):
-        seen = measure_set(frames, [of_frame[frame.camera, frame.index] for frame in frames], calibrations)
-        measurements += [measurement_record(each) for each in seen.measurements]
-        robot, time_s = robot_of(frames[0].camera), frames[0].time_s
-        mirrors += [mirror_record(plane, robot, time_s) for plane in seen.planes]
-        if math.isfinite(seen.extinction_per_m):
-            told = {
-                "extinction_per_m": seen.extinction_per_m,
-                "extinction_sigma_per_m": seen.extinction_sigma_per_m,
-            }
-            fog.append({"format": 1, "robot": robot, "time_s": time_s, **told})
-    run_folder.write_lines(folder / f"measurements.{name}.jsonl", measurements)
-    run_folder.write_lines(folder / f"mirrors.{name}.jsonl", mirrors)
-    if fog:
-        run_folder.write_lines(folder / f"fog.{name}.jsonl", fog)
 
 
 def frame_keys(folder: Path) -> list[FrameKey]:

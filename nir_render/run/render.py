@@ -1,24 +1,48 @@
 """The stage `render`: a scene becomes a run folder of raw frames, truth and calibration."""
 
+import itertools
 import time
+import uuid
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
+import perception
 from nir_render.camera.render_noise import RenderNoise
 from nir_render.errors import InputError
 from nir_render.light.exr import direct_document, write_light
 from nir_render.light.light import Light
 from nir_render.run import folder as run_folder
-from nir_render.run.manifest import enlarging_facts, noise_facts, noise_warning, sample_facts, versions
+from nir_render.run.journal import Entry, Journal
+from nir_render.run.manifest import (
+    enlarging_facts,
+    noise_facts,
+    noise_warning,
+    refresh_facts,
+    sample_facts,
+    versions,
+)
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
-from nir_render.simulation.clock import Shot, simulate
+from nir_render.simulation.clock import Begun, Shot, simulate
+from nir_render.simulation.frame_times import frame_times
+from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
 from nir_render.transport.cache import LightCache
-from perception import Calibration, calibration_document, encode_png16, frame_record
+from nir_render.transport.cache_key import digest as digest_of
+from nir_render.transport.fingerprint import code_hash, matching
+from perception import Calibration, calibration_document, encode_png16, frame_record, odometry_record
+from perception.files.tracks import ODOMETRY
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done, and of all."""
+
+_WAITING_FRAMES = 2  # that wait for the disk while the next is rendered
+_CODE = ("**/*.py", "**/*.csv")  # what decides the bits of a run
 
 
 def render_run(
@@ -44,26 +68,60 @@ def render_run(
     """
     run_folder.check_free(folder, overwrite)
     started = time.perf_counter()
-    cameras = scene.cameras()
-    total = scene.document.clock.frames * len(cameras)
+    times = frame_times(scene, scene.document.seed).values()
+    total = sum(int((~one.dropped).sum()) for one in times)
     if calibrations is None:
         calibrations = calibrations_of(scene)
     cache = LightCache() if cache is None else cache
     missed, reused = cache.missed, cache.reused
-    with run_folder.new_run_folder(folder, overwrite) as aside:
-        writer = _FrameWriter(aside, keep_light)
-        for done, shot in enumerate(simulate(scene, cache=cache)):
-            writer.add(shot)
-            progress(done + 1, total)
+    digest = _digest(scene, keep_light)
+    with run_folder.resumed_run_folder(folder, overwrite, digest) as (aside, found):
+        with _FrameWriter(aside, keep_light) as writer:
+            begun = writer.begun
+            for done, shot in enumerate(simulate(scene, cache=cache, begun=begun), start=begun.frames):
+                lights = (cache.missed - missed, cache.reused - reused)
+                writer.add(shot, lights)
+                progress(done + 1, total)
         writer.finish()
+        _write_motion(scene, aside)
         run_folder.write_json(aside / run_folder.CALIBRATION, calibration_document(calibrations))
         run_folder.write_file(aside / run_folder.SCENE, scene.resolved_yaml().encode())
         noise = noise_facts(scene.document.render.noise, writer.noises)
-        lights = {"rendered": cache.missed - missed, "reused": cache.reused - reused}
         seconds = time.perf_counter() - started
-        run_folder.write_manifest(aside, _facts(scene, writer, noise, lights, seconds))
+        run_folder.write_manifest(aside, _facts(scene, writer, noise, seconds))
     warning = noise_warning(noise, len(writer.noises))
-    return [] if warning is None else [warning]
+    return _found_words(folder, found, begun.frames) + ([] if warning is None else [warning])
+
+
+def _found_words(folder: Path, found: str, frames: int) -> list[str]:
+    """Return what to tell of an earlier render that was killed."""
+    if found == "goes on" and frames:
+        return [f"{folder}: went on from an unfinished render, of which {frames} frames were there"]
+    if found == "anew":
+        return [f"{folder}: an unfinished render of another scene or version lay there; this one began anew"]
+    return []
+
+
+def _digest(scene: Scene, keep_light: bool) -> str:
+    """Return the hash of all that decides the files of a run; two of one digest are the same bits."""
+    from nir_render.transport.backend.variant import backend
+
+    packages = Path(__file__).parents[1], Path(perception.__file__).parent
+    code = code_hash(*(matching(package, _CODE) for package in packages))
+    made_by = [f"{name} {version}" for name, version in versions().items()]
+    again = uuid.uuid4().hex if keep_light else ""  # files of light speak of each other: always begun anew
+    return digest_of((scene.resolved_yaml(), backend().variant, backend().compiler, made_by, code, again))
+
+
+def _write_motion(scene: Scene, folder: Path) -> None:
+    """Write where robots were, and what those that take frames believe of it, where anything moves."""
+    if any(robot.moves for robot in scene.document.robots.values()):
+        run_folder.write_lines(folder / run_folder.POSES, pose_records(scene))
+    believed = [
+        line for robot in observers_astir(scene) for line in odometry_of(scene, robot, scene.document.seed)
+    ]
+    if believed:
+        run_folder.write_lines(folder / ODOMETRY, map(odometry_record, believed))
 
 
 def calibrations_of(scene: Scene, progress: Progress = lambda *_: None) -> list[Calibration]:
@@ -75,41 +133,105 @@ def calibrations_of(scene: Scene, progress: Progress = lambda *_: None) -> list[
 
 
 class _FrameWriter:
-    """Writes frames into a folder as they come, and keeps what is said of all of them at the end."""
+    """Writes frames into a folder as they come, in a thread of its own, and their lines into the journal."""
 
     def __init__(self, folder: Path, keep_light: bool) -> None:
         self.noises: dict[str, RenderNoise] = {}
         self.samples_by_camera: dict[str, dict[str, Any]] = {}
         self.enlarging_by_camera: dict[str, dict[str, Any]] = {}
+        self.refresh: list[dict[str, Any]] = []
+        self.lights = (0, 0)
         self._folder = folder
         self._keep_light = keep_light
-        self._lines: dict[str, list[dict[str, Any]]] = {
-            name: [] for name in (run_folder.FRAMES, run_folder.TRUTH, run_folder.LAMPS)
-        }
         self._light_files: dict[str, tuple[str, Light]] = {}
+        self._journal = Journal(folder)
+        self._pool = ThreadPoolExecutor(1)
+        self._writing: deque[Future[None]] = deque()
+        self._cameras = set[str]()
+        self.begun = self._begun()
+        self._lights_before = self.lights
 
-    def add(self, shot: Shot) -> None:
-        """Write a frame, and its light where it is to be kept."""
-        frame, light = shot.frame, shot.light
+    def __enter__(self) -> Self:
+        """Write until the block ends: then everything is written."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Wait for what is being written; raise what went wrong with it."""
+        self._pool.shutdown(cancel_futures=kind is not None)
+        self._journal.close()
+        if kind is None:
+            self._wait(0)
+
+    def add(self, shot: Shot, lights: tuple[int, int]) -> None:
+        """Write a frame, and its light where it is to be kept.
+
+        `lights` is how many this process has rendered and reused.
+        """
+        frame, light, first = shot.frame, shot.light, None
         file = f"frames/{frame.camera}/{frame.index:06d}.png"
-        run_folder.write_file(self._folder / file, encode_png16(frame.data_dn))
-        self._lines[run_folder.FRAMES].append(frame_record(frame, file))
-        self._lines[run_folder.TRUTH] += [row.record() for row in shot.truth]
-        self._lines[run_folder.LAMPS] += [row.record() for row in shot.lamps]
-        self.noises[f"{frame.camera} {frame.index}"] = shot.noise
-        if frame.camera not in self.enlarging_by_camera:
-            self.enlarging_by_camera[frame.camera] = enlarging_facts(shot)
-            if light.indirect is not None:
-                self.samples_by_camera[frame.camera] = sample_facts(light)
+        if frame.camera not in self._cameras:
+            self._cameras.add(frame.camera)
+            samples = None if light.indirect is None else sample_facts(light)
+            first = {"samples": samples, "enlarging": enlarging_facts(shot)}
         if self._keep_light:
             stem = self._folder / "light" / frame.camera / f"{frame.index:06d}"
             self._light_files[frame.camera] = _write_light(stem, light, self._light_files.get(frame.camera))
+        before = self._lights_before
+        entry = Entry(
+            camera=frame.camera,
+            index=frame.index,
+            lines={
+                run_folder.FRAMES: [frame_record(frame, file)],
+                run_folder.TRUTH: [row.record() for row in shot.truth],
+                run_folder.LAMPS: [row.record() for row in shot.lamps],
+            },
+            noise=shot.noise,
+            exposure=shot.exposure,
+            lights=(before[0] + lights[0], before[1] + lights[1]),
+            first=first,
+            refresh=[error.record() for error in shot.refresh],
+        )
+        self._writing.append(self._pool.submit(self._write, entry, file, frame.data_dn))
+        self._wait(_WAITING_FRAMES)
 
     def finish(self) -> None:
-        """Write the lines about all frames; of lamps only where there are any."""
-        for name, records in self._lines.items():
-            if records or name != run_folder.LAMPS:
-                run_folder.write_lines(self._folder / name, records)
+        """Write the lines about all frames; of lamps only where there are any. The journal goes."""
+        for entry in self._journal.entries():
+            self.noises[entry.name] = entry.noise
+            self.lights = entry.lights
+            self.refresh += entry.refresh
+            if entry.first is not None:
+                self.enlarging_by_camera[entry.camera] = entry.first["enlarging"]
+                if entry.first["samples"] is not None:
+                    self.samples_by_camera[entry.camera] = entry.first["samples"]
+        for name in (run_folder.FRAMES, run_folder.TRUTH, run_folder.LAMPS):
+            of_frames = (record for entry in self._journal.entries() for record in entry.lines[name])
+            first = next(of_frames, None)
+            if first is not None or name != run_folder.LAMPS:
+                run_folder.write_lines(
+                    self._folder / name, () if first is None else itertools.chain((first,), of_frames)
+                )
+        self._journal.remove()
+
+    def _begun(self) -> Begun:
+        """Return what an earlier process has done of this run."""
+        frames, exposures = 0, {}
+        for entry in self._journal.entries():
+            frames += 1
+            self._cameras.add(entry.camera)
+            self.lights = entry.lights
+            if entry.exposure is not None:
+                exposures[entry.camera] = entry.exposure
+        return Begun(frames, exposures)
+
+    def _write(self, entry: Entry, file: str, data_dn: NDArray[np.uint16]) -> None:
+        run_folder.write_file(self._folder / file, encode_png16(data_dn))
+        self._journal.add(entry)
+
+    def _wait(self, most: int) -> None:
+        """Wait until at most so many frames are being written; raise what went wrong with the others."""
+        while len(self._writing) > most:
+            self._writing.popleft().result()
 
 
 def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tuple[str, Light]:
@@ -126,9 +248,7 @@ def _write_light(stem: Path, light: Light, last: tuple[str, Light] | None) -> tu
     return file, light
 
 
-def _facts(
-    scene: Scene, writer: _FrameWriter, noise: dict[str, Any], lights: dict[str, int], seconds: float
-) -> dict[str, Any]:
+def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: float) -> dict[str, Any]:
     """Return what the manifest states of a render.
 
     Its `render_noise` is the variance of the Monte Carlo part over shot and read noise: the median over the
@@ -148,9 +268,9 @@ def _facts(
         "variant": backend().variant,
         "variant_reason": backend().reason,
         "seconds": {"render": round(seconds, 3)},
-        "indirect": _indirect_facts(scene) | by_camera,
+        "indirect": _indirect_facts(scene) | by_camera | refresh_facts(scene, writer.refresh),
         "render_noise": noise,
-        "lights": lights,
+        "lights": {"rendered": writer.lights[0], "reused": writer.lights[1]},
     }
 
 

@@ -12,8 +12,16 @@ from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.materials import Dielectric, Pane
 from nir_render.scene.documents.sensor import Sensor
 from nir_render.scene.documents.shapes import Box, Cylinder, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.documents.times.clocks import JITTER_SIGMAS, CameraClock
+from nir_render.scene.documents.times.motion import Moving
 from nir_render.scene.emission import emission_spectrum
-from nir_render.scene.motion import camera_positions_m, robot_positions_m
+from nir_render.scene.motion import (
+    camera_positions_m,
+    frame_positions_m,
+    frame_rotations,
+    robot_positions_m,
+    robot_rotations,
+)
 from nir_render.scene.pose import rotation_of
 from nir_render.spectra.nodes import BAND_M
 
@@ -35,6 +43,7 @@ def check(document: SceneDocument) -> list[str]:
         *_exposures_beyond_the_clock(document),
         *_uncovered_curves(document),
         *_cameras_inside_solids(document),
+        *_cameras_and_sources_inside_their_own_bodies(document),
     ]
 
 
@@ -74,12 +83,12 @@ def _exposures_beyond_the_clock(document: SceneDocument) -> list[str]:
     if document.clock.frames == 1:
         return []
     problems = []
-    period_s = (1.0 + _SLACK) / document.clock.frame_rate_hz
-    period = f"{1e3 / document.clock.frame_rate_hz:.4g} ms"
     mend = "shorten it, or lower clock.frame_rate"
     for name, camera in _observing(document).items():
         robot, camera_name = name.split(".")
         place = f"robots.{robot}.rig.cameras.{camera_name}"
+        shortest_s = _shortest_period_s(camera, document.clock.frame_rate_hz)
+        period_s, period = (1.0 + _SLACK) * shortest_s, f"{1e3 * shortest_s:.4g} ms"
         rows, auto = camera.sensor.rows, camera.auto_exposure
         read_out_s = rows * camera.shutter.row_delay_s
         read_out = f"the read-out of {rows} rows, {1e3 * read_out_s:.4g} ms,"
@@ -103,6 +112,12 @@ def _exposures_beyond_the_clock(document: SceneDocument) -> list[str]:
     return problems
 
 
+def _shortest_period_s(camera: Camera, frame_rate_hz: float) -> float:
+    """Return the shortest time from one frame to the next, by the camera's own clock."""
+    clock = camera.clock or CameraClock()
+    return (1.0 + clock.drift) / frame_rate_hz - 2.0 * JITTER_SIGMAS * clock.jitter_s
+
+
 def _longest_exposures_s(camera: Camera) -> dict[str, float]:
     """Return the longest exposure that each field lets a camera take."""
     if camera.bracket is not None:
@@ -114,24 +129,24 @@ def _longest_exposures_s(camera: Camera) -> dict[str, float]:
 
 def _flat_cylinders(document: SceneDocument) -> list[str]:
     return [
-        f"shapes.{name}: start and end of the cylinder are the same point"
-        for name, shape in document.shapes.items()
+        f"{place}: start and end of the cylinder are the same point"
+        for place, shape in document.all_shapes().items()
         if isinstance(shape, Cylinder) and shape.start_m == shape.end_m
     ]
 
 
 def _sheets_and_solids(document: SceneDocument) -> list[str]:
     problems = []
-    for name, shape in document.shapes.items():
+    for place, shape in document.all_shapes().items():
         material = document.materials[shape.material]
         if isinstance(material, Pane) and not isinstance(shape, Rectangle):
             problems.append(
-                f"shapes.{name}.material: {shown(shape.material)} is a pane, a thin sheet: only a rectangle "
+                f"{place}.material: {shown(shape.material)} is a pane, a thin sheet: only a rectangle "
                 f"can be of it, not a {shape.type}; solid glass is of the type 'dielectric'"
             )
         if isinstance(material, Dielectric) and isinstance(shape, Rectangle):
             problems.append(
-                f"shapes.{name}.material: {shown(shape.material)} is a solid dielectric, and a rectangle has "
+                f"{place}.material: {shown(shape.material)} is a solid dielectric, and a rectangle has "
                 "no inside; use the type 'pane' for a sheet of glass, or a box"
             )
     return problems
@@ -179,50 +194,112 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
 
 def _cameras_inside_solids(document: SceneDocument) -> list[str]:
     """Tell of cameras that are in a body at the time of a frame. Meshes are tested when built."""
-    solids = _solids(document.shapes)
-    if not solids:
+    carriers = _carriers(document)
+    if not carriers:
         return []
     clock = document.clock
     frames_s = clock.start_s + np.arange(clock.frames) / clock.frame_rate_hz
     problems = []
     for name, robot in document.robots.items():
         # Where the robot stands still, the first frame tells of all.
-        times_s = frames_s if robot.motion else frames_s[:1]
+        still = not robot.moves and not any(carrier.moves for _, carrier, _ in carriers.values())
+        times_s = frames_s[:1] if still else frames_s
         places_m = robot_positions_m(robot, times_s)
         for camera_name, camera in robot.rig.cameras.items():
             met = [
-                (*found, body_name)
-                for body_name, body in solids.items()
-                if (found := _first_time_inside(body, robot, camera, times_s, places_m)) is not None
+                (*found, place)
+                for place, (body, carrier, owner) in carriers.items()
+                if owner != name
+                and (found := _first_time_inside(body, carrier, robot, camera, times_s, places_m)) is not None
             ]
             if met:
                 time_s, point_m, inside = min(met, key=lambda found: found[0])
                 problems.append(
-                    f"robots.{name}.rig.cameras.{camera_name}: the camera is inside shapes.{inside} "
+                    f"robots.{name}.rig.cameras.{camera_name}: the camera is inside {inside} "
                     f"at {time_s:g} s, at [{', '.join(f'{x:.4g}' for x in point_m)}] m; move one of them"
                 )
     return problems
 
 
 def _first_time_inside(
-    body: Solid, robot: Robot, camera: Camera, times_s: Array, places_m: Array
+    body: Solid, carrier: Moving, robot: Robot, camera: Camera, times_s: Array, places_m: Array
 ) -> tuple[float, Array] | None:
     """Return when, of times, a camera is in a body for the first time, and where it is then.
 
-    `places_m` is where its robot is, shape (n, 3): only where that is near enough is the camera looked for,
-    as this takes the robot's orientation.
+    `carrier` is what the body moves with. `places_m` is where the camera's robot is, shape (n, 3): only where
+    that is near enough is the camera looked for, as this takes the robot's orientation.
     """
     center_m, radius_m = _bounding_sphere(body)
     reach_m = (radius_m + float(np.linalg.norm(camera.position_m))) * (1.0 + _SLACK)
-    near = np.flatnonzero(np.linalg.norm(places_m - center_m, axis=-1) <= reach_m)
+    off_m = places_m - center_m
+    if _carries(carrier):
+        reach_m += float(np.linalg.norm(center_m))
+        off_m = places_m - _carrier_positions_m(carrier, times_s)
+    near = np.flatnonzero(np.linalg.norm(off_m, axis=-1) <= reach_m)
     for part in np.split(near, range(_MOST_AT_ONCE, len(near), _MOST_AT_ONCE)):
         if len(part) == 0:
             continue
         points_m = camera_positions_m(robot, camera, times_s[part])
-        inside = np.flatnonzero(_contains(body, points_m))
+        local_m = points_m
+        if _carries(carrier):
+            off_m = points_m - _carrier_positions_m(carrier, times_s[part])
+            local_m = (off_m[:, None, :] @ _carrier_rotations(carrier, times_s[part]))[:, 0]
+        inside = np.flatnonzero(_contains(body, local_m))
         if len(inside):
             return float(times_s[part[inside[0]]]), points_m[inside[0]]
     return None
+
+
+def _carriers(document: SceneDocument) -> dict[str, tuple[Solid, Moving, str | None]]:
+    """Return closed shapes, what each moves with, and the robot whose body it is, by place."""
+    carriers: dict[str, tuple[Solid, Moving, str | None]] = {
+        f"shapes.{name}": (body, document.shapes[name], None)
+        for name, body in _solids(document.shapes).items()
+    }
+    for robot_name, robot in document.robots.items():
+        for name, body in _solids(robot.rig.body).items():
+            carriers[f"robots.{robot_name}.rig.body.{name}"] = (body, robot, robot_name)
+    return carriers
+
+
+def _carries(carrier: Moving) -> bool:
+    """Tell whether what stands on a carrier is written in other axes than the world's."""
+    return carrier.moves or isinstance(carrier, Robot)
+
+
+def _carrier_positions_m(carrier: Moving, times_s: Array) -> Array:
+    if isinstance(carrier, Robot):
+        return robot_positions_m(carrier, times_s)
+    return frame_positions_m(carrier, times_s)
+
+
+def _carrier_rotations(carrier: Moving, times_s: Array) -> Array:
+    return (
+        robot_rotations(carrier, times_s) if isinstance(carrier, Robot) else frame_rotations(carrier, times_s)
+    )
+
+
+def _cameras_and_sources_inside_their_own_bodies(document: SceneDocument) -> list[str]:
+    """Tell of what is shut in by the body of its own robot: where both are does not depend on the time."""
+    problems = []
+    for name, robot in document.robots.items():
+        rig = robot.rig
+        opaque = {
+            body: shape
+            for body, shape in rig.body.items()
+            if not isinstance(document.materials[shape.material], Dielectric)
+        }
+        parts = [("cameras", one, part.position_m, rig.body) for one, part in rig.cameras.items()]
+        parts += [("sources", one, part.position_m, opaque) for one, part in rig.sources.items()]
+        for kind, one, position_m, bodies in parts:
+            inside = solid_around(bodies, np.array(position_m))
+            if inside is not None:
+                problems.append(
+                    f"robots.{name}.rig.{kind}.{one}: is inside the robot's own body.{inside}, at "
+                    f"[{', '.join(f'{x:.4g}' for x in position_m)}] m, and sees or shows nothing; move one "
+                    "of them, or make the body of parts that leave it free"
+                )
+    return problems
 
 
 def _bounding_sphere(body: Solid) -> tuple[Array, float]:

@@ -9,12 +9,13 @@ import yaml
 from pydantic import ValidationError
 
 from nir_render.errors import InputError, shown
+from nir_render.scene.bodies import shapes_at
 from nir_render.scene.checks import check
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.emitters import Lamp, Source, Sun
 from nir_render.scene.explain import Places, explain
-from nir_render.scene.motion import robot_pose
+from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
 from nir_render.scene.snapshot import PlacedRobot, Snapshot
 
@@ -86,10 +87,10 @@ class Scene:
         return Snapshot(
             time_s=time_s,
             robots={
-                name: PlacedRobot(robot.rig, robot_pose(robot, time_s))
+                name: PlacedRobot(robot.rig, robot_pose(robot, time_s), robot_velocity(robot, time_s))
                 for name, robot in document.robots.items()
             },
-            shapes=document.shapes,
+            standing=shapes_at(document.shapes, time_s),
             materials=document.materials,
             lamps=document.lamps,
             sun=document.sun,
@@ -103,10 +104,10 @@ class Scene:
         """Return the document with everything expanded, in SI units; it loads to the same scene."""
         data = self.document.model_dump(mode="json", by_alias=True, exclude_none=True)
         for robot in data["robots"].values():
+            if robot["motion"] or "path" in robot:
+                del robot["position"], robot["orientation"]
             if not robot["motion"]:
                 del robot["motion"]
-            else:
-                del robot["position"], robot["orientation"]
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=110)
 
 

@@ -8,7 +8,7 @@ from nir_render.scene.documents.emitters import Lamp, Source
 from nir_render.scene.documents.files import PresetDocument, preset_names
 from nir_render.scene.documents.lens import Bandpass, Lens
 from nir_render.scene.documents.sensor import Sensor
-from nir_render.scene.text.units import VISIBILITY
+from nir_render.scene.text.units import SPEED, VISIBILITY
 
 _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     Source,
@@ -34,10 +34,19 @@ def scene_schema() -> dict[str, Any]:
     fog["properties"]["visibility"]["description"] = "3.912 / extinction, in place of it"
     del fog["required"]
     fog["oneOf"] = [{"required": ["extinction"]}, {"required": ["visibility"]}]
+    for name, key in (("Waypoint", "time"), ("Circle", "period")):
+        _or_speed(definitions[name], key)
     schema["properties"]["include"] = {"type": "array", "items": {"type": "string"}}
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "nir_render scene"
     return schema
+
+
+def _or_speed(definition: dict[str, Any], key: str) -> None:
+    """Let a speed stand in place of a time."""
+    definition["properties"]["speed"] = {"type": "string", "examples": [SPEED.example]}
+    definition["required"].remove(key)
+    definition["oneOf"] = [{"required": [key]}, {"required": ["speed"]}]
 
 
 def _describe_curves(definitions: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from nir_render.errors import InputError, shown
+from nir_render.scene.bodies import body_shapes
 from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import RenderSettings, reflects_or_scatters
 from nir_render.scene.documents.emitters import Drive, Lamp, Source, Sun
@@ -24,16 +25,18 @@ from nir_render.scene.documents.materials import MaterialDocument
 from nir_render.scene.documents.shapes import ShapeDocument
 from nir_render.scene.emission import Emitter
 from nir_render.scene.explain import explain
+from nir_render.scene.motion import Velocity
 from nir_render.scene.pose import Pose, camera_mount, source_mount
 from nir_render.scene.text.units import LENGTH
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedRobot:
-    """What a robot carries, and the pose of its body in the world."""
+    """What a robot carries, the pose of its body in the world, and how that changes: None where it rests."""
 
     rig: Rig
     pose: Pose
+    velocity: Velocity | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +63,8 @@ class Snapshot:
     ----------
     robots
         Rig and pose of each robot, by name.
-    shapes, materials
-        Bodies that stand still, and what they are made of, by name.
+    standing, materials
+        Bodies that no robot carries, where they are, and what bodies are made of, by name.
     lamps, sun, fog
         What else shines, and what the air holds.
     render
@@ -74,7 +77,7 @@ class Snapshot:
 
     time_s: float
     robots: Mapping[str, PlacedRobot]
-    shapes: Mapping[str, ShapeDocument]
+    standing: Mapping[str, ShapeDocument]
     materials: Mapping[str, MaterialDocument]
     lamps: Mapping[str, Lamp]
     sun: Sun | None
@@ -82,6 +85,14 @@ class Snapshot:
     render: RenderSettings
     seed: int = 0
     origin: str = "snapshot"
+
+    @cached_property
+    def shapes(self) -> Mapping[str, ShapeDocument]:
+        """All bodies where they are, by name: those that stand, then `robot.body.shape`."""
+        shapes = dict(self.standing)
+        for name, robot in self.robots.items():
+            shapes |= body_shapes(name, robot.rig.body, robot.pose)
+        return shapes
 
     @cached_property
     def sources(self) -> Mapping[str, PlacedSource]:
@@ -122,8 +133,16 @@ class Snapshot:
             return False
         return bool(self.lamps) or reflects_or_scatters(self.shapes, self.materials, self.fog)
 
-    def moved(self, poses: Mapping[str, Pose], time_s: float | None = None) -> "Snapshot":
+    def moved(
+        self,
+        poses: Mapping[str, Pose],
+        time_s: float | None = None,
+        velocities: Mapping[str, Velocity] | None = None,
+    ) -> "Snapshot":
         """Return the world with robots at other poses, by name, and at another time.
+
+        Robots that are moved rest there, unless `velocities` says how fast they go: their flares are drawn
+        out along their way in the exposure.
 
         >>> from nir_render import Pose, load_scene
         >>> world = load_scene("scenes/one_source.yaml").at(0.0)
@@ -137,7 +156,10 @@ class Snapshot:
             There is no such robot; a pose is none, not finite, too far off, or no rotation.
         """
         robots = {
-            name: replace(self._robot(name), pose=self._sound(name, pose)) for name, pose in poses.items()
+            name: replace(
+                self._robot(name), pose=self._sound(name, pose), velocity=(velocities or {}).get(name)
+            )
+            for name, pose in poses.items()
         }
         return replace(
             self, robots={**self.robots, **robots}, time_s=self.time_s if time_s is None else time_s

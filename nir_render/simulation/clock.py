@@ -3,8 +3,8 @@
 Light is rendered once for a geometry; exposing it is arithmetic.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,9 @@ from nir_render.randomness import RandomKey
 from nir_render.scene.documents.camera import MOST_GAIN, AutoExposure, Camera
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
+from nir_render.simulation.frame_times import frame_times, last_of_first
 from nir_render.simulation.lamps import lamp_truth
+from nir_render.simulation.refresh import Refreshed, RefreshError
 from nir_render.simulation.truth import truth_of
 from nir_render.transport.cache import LightCache
 from nir_render.truth.lamps import LampTruth
@@ -49,7 +51,11 @@ SceneOrSnapshot = Scene | Snapshot
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame, its light, the truth about sources and lamps, its mean without noise, the render's noise."""
+    """A frame, its light, the truth about sources and lamps, its mean without noise, the render's noise.
+
+    `exposure` is what the camera's automatic exposure knows after it; None without one. `refresh` is what was
+    measured on the way to it of the error of interpolated light.
+    """
 
     frame: RawFrame
     light: Light
@@ -57,6 +63,16 @@ class Shot:
     lamps: tuple[LampTruth, ...]
     mean: MeanFrame
     noise: RenderNoise
+    exposure: ExposureState | None = None
+    refresh: tuple[RefreshError, ...] = ()
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What is done of a run: so many frames, and what automatic exposures know after them, by camera."""
+
+    frames: int = 0
+    exposures: Mapping[str, ExposureState] = field(default_factory=dict)
 
 
 def render(
@@ -238,39 +254,59 @@ def _of_light(light: Light, world: SceneOrSnapshot) -> Snapshot:
     return world
 
 
-def simulate(scene: Scene, seed: int | None = None, cache: LightCache | None = None) -> Iterator[Shot]:
+def simulate(
+    scene: Scene, seed: int | None = None, cache: LightCache | None = None, begun: Begun | None = None
+) -> Iterator[Shot]:
     """Yield frames with their truth: for each time of the clock, each observing camera.
 
     `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
-    Geometry stands still within a frame, as it is at mid-exposure of its middle row. Light is rendered only
-    where geometry is new; `cache` keeps it beyond this run.
+    Geometry is as at mid-exposure of a frame's middle row; only the flares of what moves are drawn out along
+    their way (`camera/motion_blur.py`). Light is rendered only where geometry is new; `cache` keeps it beyond
+    this run. Frames that a camera drops are taken, for automatic exposure, and not yielded. Those that
+    are `begun`, done already, are left out, and the others are as they would be after them.
     """
     run_seed = scene.document.seed if seed is None else seed
     cache = LightCache() if cache is None else cache
     period_s = 1.0 / scene.document.clock.frame_rate_hz
     kept: dict[str, Rates] = {}
-    states: dict[str, ExposureState] = {}
+    begun = Begun() if begun is None else begun
+    states = dict(begun.exposures)
+    cameras = scene.cameras()
+
+    refreshed = _refreshed(scene, run_seed, cache)
 
     def light_at(name: str, time_s: float) -> tuple[Light, Rates]:
+        if refreshed is not None:
+            rates = refreshed.rates_at(name, time_s)
+            return rates.light, rates
         snapshot = scene.at(time_s)
         light = render(snapshot, name, seed=run_seed, cache=cache)
         kept[name] = _reused_rates(light, snapshot, kept.get(name))
         return light, kept[name]
 
-    for index, time_s in enumerate(scene.document.frame_times_s()):
-        for name in scene.cameras():
-            _, camera = scene.camera(name)
-            control, setting = camera.auto_exposure, own_setting(camera, index)
-            if control is not None:
-                if name not in states:
-                    _, rates = light_at(name, time_s)
-                    states[name] = _settled(rates, control, time_s, period_s, run_seed)
-                setting = states[name].upcoming[0]
-            light, rates = light_at(name, time_s + mid_exposure_s(camera, setting.exposure_s))
-            shot = _shot(light, rates, setting, time_s, RandomKey(run_seed, "read_out", name, index))
+    own_times = frame_times(scene, run_seed)
+    turns = [(index, name) for index in range(scene.document.clock.frames) for name in cameras]
+    done = last_of_first(turns, own_times, begun.frames)
+    for index, name in turns:
+        _, camera = scene.camera(name)
+        control, setting = camera.auto_exposure, own_setting(camera, index)
+        time_s, dropped = float(own_times[name].time_s[index]), bool(own_times[name].dropped[index])
+        if index <= done.get(name, -1) or (dropped and control is None):
+            continue
+        if control is not None:
+            if name not in states:
+                _, rates = light_at(name, time_s)
+                states[name] = _settled(rates, control, time_s, period_s, run_seed)
+            setting = states[name].upcoming[0]
+        light, rates = light_at(name, time_s + mid_exposure_s(camera, setting.exposure_s))
+        shot = _shot(light, rates, setting, time_s, RandomKey(run_seed, "read_out", name, index))
+        if control is not None:
+            states[name] = next_state(states[name], control, camera, shot.frame)
+            shot = replace(shot, exposure=states[name])
+        if refreshed is not None:
+            shot = replace(shot, refresh=tuple(refreshed.measured()))
+        if not dropped:
             yield shot
-            if control is not None:
-                states[name] = next_state(states[name], control, camera, shot.frame)
 
 
 def frame_of(
@@ -303,11 +339,38 @@ def frame_of(
     )
 
 
+def _refreshed(scene: Scene, seed: int, cache: LightCache) -> Refreshed | None:
+    """Return what interpolates indirect light; None where each frame's is rendered."""
+    settings = scene.document.render.indirect
+    if (settings.every_s is None and settings.error is None) or not scene.document.has_indirect_light():
+        return None
+    return Refreshed(scene, seed, cache)
+
+
 def _reused_rates(light: Light, snapshot: Snapshot, kept: Rates | None) -> Rates:
     """Return the rates of a light: those that are kept where it is the same light at another time."""
-    if kept is None or kept.light.indirect is not light.indirect or kept.light.direct is not light.direct:
+    if kept is None or not _as_fast(kept.snapshot, snapshot):
+        return electron_rates(light, snapshot)
+    if kept.light.indirect is not light.indirect or kept.light.direct is not light.direct:
         return electron_rates(light, snapshot)
     return kept
+
+
+def _as_fast(before: Snapshot, after: Snapshot) -> bool:
+    """Tell whether all robots go as fast in two worlds: else their flares are drawn out otherwise."""
+    pairs = [(before.robots[name].velocity, robot.velocity) for name, robot in after.robots.items()]
+    return all(
+        (one is None) == (other is None)
+        and (
+            one is None
+            or other is None
+            or (
+                np.array_equal(one.linear_m_per_s, other.linear_m_per_s)
+                and np.array_equal(one.angular_rad_per_s, other.angular_rad_per_s)
+            )
+        )
+        for one, other in pairs
+    )
 
 
 def _settled(rates: Rates, control: AutoExposure, time_s: float, period_s: float, seed: int) -> ExposureState:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.mean_frame import MeanFrame, place_of
+from nir_render.camera.mean_frame import MeanFrame
 from nir_render.camera.optics.lens import intrinsics_of
+from nir_render.camera.optics.psf import place_of
 from nir_render.camera.sensor.read_out import dark_variance_e2, saturation_dn
 from nir_render.camera.timing.drive import drive_of
 from nir_render.camera.timing.shutter import on_fractions

@@ -24,13 +24,14 @@ from nir_render.light.npz import ASIDE, bytes_of, read_light, write_light
 _SUFFIX = ".light.npz"
 _ABANDONED_AFTER_S = 3600.0
 _PLANS = 64
+_MOST_HELD = 512  # small lights, of long runs: each new one looks through them
 
 
 class LightCache:
     """Lights by key; the least recently used go first.
 
-    The last light of each camera and film stays in memory whatever the limit; on disk the folder may hold
-    `limit_bytes`.
+    The last light of each camera and film stays in memory whatever the limit, of others at most 512; on disk
+    the folder may hold `limit_bytes`.
     `reused` and `missed` count the lights that were asked for.
     """
 
@@ -127,7 +128,7 @@ class LightCache:
         newest = {_film(one): name for name, one in self._held.items()}
         excess_bytes = sum(map(bytes_of, self._held.values())) - self._memory_limit_bytes
         for name, one in list(self._held.items()):
-            if excess_bytes <= 0:
+            if excess_bytes <= 0 and len(self._held) <= _MOST_HELD:
                 break
             if newest[_film(one)] != name:
                 del self._held[name]

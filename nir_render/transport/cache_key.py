@@ -45,6 +45,9 @@ _CODE = (
     "geometry.py",
 )
 
+# Of a shape: its material is told beside it; a snapshot has it where its motion has brought it.
+_ELSEWHERE = {"material", "motion", "between", "path"}
+
 Sampled = NDArray[np.int64] | int | str | tuple[str, NDArray[np.int64]] | None
 
 
@@ -166,7 +169,7 @@ def versions(variant: str, compiler: str) -> tuple[str, ...]:
 
 def _shape(shape: ShapeDocument) -> tuple[str, dict[str, Any]]:
     """Return a shape without the name of its material, and a mesh by what its file holds."""
-    fields = {name: getattr(shape, name) for name in type(shape).model_fields if name != "material"}
+    fields = {name: getattr(shape, name) for name in type(shape).model_fields if name not in _ELSEWHERE}
     if isinstance(shape, Mesh):
         file = Path(shape.file)
         state = file.stat()

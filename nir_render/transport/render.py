@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError
 from nir_render.light.enlarge import Enlargement, part_of
 from nir_render.light.light import DirectTable, Indirect, Light
+from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.checks import indivisible_sensor, solid_around
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
@@ -43,6 +44,11 @@ def render(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None 
     samples, short_pixels = rendering.samples()
     light = rendering.light(samples)
     return replace(light, time_s=snapshot.time_s, seed=seed, short_pixels=short_pixels)
+
+
+def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
+    """Return the direct light alone that reaches a camera; errors as `render`. It is kept nowhere."""
+    return _rendering(snapshot, camera, seed, None).direct_light()
 
 
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
@@ -86,6 +92,10 @@ class _Rendering:
         """Return the light with so many samples in each pixel."""
         return self._kept(samples, lambda: self._light(self._indirect(samples)), counts=True)
 
+    def direct_light(self) -> Light:
+        """Return the light without its indirect part."""
+        return self._light(None)
+
     def _kept(self, samples: Sampled, rendered: Callable[[], Light], *, counts: bool) -> Light:
         made_by = _made_by()
         key = light_key(self.site, self._geometry, self.seed, self._power, samples, made_by)
@@ -117,6 +127,8 @@ class _Rendering:
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
         snapshot, name = self.site.snapshot, self.site.name
+        if not snapshot.has_indirect_light():
+            return None
         key = groups.light_seed(self.seed, "indirect", name, self._geometry)
         if not backend().vectorised:
             return stock.indirect(snapshot, name, key, self._direct)
@@ -174,8 +186,8 @@ def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | N
     inside = solid_around(snapshot.shapes, placed.pose.position_m)
     if inside is not None:
         raise InputError(
-            f"{snapshot.origin}: the camera {camera} is inside shapes.{inside} at {snapshot.time_s:g} s; "
-            "move one"
+            f"{snapshot.origin}: the camera {camera} is inside {place_of_shape(inside)} at "
+            f"{snapshot.time_s:g} s; move one"
         )
     if snapshot.has_indirect_light():
         indivisible = indivisible_sensor(camera, placed.camera.sensor, snapshot.render.indirect.scale)

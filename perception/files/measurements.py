@@ -10,18 +10,21 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perception.files.fields import Place, check_format, get, shown
 from perception.files.readers import (
     Reader,
+    detection_keys,
     flag,
     integer,
+    matrix,
     number,
     number_or_nan,
-    numbers,
+    one_of,
+    plain,
     read_fields,
     text,
+    vector,
 )
 from perception.types import Measurement, MirrorPlane
 
@@ -39,7 +42,7 @@ def measurement_record(measurement: Measurement) -> dict[str, Any]:
         If a number is infinite, which JSON cannot hold.
     """
     record = {"format": 1, **asdict(measurement), "position_body_m": measurement.position_body_m}
-    return {name: _plain(name, value) for name, value in record.items()}
+    return {name: plain(name, value) for name, value in record.items()}
 
 
 def parse_measurement(record: Mapping[str, Any], file: str = "", line: int | None = None) -> Measurement:
@@ -70,7 +73,7 @@ def parse_measurement(record: Mapping[str, Any], file: str = "", line: int | Non
 def mirror_record(mirror: MirrorPlane, robot: str, time_s: float) -> dict[str, Any]:
     """Make the JSON object of a mirror that a set shows."""
     record = {"format": 1, "robot": robot, "time_s": time_s, **asdict(mirror)}
-    return {name: _plain(name, value) for name, value in record.items()}
+    return {name: plain(name, value) for name, value in record.items()}
 
 
 def parse_mirror(
@@ -89,64 +92,11 @@ def parse_mirror(
     return text(record, "robot", place), number(record, "time_s", place), plane
 
 
-def _plain(name: str, value: Any) -> Any:
-    """Return a value as JSON holds it: lists for tuples and arrays, null for NaN."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(name, each) for each in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        if math.isinf(value):
-            raise ValueError(f"{name} is infinite, which JSON cannot hold; use NaN")
-        return None
-    return value
-
-
-def _vector(record: Mapping[str, Any], field: str, place: Place) -> tuple[float, ...]:
-    return tuple(numbers(record, field, place, 3))
-
-
-def _matrix(size: int) -> Reader:
-    def read(record: Mapping[str, Any], field: str, place: Place) -> NDArray[np.float64]:
-        rows = get(record, field, place)
-        if not isinstance(rows, list) or [len(row) for row in rows if isinstance(row, list)] != [size] * size:
-            raise place.error(f"is {shown(rows)}", f"Write {size} lists of {size} numbers", field)
-        cells = [each for row in rows for each in row]
-        flat = {f"{field}[{k // size}][{k % size}]": each for k, each in enumerate(cells)}
-        return np.array([number_or_nan(flat, name, place) for name in flat]).reshape(size, size)
-
-    return read
-
-
-def _one_of(words: tuple[str, ...]) -> Reader:
-    def read(record: Mapping[str, Any], field: str, place: Place) -> str:
-        word = text(record, field, place)
-        if word not in words:
-            raise place.error(f"is {shown(word)}", f"Write one of {', '.join(words)}", field)
-        return word
-
-    return read
-
-
 def _cameras(record: Mapping[str, Any], field: str, place: Place) -> tuple[str, ...]:
     names = get(record, field, place)
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
         raise place.error(f"is {shown(names)}", "Write a list of cameras' names", field)
     return tuple(names)
-
-
-def _detections(record: Mapping[str, Any], field: str, place: Place) -> tuple[tuple[str, int, int], ...]:
-    rows = get(record, field, place)
-    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
-        raise place.error(f"is {shown(rows)}", "Write a list of [camera, index, number]", field)
-    parts = [
-        {"camera": row[0], "index": row[1], "number": row[2]} for row in rows
-    ]  # each checked as fields of its own
-    return tuple(
-        (text(part, "camera", at), integer(part, "index", at), integer(part, "number", at))
-        for i, part in enumerate(parts)
-        for at in (place.within(f"{field}[{i}]"),)
-    )
 
 
 _OF_MEASUREMENT: dict[Any, Reader] = {
@@ -155,18 +105,18 @@ _OF_MEASUREMENT: dict[Any, Reader] = {
     bool: flag,
     "time_s": number,
     "cameras": _cameras,
-    "detections": _detections,
-    "origin_body_m": _vector,
-    "bearing_body": _vector,
-    "covariance": _matrix(3),
-    "ghost": _one_of(_GHOST),
+    "detections": detection_keys,
+    "origin_body_m": vector,
+    "bearing_body": vector,
+    "covariance": matrix(3),
+    "ghost": one_of(_GHOST),
     "ghost_probability": number,
 }
 
 _OF_MIRROR: dict[Any, Reader] = {
     float: number,
     int: integer,
-    "normal_body": _vector,
-    "kind": _one_of(_KINDS),
-    "covariance": _matrix(4),
+    "normal_body": vector,
+    "kind": one_of(_KINDS),
+    "covariance": matrix(4),
 }

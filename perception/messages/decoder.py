@@ -23,7 +23,7 @@ from perception.messages.lattice import (
 )
 from perception.messages.samples import LevelScale, likelihood_of_levels, usable_samples
 from perception.messages.settings import DecoderSettings
-from perception.messages.uart import FRAME_BITS, IDLE_BITS, meaning
+from perception.messages.uart import IDLE_BITS, meaning
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]

@@ -1,7 +1,7 @@
 """Which frames of a recording belong together: those that a robot's cameras took within half a period."""
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from statistics import median
 from typing import Protocol, TypeVar
@@ -34,6 +34,11 @@ class Exposed(Protocol):
 
 
 Frame = TypeVar("Frame", bound=Exposed)
+
+
+def set_time_s(frames: Sequence[Exposed]) -> float:
+    """Return when a set was taken: the mean of the middles of its exposures, of their first rows."""
+    return sum(frame.time_s + 0.5 * frame.exposure_s for frame in frames) / len(frames)
 
 
 def robot_of(camera: str) -> str:

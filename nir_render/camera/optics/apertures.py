@@ -12,6 +12,7 @@ from nir_render.camera.optics.gaussian_fit import BLUR_SIGMAS, LEAST_RADIUS_PX, 
 from nir_render.camera.optics.lens import intrinsics_of
 from nir_render.camera.optics.otf import core_of
 from nir_render.light.enlarge import Enlargement, weights_of
+from nir_render.light.light import Light
 from nir_render.scene.documents.camera import Camera
 
 
@@ -95,3 +96,13 @@ def aperture_weights(
     shape = (len(places), len(enlargement.patch))
     of_patch = coo_array((weight[alone], (number[alone], at[alone])), shape=shape).tocsr()
     return of_blocks, of_patch
+
+
+def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:
+    """Return the apertures of what the direct table shows in the frame: sources, the sun, their ghosts."""
+    table = light.direct
+    shown = (
+        flare_aperture(camera, table.direction[row], float(table.angular_radius_rad[row]))
+        for row in table.shining
+    )
+    return [aperture for aperture in shown if aperture is not None]

@@ -20,7 +20,7 @@ from nir_render.camera.optics.large_disc import Disc, image_of_large_disc
 from nir_render.camera.optics.lens import Intrinsics
 from nir_render.camera.optics.otf import Core
 from nir_render.camera.optics.waves import image_of_points
-from nir_render.geometry import cone_directions, cone_versine
+from nir_render.geometry import cone_directions, cone_versine, legendre
 
 _TAIL_SIGMAS = 8.0
 _WAVES_PER_SIGMA = 0.84
@@ -36,7 +36,7 @@ def cone_nodes(
     Gauss–Legendre in 1 − cos ψ (solid angle is even in it), evenly spaced in azimuth: exact for polynomials
     of degree 2·rings − 1 in the plane.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    nodes, weights = legendre(rings)
     spokes = 4 * rings
     versine = 0.5 * (nodes + 1.0) * cone_versine(angular_radius_rad)
     azimuth_rad = 2.0 * np.pi * (np.arange(spokes) + 0.5) / spokes
@@ -61,6 +61,12 @@ class Window:
         """Add the values to the image, in place."""
         rows, columns = self.values.shape
         image[self.row : self.row + rows, self.column : self.column + columns] += self.values
+
+
+def place_of(window: Window) -> tuple[slice, slice]:
+    """Return the rows and the columns of pixels that a window lies on."""
+    rows, columns = window.values.shape
+    return slice(window.row, window.row + rows), slice(window.column, window.column + columns)
 
 
 def source_window(

@@ -16,6 +16,7 @@ Words = NDArray[np.uint32]
 # From this mean on the expansion holds: it shifts 1.1e-5 of the probability, and less beyond.
 EXPANSION_MEAN = 16.0
 _FEW = 0.25
+_SOME = 0.2
 _RARE = 1.0 - 2.0**-12
 
 
@@ -25,22 +26,44 @@ def normal(words: Words) -> Floats:
     Box and Muller 1958. The largest is 6.7.
     """
     half = len(words) // 2
-    # Words count from 1, so that the logarithm is finite; its float32 keeps the tail's digits.
-    radius = words[:half].astype(np.float32)
-    radius += np.float32(0.5)
-    radius *= np.float32(2.0**-32)
-    np.log(radius, out=radius)
-    radius *= np.float32(-2.0)
-    np.maximum(radius, np.float32(0.0), out=radius)
-    np.sqrt(radius, out=radius)
-    angle = words[half:].astype(np.float32)
-    angle *= np.float32(2.0 * np.pi * 2.0**-32)
+    radius, angle = _radius(words[:half]), _angle(words[half:])
     drawn = np.empty(2 * half, dtype=np.float32)
     np.cos(angle, out=drawn[:half])
     np.sin(angle, out=drawn[half:])
     drawn[:half] *= radius
     drawn[half:] *= radius
     return drawn
+
+
+def some_normal(words: Words, places: NDArray[np.int64]) -> Floats:
+    """Return the variates of `normal` at some places, which increase, to the bit."""
+    half = len(words) // 2
+    first = int(np.searchsorted(places, half))
+    of_pair = places.copy()
+    of_pair[first:] -= half
+    radius, angle = _radius(words[of_pair]), _angle(words[half + of_pair])
+    drawn = np.empty(len(places), dtype=np.float32)
+    np.cos(angle[:first], out=drawn[:first])
+    np.sin(angle[first:], out=drawn[first:])
+    drawn *= radius
+    return drawn
+
+
+def _radius(words: Words) -> Floats:
+    # Words count from 1, so that the logarithm is finite; its float32 keeps the tail's digits.
+    radius = words.astype(np.float32)
+    radius += np.float32(0.5)
+    radius *= np.float32(2.0**-32)
+    np.log(radius, out=radius)
+    radius *= np.float32(-2.0)
+    np.maximum(radius, np.float32(0.0), out=radius)
+    return np.sqrt(radius, out=radius)
+
+
+def _angle(words: Words) -> Floats:
+    angle = words.astype(np.float32)
+    angle *= np.float32(2.0 * np.pi * 2.0**-32)
+    return angle
 
 
 def large_poisson(mean: Floats, z: Floats) -> Floats:
@@ -123,6 +146,12 @@ def poisson(mean: Floats, large: Words, small: Words | None) -> Floats:
     low = mean < EXPANSION_MEAN
     if low.all():
         return small_poisson(mean, small)
+    high = np.flatnonzero(~low)
+    if len(high) < _SOME * len(mean):  # a frame's flares: the others need no normal variates
+        drawn = np.empty(len(mean), dtype=np.float32)
+        drawn[low] = small_poisson(mean[low], small[low])
+        drawn[high] = large_poisson(mean[high], some_normal(large, high))
+        return drawn
     drawn = large_poisson(np.maximum(mean, np.float32(EXPANSION_MEAN)), normal(large)[: len(mean)])
     drawn[low] = small_poisson(mean[low], small[low])
     return drawn

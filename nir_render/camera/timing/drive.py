@@ -30,7 +30,7 @@ def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array
     if drive.square is not None:
         return _of_square(drive.square, start, duration)
     if drive.bits is not None:
-        return _of_bits(drive.bits, start, duration)
+        return np.clip(_of_bits(drive.bits, start, duration), 0.0, 1.0)
     assert drive.constant is not None  # the model admits no fourth form
     return np.full(start.shape, drive.constant)
 

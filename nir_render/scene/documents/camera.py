@@ -21,6 +21,8 @@ from nir_render.scene.documents.files import PresetDocument
 from nir_render.scene.documents.lens import Bandpass, Lens, check_field, check_focus
 from nir_render.scene.documents.point_spread import PointSpread
 from nir_render.scene.documents.sensor import Sensor
+from nir_render.scene.documents.shapes import ShapeDocument
+from nir_render.scene.documents.times.clocks import CameraClock, OdometryNoise
 
 MOST_GAIN = 64.0
 
@@ -124,6 +126,7 @@ class Camera(PresetDocument):
     shutter: Shutter = GlobalShutter()
     position_m: Position = (0.0, 0.0, 0.0)
     orientation: Orientation = Orientation()
+    clock: CameraClock | None = None
     serial: Annotated[str, BeforeValidator(_as_text)] | None = None
 
     @model_validator(mode="after")
@@ -148,9 +151,23 @@ class Camera(PresetDocument):
 
 
 class Rig(PresetDocument):
-    """What a robot carries: sources and cameras, by name."""
+    """What a robot carries: sources and cameras, by name, and its body: shapes in the robot's own axes.
+
+    `odometry` is how well it knows its way; left out, exactly.
+    """
 
     preset_folder: ClassVar[str] = "rigs"
 
     sources: dict[Name, Source] = {}
     cameras: dict[Name, Camera] = {}
+    body: dict[Name, ShapeDocument] = {}
+    odometry: OdometryNoise | None = None
+
+    @model_validator(mode="after")
+    def _bodies_move_with_the_robot(self) -> Self:
+        for name, shape in self.body.items():
+            if shape.moves:
+                raise ValueError(
+                    f"body.{name}: moves with its robot and has no motion of its own; leave it out"
+                )
+        return self

@@ -8,7 +8,6 @@ from nir_render.errors import shown
 from nir_render.scene.documents.base import (
     Angle,
     Direction,
-    Document,
     Length,
     Orientation,
     Position,
@@ -20,10 +19,15 @@ from nir_render.scene.documents.base import (
     usable_direction,
 )
 from nir_render.scene.documents.files import resolve_file
+from nir_render.scene.documents.times.motion import Moving
 
 
-class _Shape(Document):
-    """What all shapes have: the name of a material of the scene, or of a preset."""
+class _Shape(Moving):
+    """What all shapes have: the name of a material of the scene, or of a preset; and how they move.
+
+    What moves is written as it is in a frame that a motion carries: the hinge of a door, the feet of one who
+    walks. Robots' bodies move with their robots.
+    """
 
     material: str
 

@@ -47,17 +47,17 @@ FRACTION = Quantity("fraction", "", "0.8", 1e12)
 EXTINCTION = Quantity("extinction coefficient", "1/m", "0.05 /m", 1e9)
 SPECTRAL_IRRADIANCE = Quantity("spectral irradiance", "W/m**3", "0.305 W/m^2/nm", 1e18)
 VISIBILITY = Quantity("length", "m", "50 m", 1e9)
+SPEED = Quantity("speed", "m/s", "0.1 m/s", 1e6)
 _OTHERS = (
     Quantity("mass", "kg", ""),
     Quantity("illuminance", "lx", ""),
     Quantity("radiant intensity", "W/sr", ""),
     Quantity("irradiance", "W/m**2", ""),
     Quantity("energy", "J", ""),
-    Quantity("speed", "m/s", ""),
 )
 _KNOWN = (
     LENGTH, TIME, FREQUENCY, ANGLE, POWER, TEMPERATURE, LUMINOUS_FLUX, ELECTRONS, COUNTS, SYSTEM_GAIN,
-    DARK_CURRENT, FOCUS_SHIFT, PIXELS, BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, *_OTHERS,
+    DARK_CURRENT, FOCUS_SHIFT, PIXELS, BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, SPEED, *_OTHERS,
 )  # fmt: skip
 
 _NUMBER = re.compile(

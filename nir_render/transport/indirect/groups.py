@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.optics.lens import corner_directions
 from nir_render.light.light import Indirect
+from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.materials import Dielectric, Pane
 from nir_render.scene.documents.shapes import Box
@@ -285,13 +286,14 @@ def _shape_columns(
     first_facet = {name: index for index, name in reversed(list(enumerate(flat.name)))}
     for body, number in numbers:
         columns["light"][number] = light_of_body.get(body, -1)
-        name = body.removeprefix("shape_").rpartition("_")[0]
+        name = mitsuba_scene.shape_name(body.removeprefix("shape_").rpartition("_")[0])
         if not body.startswith("shape_") or name not in snapshot.shapes:
             continue
         shape = snapshot.shapes[name]
         material = snapshot.materials[shape.material]
         box = isinstance(shape, Box)
-        columns["facet"][number] = first_facet.get(f"shapes.{name}.0" if box else f"shapes.{name}", -1)
+        place = place_of_shape(name)
+        columns["facet"][number] = first_facet.get(f"{place}.0" if box else place, -1)
         columns["box"][number] = box
         columns["glass"][number] = isinstance(material, Dielectric)
         columns["pane"][number] = isinstance(material, Pane)

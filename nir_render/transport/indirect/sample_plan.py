@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from nir_render.camera.by_spectrum import group_fluxes
-from nir_render.camera.mean_frame import electron_rates, flare_apertures, fully_lit_frame
-from nir_render.camera.optics.apertures import aperture_weights
+from nir_render.camera.mean_frame import electron_rates, fully_lit_frame
+from nir_render.camera.optics.apertures import aperture_weights, flare_apertures
 from nir_render.camera.render_noise import temporal_variance_e2, variance_by_spectrum
 from nir_render.camera.timing.exposure_control import setting_for
 from nir_render.light.enlarge import Enlargement

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nir_render.geometry import rectangle_frame
+from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.materials import Dielectric, MaterialDocument, Mirror, Pane, Plastic
 from nir_render.scene.documents.shapes import Box, Rectangle, ShapeDocument
 from nir_render.scene.pose import rotation_of
@@ -77,7 +78,7 @@ def facets(snapshot: Snapshot) -> Facets:
         if surface is None:
             continue
         parts = _frames(shape)
-        names += [f"shapes.{name}{suffix}" for suffix in parts]
+        names += [f"{place_of_shape(name)}{suffix}" for suffix in parts]
         frames += parts.values()
         optics += [(*surface, isinstance(shape, Rectangle))] * len(parts)
     return _table(names, frames, optics)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from nir_render.errors import InputError
 from nir_render.geometry import perpendiculars, rectangle_frame
+from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.emitters import Sun
 from nir_render.scene.documents.materials import (
     Dielectric,
@@ -81,7 +82,7 @@ def described(
             continue
         bsdf = _bsdf(material)
         for part, body in enumerate(_bodies(shape)):
-            bodies[f"shape_{name}_{part}"] = {**body, "bsdf": bsdf}
+            bodies[f"shape_{body_id(name)}_{part}"] = {**body, "bsdf": bsdf}
     for index, (name, placed) in enumerate(snapshot.sources.items()):
         centre_m, radius_m = placed.pose.position_m, placed.source.radius_m
         if name in emitting and as_point:
@@ -104,6 +105,16 @@ def described(
     return bodies
 
 
+def body_id(name: str) -> str:
+    """Return the name of a shape as Mitsuba takes it: a dot would lead into a dictionary within."""
+    return name.replace(".", ":")
+
+
+def shape_name(body: str) -> str:
+    """Undo `body_id`."""
+    return body.replace(":", ".")
+
+
 def source_spheres(bodies: Any) -> list[Any]:
     """Return the spheres of the sources of a built scene, in the order of the scene's light groups."""
     spheres = {shape.id(): shape for shape in bodies.shapes() if shape.id().startswith("source_")}
@@ -114,7 +125,7 @@ def check_meshes(snapshot: Snapshot, point_m: NDArray[np.float64], what: str) ->
     """Raise InputError where a point is inside a closed mesh: a ray leaves it an odd number of times."""
     for name, shape in snapshot.shapes.items():
         if isinstance(shape, Mesh) and _crossings(shape, point_m) % 2 == 1:
-            raise InputError(f"{snapshot.origin}: {what} is inside shapes.{name}; move one of them")
+            raise InputError(f"{snapshot.origin}: {what} is inside {place_of_shape(name)}; move one of them")
 
 
 def _crossings(shape: Mesh, point_m: NDArray[np.float64]) -> int:

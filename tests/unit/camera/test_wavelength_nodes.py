@@ -7,7 +7,8 @@ import pytest
 from scipy import constants
 
 import nir_render as nr
-from nir_render.camera.mean_frame import flare_apertures, mean_frame
+from nir_render.camera.mean_frame import mean_frame
+from nir_render.camera.optics.apertures import flare_apertures
 from nir_render.camera.optics.response import response
 from nir_render.camera.render_noise import aperture_variances_e2, render_noise, render_variance_e2
 from nir_render.light.light import DirectTable, Indirect, Light

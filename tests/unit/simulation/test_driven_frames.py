@@ -44,6 +44,7 @@ def base() -> Scene:
             f"{CAMERA}.sensor": {"preset": "mt9m031", **small},
             f"{CAMERA}.filter": None,
             "render.indirect.samples": 16,
+            "robots.r2.motion": [],  # it rests: a flare is drawn in one place
         }
     )
 

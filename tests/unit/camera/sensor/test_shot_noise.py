@@ -11,7 +11,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from nir_render.camera.sensor.shot_noise import EXPANSION_MEAN, large_poisson, normal, poisson, small_poisson
+from nir_render.camera.sensor.shot_noise import (
+    EXPANSION_MEAN,
+    large_poisson,
+    normal,
+    poisson,
+    small_poisson,
+    some_normal,
+)
 from nir_render.randomness import RandomKey
 
 DRAWS = 2_000_000
@@ -129,3 +136,27 @@ def test_small_means_by_adding_up_probabilities() -> None:
     words = np.array([0.3678, 0.3680, 0.7357, 0.7359, 0.9196, 0.9198, 0.999999999]) * 2.0**32
     counts = small_poisson(np.ones(len(words), dtype=np.float32), words.astype(np.uint32))
     assert counts.tolist() == [0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 11.0]
+
+
+def test_normal_variates_at_some_places_are_those_of_all() -> None:
+    """To the bit, from both halves of the pairs; an odd number of pixels too, whose last word is of no pixel."""
+    words = RandomKey(1, "test", "c", 0).words("n", 0, 1000)
+    for places in (
+        np.arange(0, 999, 7),
+        np.array([3, 499]),
+        np.array([500, 998]),
+        np.array([], dtype=np.int64),
+    ):
+        np.testing.assert_array_equal(some_normal(words, places), normal(words)[places])
+
+
+@pytest.mark.parametrize("share", [0.01, 0.6])
+def test_few_bright_pixels_are_drawn_as_many_are(share: float) -> None:
+    """A pixel's electrons do not depend on how many others of its block are bright."""
+    key, count = RandomKey(2, "test", "c", 0), 10_001
+    bright = np.random.default_rng(1).random(count) < share
+    mean = np.where(bright, 300.0, 2.0).astype(np.float32)
+    large, small = key.words("a", 0, count + 1), key.words("b", 0, count)
+    drawn = poisson(mean, large, small)
+    np.testing.assert_array_equal(drawn[bright], large_poisson(mean, normal(large)[:count])[bright])
+    np.testing.assert_array_equal(drawn[~bright], small_poisson(np.full_like(mean, 2.0), small)[~bright])

@@ -1,0 +1,89 @@
+"""Where robots are at each frame, and where they take themselves to be: dead reckoning with its errors."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.randomness import generator
+from nir_render.scene.documents.times.clocks import OdometryNoise
+from nir_render.scene.motion import robot_pose, robot_velocity
+from nir_render.scene.scene import Scene
+from perception.types import Odometry
+
+Array = NDArray[np.float64]
+
+
+def observers_astir(scene: Scene) -> list[str]:
+    """Return the robots that take frames and have odometry: those that move, or may believe they do."""
+    names = dict.fromkeys(name.partition(".")[0] for name in scene.cameras())
+    robots = scene.document.robots
+    return [name for name in names if robots[name].moves or robots[name].rig.odometry is not None]
+
+
+def pose_times_s(scene: Scene) -> Array:
+    """Return when poses are told of: at each frame of the scene's clock, and one period after the last."""
+    times_s = scene.document.frame_times_s()
+    return np.array([*times_s, times_s[-1] + 1.0 / scene.document.clock.frame_rate_hz])
+
+
+def pose_records(scene: Scene) -> Iterator[dict[str, Any]]:
+    """Yield the true pose and velocity of every robot in the world, by time: lines of `poses.jsonl`."""
+    from scipy.spatial.transform import Rotation
+
+    for time_s in pose_times_s(scene):
+        for name, robot in scene.document.robots.items():
+            pose, velocity = robot_pose(robot, float(time_s)), robot_velocity(robot, float(time_s))
+            still = np.zeros(3)
+            yield {
+                "format": 1,
+                "robot": name,
+                "time_s": float(time_s),
+                "position_m": pose.position_m.tolist(),
+                "quaternion_xyzw": Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist(),
+                "velocity_m_per_s": (still if velocity is None else velocity.linear_m_per_s).tolist(),
+                "angular_velocity_rad_per_s": (
+                    still if velocity is None else velocity.angular_rad_per_s
+                ).tolist(),
+            }
+
+
+def odometry_of(scene: Scene, robot: str, seed: int) -> list[Odometry]:
+    """Return what a robot knows of its own way, in a frame that is its body's axes at the first time.
+
+    Each step is the true one, in the axes that the robot takes itself to have, and a normal error of the walk
+    times the root of its time on top, per axis: a heading that is off bends what follows. Errors of each
+    record by itself are laid over it and do not add up. All are in body axes, keyed by seed, robot and step.
+    """
+    from scipy.spatial.transform import Rotation
+
+    known = scene.document.robots[robot]
+    noise = known.rig.odometry or OdometryNoise()
+    times_s = pose_times_s(scene)
+    poses = [robot_pose(known, float(time_s)) for time_s in times_s]
+    position_m, rotation = np.zeros(3), np.eye(3)
+    records = []
+    for index, (time_s, pose) in enumerate(zip(times_s, poses, strict=True)):
+        random = generator(seed, "odometry", robot, index)
+        walked, turned, shaken, tilted = random.standard_normal((4, 3))
+        if index:
+            before, root_s = poses[index - 1], float(np.sqrt(time_s - times_s[index - 1]))
+            step_m = before.rotation.T @ (pose.position_m - before.position_m)
+            position_m = position_m + rotation @ (step_m + noise.position_walk_m * root_s * walked)
+            turn = Rotation.from_rotvec(noise.rotation_walk_rad * root_s * turned).as_matrix()
+            rotation = rotation @ before.rotation.T @ pose.rotation @ turn
+        tilt = Rotation.from_rotvec(noise.rotation_noise_rad * tilted).as_matrix()
+        records.append(
+            Odometry(
+                robot=robot,
+                time_s=float(time_s),
+                position_m=position_m + rotation @ (noise.position_noise_m * shaken),
+                rotation=rotation @ tilt,
+                position_sigma_m=noise.position_noise_m,
+                rotation_sigma_rad=noise.rotation_noise_rad,
+                position_walk_m_per_sqrt_s=noise.position_walk_m,
+                rotation_walk_rad_per_sqrt_s=noise.rotation_walk_rad,
+            )
+        )
+    return records

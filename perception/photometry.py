@@ -1,0 +1,237 @@
+"""How bright a tracked source is in a frame, dark or lit: measured where it is predicted.
+
+A source that was found is as bright as its detection says. One that was not may be dark, and how dark is a
+measurement too: the flux of an image of known place and shape, by weighted least squares, beside a level
+background and the images of all flares found near it, at their places, with fluxes fitted anew.
+Where a neighbour's image cannot be told from its own the standard deviation says so by itself.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.bearing import pixel_turn
+from perception.model.flare import PixelBox, flare_image, has_image, image_radius_px
+from perception.model.lens import project
+from perception.model.ranging import angular_radius_rad, exposure_towards
+from perception.model.sensor import gain_dn_per_e, noise_floor_e2, saturation_dn
+from perception.types import Calibration, Detection, RawFrame
+
+Array = NDArray[np.float64]
+
+OWN_ERROR = 0.02
+"""A lit level is never known better than this: pixels differ, patterns are uneven, ranges are predicted."""
+
+BLURRED_MOST = 3.0
+"""At a place less certain than this many times the image's own width it counts whether a flare was found."""
+
+SURE_SNR = 12.0
+"""A lit source whose flux is this many times its noise is found."""
+
+_MISSED, _MOST_MISSED, _MERGE = 3e-4, 0.2, 3.0
+
+_REACH = 4.0
+"""Half a window, in standard deviations of the image, and what counts as a neighbour beyond its edge."""
+
+_LARGEST_PX, _RESOLVED_PX = 40.0, 0.5
+_LEAST_PIXELS = 9
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Brightness of one source in one frame, as in `Signal`."""
+
+    time_s: float
+    exposure_s: float
+    level: float
+    sigma_dark: float
+    sigma_lit: float
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Where a source must be in a frame, and how bright if it is lit.
+
+    Attributes
+    ----------
+    u_px, v_px
+        Its place.
+    sigma_px
+        Standard deviation of the place, the larger half axis.
+    range_m
+        From the lens.
+    flux_dn
+        Background-subtracted integral if it is lit throughout.
+    """
+
+    u_px: float
+    v_px: float
+    sigma_px: float
+    range_m: float
+    flux_dn: float
+
+
+def expected_image(
+    position_body_m: Array, covariance_m2: Array, frame: RawFrame, calibration: Calibration
+) -> Expected | None:
+    """Return where a source must be in a frame, by its predicted place; None where it is out of view.
+
+    Parameters
+    ----------
+    position_body_m, covariance_m2
+        Where it is predicted at the frame's time, in body axes, shape (3,), and how well, shape (3, 3).
+
+    Notes
+    -----
+    In fog it is dimmed by what the calibration says of the extinction.
+    """
+    towards_m = calibration.rotation_body_camera.T @ (position_body_m - calibration.position_body_m)
+    range_m = float(np.linalg.norm(towards_m))
+    if not towards_m[2] > 0.0:
+        return None
+    u_px, v_px = project(towards_m[None, :], calibration)[0].tolist()
+    inside = -0.5 <= u_px < calibration.width_px - 0.5 and -0.5 <= v_px < calibration.height_px - 0.5
+    if not inside:
+        return None
+    exposed_s = float(exposure_towards(towards_m / range_m, frame.exposure_s, frame.gain, calibration))
+    flux_dn = calibration.range_constant_dn_m2_per_s * exposed_s / range_m**2
+    flux_dn *= math.exp(-calibration.extinction_per_m * range_m)
+    if not flux_dn > 0.0:
+        return None
+    turn = pixel_turn([[u_px, v_px]], calibration)[0]
+    axes = turn / (turn**2).sum(axis=1, keepdims=True) / range_m
+    of_camera = calibration.rotation_body_camera.T @ covariance_m2 @ calibration.rotation_body_camera
+    place_px2 = axes @ of_camera @ axes.T
+    sigma_px = math.sqrt(max(float(np.linalg.eigvalsh(place_px2)[-1]), 0.0))
+    return Expected(u_px, v_px, sigma_px, range_m, flux_dn)
+
+
+def sample_of_detection(
+    hit: Detection, expected: Expected, frame: RawFrame, calibration: Calibration
+) -> Sample:
+    """Return the brightness of a source that was found."""
+    level = hit.flux_dn / expected.flux_dn
+    sigma = hit.flux_sigma_dn / expected.flux_dn
+    if not (math.isfinite(sigma) and math.isfinite(level)):
+        # Lit it is, for it was found; how brightly is not said.
+        level, sigma = (max(level, 1.0) if math.isfinite(level) else 1.0), 0.3
+    shot = math.sqrt(gain_dn_per_e(frame, calibration) * max(hit.flux_dn, 0.0)) / expected.flux_dn
+    dark = math.sqrt(max(sigma**2 - shot**2, 0.04 * sigma**2))
+    return _sample(level, dark, expected, frame, calibration)
+
+
+def sample_at(
+    expected: Expected,
+    found: Sequence[Detection],
+    frame: RawFrame,
+    calibration: Calibration,
+    claimed: Sequence[bool] | None = None,
+) -> Sample | None:
+    """Return the brightness at the place where a source is expected but was not found.
+
+    Parameters
+    ----------
+    found
+        All detections in the frame: none of them is taken for the source.
+    claimed
+        Which of them are known to be others'; by default none is.
+
+    Returns
+    -------
+    None where nothing can be said: a flare lies upon the place, or may be the source after all; pixels are
+    clipped; the place is too uncertain and the source too faint for its absence to say that it is dark.
+    """
+    disc_rad = float(angular_radius_rad(expected.range_m, calibration.source_radius_m))
+    width_px = _width_px(expected.u_px, expected.v_px, disc_rad, calibration)
+    if width_px > _LARGEST_PX:
+        return None
+    gain = gain_dn_per_e(frame, calibration)
+    floor_e2 = noise_floor_e2(calibration, frame.gain)
+    lit_e = expected.flux_dn / gain
+    if expected.sigma_px > BLURRED_MOST * width_px:
+        snr = lit_e / math.sqrt(lit_e + 4.0 * math.pi * width_px**2 * floor_e2)
+        missed = _chance_missed(expected, width_px, found, claimed or [False] * len(found))
+        if snr < SURE_SNR or missed > _MOST_MISSED:
+            return None
+        return _sample(0.0, 1.0 / math.sqrt(-2.0 * math.log(missed)), expected, frame, calibration)
+    blurred_px = math.hypot(width_px, expected.sigma_px)
+    # Images so close differ by their shapes alone, and places are not known as well as that.
+    if any(
+        math.hypot(hit.u_px - expected.u_px, hit.v_px - expected.v_px) < 1.5 * blurred_px for hit in found
+    ):
+        return None
+    half_px = _REACH * blurred_px + 1.0
+    window = PixelBox.around(expected.u_px, expected.v_px, half_px, calibration)
+    counts = frame.data_dn[window.slices]
+    if counts.size < _LEAST_PIXELS or (counts >= saturation_dn(calibration, frame.gain)).any():
+        return None
+    # The image of a source whose place is not known well is its mean over where it may be.
+    shapes = [_gaussian(expected.u_px, expected.v_px, blurred_px, window)]
+    for hit in found:
+        hit_rad = float(angular_radius_rad(max(hit.range_m, 0.01), calibration.source_radius_m))
+        hit_rad = hit_rad if math.isfinite(hit_rad) else 0.0
+        hit_px = _width_px(hit.u_px, hit.v_px, hit_rad, calibration)
+        if max(abs(hit.u_px - expected.u_px), abs(hit.v_px - expected.v_px)) < half_px + _REACH * hit_px:
+            resolved = hit_rad * calibration.fx_px > _RESOLVED_PX
+            if resolved and has_image(hit.u_px, hit.v_px, hit_rad, calibration):
+                shapes.append(flare_image(hit.u_px, hit.v_px, hit_rad, window, calibration).fraction)
+            else:
+                shapes.append(_gaussian(hit.u_px, hit.v_px, hit_px, window))
+    columns = np.column_stack([shape.ravel() for shape in [*shapes, np.ones(counts.shape)]])
+    image_e = (counts.ravel() - frame.black_level_dn) / gain
+    # Weights by single pixels would favour those that are low by chance: an even ground has its mean's.
+    level_e2 = max(float(np.median(image_e)), 0.0) + floor_e2
+    variance_e2 = np.maximum(image_e + floor_e2, level_e2) if len(shapes) > 1 else level_e2
+    weighted = (columns.T / variance_e2).T
+    try:
+        covariance = np.linalg.inv(columns.T @ weighted)
+    except np.linalg.LinAlgError:
+        return None
+    flux_e = float((covariance @ (weighted.T @ image_e))[0])
+    sigma_e = math.sqrt(max(float(covariance[0, 0]), 0.0))
+    if not 0.0 < sigma_e < lit_e:
+        return None
+    return _sample(flux_e / lit_e, sigma_e / lit_e, expected, frame, calibration)
+
+
+def _chance_missed(
+    expected: Expected, width_px: float, found: Sequence[Detection], claimed: Sequence[bool]
+) -> float:
+    """Return how probable it is that a lit source goes unseen: it may stand upon another, or be the other."""
+    missed = _MISSED
+    for hit, others in zip(found, claimed, strict=True):
+        off_px = math.hypot(hit.u_px - expected.u_px, hit.v_px - expected.v_px)
+        if not others and off_px < _REACH * (expected.sigma_px + width_px):
+            return 1.0
+        upon = (_MERGE * width_px / expected.sigma_px) ** 2
+        missed += (
+            0.5 * upon * math.exp(-0.5 * (max(off_px - _MERGE * width_px, 0.0) / expected.sigma_px) ** 2)
+        )
+    return missed
+
+
+def _sample(
+    level: float, sigma_dark: float, expected: Expected, frame: RawFrame, calibration: Calibration
+) -> Sample:
+    shot2 = gain_dn_per_e(frame, calibration) / expected.flux_dn
+    lit = math.sqrt(sigma_dark**2 + shot2 + OWN_ERROR**2)
+    middle_s = frame.time_s + 0.5 * frame.exposure_s + frame.line_time_s * expected.v_px
+    return Sample(middle_s, frame.exposure_s, level, sigma_dark, lit)
+
+
+def _width_px(u_px: float, v_px: float, disc_rad: float, calibration: Calibration) -> float:
+    """Return the standard deviation of a source's image, the pixel's own aperture left out."""
+    radius_px = float(image_radius_px(u_px, v_px, disc_rad, calibration)) if disc_rad > 0.0 else 0.0
+    return math.hypot(calibration.psf_sigma_px, 0.5 * radius_px)
+
+
+def _gaussian(u_px: float, v_px: float, sigma_px: float, window: PixelBox) -> Array:
+    """Return the share of a Gaussian in each pixel of a window."""
+    from scipy.special import ndtr
+
+    across = np.diff(ndtr((np.arange(window.width + 1) - 0.5 + window.left - u_px) / sigma_px))
+    down = np.diff(ndtr((np.arange(window.height + 1) - 0.5 + window.top - v_px) / sigma_px))
+    return np.asarray(down[:, None] * across)

@@ -1,0 +1,257 @@
+"""The whole stack, fed as it goes: a set of frames in, who is where and who says what out.
+
+    pipeline = perception.Pipeline(calibrations)
+    for frames, odometry in sets:                # what a robot's cameras took within half a period
+        heard = pipeline.push(frames, odometry)
+        heard.tracks, heard.messages
+
+Frames become detections (an estimator), these measurements (`rig`), these tracks (`track`); each track's
+brightness is measured in every frame, dark or lit (`photometry`), and read (`messages`).
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from perception.estimators import Estimator, detect_frames
+from perception.messages.decoder import Decoder
+from perception.photometry import Sample, expected_image, sample_at, sample_of_detection
+from perception.rig.frame_sets import robot_of, set_time_s
+from perception.rig.measure_set import measure_set
+from perception.track.settings import TrackerSettings
+from perception.track.tracker import Tracker
+from perception.types import (
+    Calibration,
+    Detection,
+    Measurement,
+    Message,
+    Odometry,
+    RawFrame,
+    SetMeasurements,
+    Signal,
+    Track,
+)
+
+_AS_THE_PAPER = TrackerSettings(filter="paper", association="paper", overlap="paper")
+
+_AT_ONCE_S = 1e-3
+"""Frames are of one time if they are no further apart."""
+
+
+class Follows(Protocol):
+    """What makes tracks of measurements: `Tracker`, or one's own."""
+
+    def update(
+        self, time_s: float, measurements: Sequence[Measurement], odometry: Sequence[Odometry]
+    ) -> tuple[Track, ...]:
+        """Take the measurements of a set; return the tracks at its time."""
+
+    def predicted(self, time_s: float, odometry: Sequence[Odometry]) -> tuple[Track, ...]:
+        """Return the tracks at another time, by what is known so far."""
+
+
+class Reads(Protocol):
+    """What makes messages of one track's signal: `Decoder`, or one's own."""
+
+    def push(self, signal: Signal) -> Iterable[Message]:
+        """Take further samples; return the messages that are complete."""
+
+    def finish(self) -> Iterable[Message]:
+        """Return what can be said of the rest, as no more will come."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What a set of frames says, and all before it: measurements, tracks, messages that it completed."""
+
+    time_s: float
+    measurements: SetMeasurements
+    tracks: tuple[Track, ...]
+    messages: tuple[Message, ...]
+
+
+class Pipeline:
+    """The stack of one robot, with what it remembers.
+
+    Parameters
+    ----------
+    calibrations
+        Of each camera, by its name.
+    estimator
+        As for `detect`.
+    tracker
+        What follows; by default a `Tracker` as it comes.
+    decoder
+        Makes what reads one track, of the observer's name and the track's number; by default `Decoder`.
+    """
+
+    def __init__(
+        self,
+        calibrations: Mapping[str, Calibration],
+        estimator: str | Estimator = "robust",
+        tracker: Follows | None = None,
+        decoder: Callable[[str, int], Reads] = Decoder,
+    ) -> None:
+        self._calibrations = calibrations
+        self._estimator = estimator
+        self._tracker: Follows = Tracker() if tracker is None else tracker
+        self._decoder = decoder
+        self._readers: dict[int, Reads] = {}
+        self._latest_s = -math.inf
+        self._robot: str | None = None
+        self._samples: dict[int, list[Sample]] = {}
+
+    @staticmethod
+    def of(
+        name: str,
+        calibrations: Mapping[str, Calibration],
+        tracker: Follows | None = None,
+        decoder: Callable[[str, int], Reads] | None = None,
+    ) -> "Pipeline":
+        """Return the stack that goes with an estimator: the paper's own parts where it is `paper`.
+
+        `tracker` and `decoder` take the place of those that belong to it.
+        """
+        paper = name == "paper"
+        if tracker is None:
+            tracker = Tracker(_AS_THE_PAPER if paper else None)
+        return Pipeline(calibrations, "paper" if paper else "robust", tracker, decoder or Decoder)
+
+    def push(self, frames: Sequence[RawFrame], odometry: Sequence[Odometry] = ()) -> Heard:
+        """Take the next set of frames.
+
+        Parameters
+        ----------
+        frames
+            What the robot's cameras took within half a period (`frame_sets`).
+        odometry
+            What it knows of its own motion, from before the last set on to now or beyond; without any it
+            stands still.
+
+        Raises
+        ------
+        ValueError
+            There are no frames, or those of another robot than before; as for `detect`.
+        """
+        return self.follow(frames, detect_frames(frames, self._calibrations, self._estimator), odometry)
+
+    def follow(
+        self,
+        frames: Sequence[RawFrame],
+        detections: Sequence[Sequence[Detection]],
+        odometry: Sequence[Odometry] = (),
+    ) -> Heard:
+        """As `push`, from detections of each frame that were made elsewhere.
+
+        Raises
+        ------
+        ValueError
+            As for `push`.
+        """
+        robots = {robot_of(frame.camera) for frame in frames} | {self._robot or ""} - {""}
+        if not frames or len(robots) != 1:
+            raise ValueError(
+                f"a pipeline follows one robot, not {', '.join(sorted(robots)) or 'none'}: give it "
+                "the frames of one set of one robot"
+            )
+        (self._robot,) = robots
+        seen = measure_set(frames, detections, self._calibrations)
+        time_s = set_time_s(frames)
+        tracks = self._tracker.update(time_s, seen.measurements, odometry)
+        messages = self._listen(time_s, frames, seen.detections, tracks, odometry)
+        return Heard(time_s, seen, tracks, messages)
+
+    def finish(self) -> tuple[Message, ...]:
+        """Return the messages that can be told as no more frames will come."""
+        said = [message for reader in self._readers.values() for message in reader.finish()]
+        self._readers.clear()
+        return tuple(said)
+
+    def signals(self) -> tuple[Signal, ...]:
+        """Return how bright every track was so far."""
+        return tuple(self._signal(track, samples) for track, samples in self._samples.items() if samples)
+
+    def _listen(
+        self,
+        time_s: float,
+        frames: Sequence[RawFrame],
+        detections: Sequence[Sequence[Detection]],
+        tracks: Sequence[Track],
+        odometry: Sequence[Odometry],
+    ) -> tuple[Message, ...]:
+        """Measure the brightness of each track in a set, and read on."""
+        said: list[Message] = []
+        for number in set(self._readers) - {track.track for track in tracks}:
+            said += self._readers.pop(number).finish()
+        if time_s <= self._latest_s:  # what comes late is followed, if the tracker can, but not read
+            return tuple(said)
+        self._latest_s = time_s
+        by_key = {
+            (hit.camera, hit.index, number): hit for found in detections for number, hit in enumerate(found)
+        }
+        fed = Counter(key for track in tracks for key in track.detections)
+        places = [self._at(frame, time_s, tracks, odometry) for frame in frames]
+        for track in tracks:
+            samples = [
+                self._sample(track, there.get(track.track, track), frame, found, by_key, fed)
+                for there, frame, found in zip(places, frames, detections, strict=True)
+            ]
+            known = [sample for sample in samples if sample is not None]
+            if not known:
+                continue
+            best = min(known, key=lambda sample: sample.sigma_lit)
+            kept = self._samples.setdefault(track.track, [])
+            if kept and best.time_s <= kept[-1].time_s:
+                continue
+            kept.append(best)
+            if track.ghost == "yes":  # it says what its robot says
+                continue
+            if track.track not in self._readers:
+                self._readers[track.track] = self._decoder(track.robot, track.track)
+            reader = self._readers[track.track]
+            said += reader.push(self._signal(track.track, [best]))
+        return tuple(said)
+
+    def _at(
+        self, frame: RawFrame, time_s: float, tracks: Sequence[Track], odometry: Sequence[Odometry]
+    ) -> dict[int, Track]:
+        """Return where tracks are in the middle of a frame, by number; none where that is the set's time."""
+        middle_s = frame.time_s + 0.5 * (
+            frame.exposure_s + frame.line_time_s * (self._calibrations[frame.camera].height_px - 1)
+        )
+        if not tracks or abs(middle_s - time_s) < _AT_ONCE_S:
+            return {}
+        return {track.track: track for track in self._tracker.predicted(middle_s, odometry)}
+
+    def _sample(
+        self,
+        track: Track,
+        there: Track,
+        frame: RawFrame,
+        found: Sequence[Detection],
+        by_key: Mapping[tuple[str, int, int], Detection],
+        fed: Mapping[tuple[str, int, int], int],
+    ) -> Sample | None:
+        """Return the brightness of a track, which is `there` in a frame; None where nothing is known."""
+        calibration = self._calibrations[frame.camera]
+        expected = expected_image(there.position_body_m, there.covariance[:3, :3], frame, calibration)
+        if expected is None:
+            return None
+        own = [key for key in track.detections if key[:2] == (frame.camera, frame.index)]
+        if own:
+            hit = by_key.get(own[0])
+            if hit is None or hit.merged or fed[own[0]] > 1:
+                return None
+            return sample_of_detection(hit, expected, frame, calibration)
+        claimed = [(frame.camera, frame.index, number) in fed for number in range(len(found))]
+        return sample_at(expected, found, frame, calibration, claimed)
+
+    def _signal(self, track: int, samples: Sequence[Sample]) -> Signal:
+        columns = np.array(
+            [[one.time_s, one.exposure_s, one.level, one.sigma_dark, one.sigma_lit] for one in samples]
+        ).reshape(-1, 5)
+        return Signal(self._robot or "", track, *columns.T)
