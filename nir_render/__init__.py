@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nir_render.errors import InputError
     from nir_render.light.light import DirectTable, Indirect, Light
-    from nir_render.scene.documents.emitters import Drive
+    from nir_render.scene.documents.times.drives import Drive
     from nir_render.scene.load import load_scene
     from nir_render.scene.pose import Pose
     from nir_render.scene.scene import Scene, parse_scene

@@ -35,7 +35,7 @@ from nir_render.geometry import sunflower
 from nir_render.light.enlarge import enlarge
 from nir_render.light.light import Indirect, Light
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.documents.emitters import FULL_DRIVE, Drive
+from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
 from nir_render.scene.emission import Emitter
 from nir_render.scene.snapshot import Snapshot
 

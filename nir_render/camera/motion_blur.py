@@ -25,7 +25,7 @@ from nir_render.camera.timing.shutter import on_fractions, row_profile, row_star
 from nir_render.geometry import legendre, sunflower
 from nir_render.light.light import DirectTable
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.documents.emitters import Drive
+from nir_render.scene.documents.times.drives import Drive
 from nir_render.scene.motion import Velocity
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot

@@ -32,6 +32,7 @@ from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Begun, Shot, simulate
 from nir_render.simulation.frame_times import frame_times
 from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
+from nir_render.simulation.sent import sent_packets
 from nir_render.transport.cache import LightCache
 from nir_render.transport.cache_key import digest as digest_of
 from nir_render.transport.fingerprint import code_hash, matching
@@ -114,7 +115,7 @@ def _digest(scene: Scene, keep_light: bool) -> str:
 
 
 def _write_motion(scene: Scene, folder: Path) -> None:
-    """Write where robots were, and what those that take frames believe of it, where anything moves."""
+    """Write where robots were and believe they were, where anything moves, and what was sent."""
     if any(robot.moves for robot in scene.document.robots.values()):
         run_folder.write_lines(folder / run_folder.POSES, pose_records(scene))
     believed = [
@@ -122,6 +123,8 @@ def _write_motion(scene: Scene, folder: Path) -> None:
     ]
     if believed:
         run_folder.write_lines(folder / ODOMETRY, map(odometry_record, believed))
+    if sent := sent_packets(scene):
+        run_folder.write_lines(folder / run_folder.SENT, [packet.record() for packet in sent])
 
 
 def calibrations_of(scene: Scene, progress: Progress = lambda *_: None) -> list[Calibration]:

@@ -19,10 +19,11 @@ from nir_render.errors import InputError, shown
 from nir_render.scene.bodies import body_shapes
 from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import RenderSettings, reflects_or_scatters
-from nir_render.scene.documents.emitters import Drive, Lamp, Source, Sun
+from nir_render.scene.documents.emitters import Lamp, Source, Sun
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import MaterialDocument
 from nir_render.scene.documents.shapes import ShapeDocument
+from nir_render.scene.documents.times.drives import Drive
 from nir_render.scene.emission import Emitter
 from nir_render.scene.explain import explain
 from nir_render.scene.motion import Velocity

@@ -25,7 +25,8 @@ from nir_render.camera.optics.otf import core_of
 from nir_render.camera.optics.response import Response, response
 from nir_render.scene.documents.base import Orientation
 from nir_render.scene.documents.camera import Camera, GlobalShutter
-from nir_render.scene.documents.emitters import FULL_DRIVE, Source
+from nir_render.scene.documents.emitters import Source
+from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.backend.user_cache import cache_file, read_answers, write_answers

@@ -27,8 +27,9 @@ from pydantic import BaseModel
 
 from nir_render.camera.optics.lens import corner_directions
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.documents.emitters import FULL_DRIVE, Sun
+from nir_render.scene.documents.emitters import Sun
 from nir_render.scene.documents.shapes import Mesh, ShapeDocument
+from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import PlacedCamera, Snapshot

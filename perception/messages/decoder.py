@@ -9,6 +9,7 @@ given out.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from perception.messages.uart import IDLE_BITS, meaning
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 Numbers = NDArray[np.int64]
 
 _BLOCK = 3 * STEPS_PER_BIT  # steps that are taken in at once
@@ -181,7 +183,7 @@ class Decoder:
         first = self._complete - _BLOCK - self._clocks.longest
         return float(np.maximum(self._table[0, first:], 0.0).sum()) > _WORTH_ASKING
 
-    def _note_best(self, words: Array, before: Array, starts: Numbers, rates: Numbers) -> None:
+    def _note_best(self, words: Floats, before: Array, starts: Numbers, rates: Numbers) -> None:
         """Keep the best packet that may have been sent, unless a better one takes its place."""
         tops = words.max(axis=1, initial=-np.inf)
         worthy = (tops > _WORTH_ASKING) & (starts + self._done + _MARGIN >= self._spoken_until)
@@ -279,7 +281,7 @@ def decode(signal: Signal, settings: DecoderSettings | None = None) -> tuple[Mes
     return decoder.push(signal) + decoder.finish()
 
 
-def _log_sum(logs: Array) -> Array:
+def _log_sum(logs: Floats) -> Array:
     """Return the logarithm of the sum over the last axis."""
     if not logs.shape[-1]:
         return np.full(logs.shape[:-1], -np.inf)

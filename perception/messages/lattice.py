@@ -30,7 +30,7 @@ _HOPELESS = 6.0
 class Clocks:
     """The clock rates that senders may have, and where the edges of their packets lie, in steps.
 
-    `drifts` are shares, shape (r,); `edges` the steps from a packet's start to each edge, shape (r, bits + 1).
+    `drifts` are shares, shape (r,); `edges` the steps from a start to each edge, shape (r, bits + 1).
     """
 
     def __init__(self, settings: DecoderSettings) -> None:
@@ -128,7 +128,8 @@ class Lattice:
 
     def garbage(self, starts: Numbers, rates: Numbers) -> Array:
         """Return the score of a stretch as long as a packet in which anything goes, shape (n,)."""
-        return self._garbage.take(starts + self._clocks.lengths[rates]) - self._garbage.take(starts)
+        ends = starts + self._clocks.lengths[rates]
+        return np.asarray(self._garbage.take(ends) - self._garbage.take(starts))
 
     def frames_seen(self, start: int, rate: int) -> NDArray[np.bool_]:
         """Return of which repeats each bit was seen, shape (repeats,)."""

@@ -3,8 +3,10 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nir_render.scene.documents.emitters import FULL_DRIVE, BitString, Drive, SquareWave, Sun
+from nir_render.scene.documents.emitters import Sun
+from nir_render.scene.documents.times.drives import FULL_DRIVE, BitString, Drive, Packets, SquareWave
 from nir_render.scene.emission import Emitter
+from perception.messages.uart import encode
 
 Array = NDArray[np.float64]
 
@@ -31,7 +33,9 @@ def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array
         return _of_square(drive.square, start, duration)
     if drive.bits is not None:
         return np.clip(_of_bits(drive.bits, start, duration), 0.0, 1.0)
-    assert drive.constant is not None  # the model admits no fourth form
+    if drive.packets is not None:
+        return _of_packets(drive.packets, start, duration)
+    assert drive.constant is not None  # the model admits no fifth form
     return np.full(start.shape, drive.constant)
 
 
@@ -71,6 +75,27 @@ def _of_bits(bits: BitString, start_s: Array, duration_s: Array) -> Array:
     summed = level(first) * (1.0 - begin) + total(first + further) - total(first + 1.0)
     summed += level(first + further) * rest
     return np.divide(summed, length, out=level(first), where=further > 0.0)
+
+
+def _of_packets(packets: Packets, start_s: Array, duration_s: Array) -> Array:
+    """Return the mean: what is left of the first bit, whole bits, a part of the last; lit between packets."""
+    edges_s, levels = [], [np.array([1.0])]
+    for at_s, word in packets.starts_s:
+        bits = encode(word)
+        edges_s.append(at_s + packets.bit_s * np.arange(len(bits) + 1))
+        levels += [bits.astype(float), np.array([1.0])]
+    edge_s, level = np.concatenate(edges_s), np.concatenate(levels)
+    sums_s = np.concatenate([[0.0], np.cumsum(level[1:-1] * np.diff(edge_s))])  # of light, up to each edge
+    end_s = start_s + duration_s
+    first = np.searchsorted(edge_s, start_s, side="right")
+    last = np.maximum(np.searchsorted(edge_s, end_s, side="left"), first)
+    within = first == last
+    final = np.maximum(last - 1, 0)
+    opened = np.minimum(first, len(edge_s) - 1)
+    lit_s = level[first] * (edge_s[opened] - start_s) + (sums_s[final] - sums_s[opened])
+    lit_s += level[last] * (end_s - edge_s[final])
+    mean = np.divide(lit_s, duration_s, out=level[first], where=~within)
+    return np.asarray(np.clip(mean, 0.0, 1.0))
 
 
 def _whole_and_part(number: Array) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.timing.drive import mean_level
 from nir_render.scene.documents.camera import Camera, RollingShutter
-from nir_render.scene.documents.emitters import Drive
+from nir_render.scene.documents.times.drives import Drive
 
 Array = NDArray[np.float64]
 

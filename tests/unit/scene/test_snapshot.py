@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import nir_render as nr
-from nir_render.scene.documents.emitters import Drive
+from nir_render.scene.documents.times.drives import Drive
 from tests.paths import SCENES
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from nir_render.camera.timing.drive import drive_of, mean_level
-from nir_render.scene.documents.emitters import Drive, Sun
+from nir_render.scene.documents.emitters import Sun
+from nir_render.scene.documents.times.drives import Drive
+from perception.messages.uart import encode
 
 BITS = {"pattern": "0101101111", "rate": "10 Hz", "start": "50 ms"}
 DRIVES: list[dict[str, Any]] = [
@@ -19,6 +21,15 @@ DRIVES: list[dict[str, Any]] = [
     {"bits": BITS},
     {"bits": {**BITS, "idle": 0.25, "repeat": 3}},
     {"bits": {"pattern": "00101", "rate": "997 Hz", "repeat": "forever", "idle": 0}},
+    {"packets": {"sends": [{"at": "-0.4 s", "text": "a~"}], "rate": "80 Hz"}},
+    {
+        "packets": {
+            "sends": [{"at": "2 s", "command": "hold"}, {"at": "0 s", "word": 77}],
+            "rate": "30 Hz",
+            "offset": "13 ms",
+            "drift": "-1.3 %",
+        }
+    },
 ]
 
 
@@ -29,6 +40,13 @@ def _exactly(drive: Drive, time: Fraction) -> Fraction:
         frequency, duty = Fraction(square.frequency_hz), Fraction(square.duty)
         periods = (time - Fraction(square.phase_s)) * frequency
         return (math.floor(periods) * duty + min(periods - math.floor(periods), duty)) / frequency
+    if drive.packets is not None:
+        dark, bit = Fraction(0), Fraction(drive.packets.bit_s)
+        for start_s, word in drive.packets.starts_s:
+            for number, lit in enumerate(encode(word)):
+                place = (time - Fraction(start_s)) / bit - number
+                dark += 0 if lit else min(max(place, Fraction(0)), Fraction(1)) * bit
+        return time - dark
     assert drive.bits is not None
     bits, levels = drive.bits, [int(bit) for bit in drive.bits.pattern]
     rate, idle = Fraction(bits.rate_hz), Fraction(bits.idle)
@@ -83,6 +101,16 @@ def test_bits_by_hand() -> None:
     start_s = np.array([0.0, 0.9, 1.0, 1.05, 1.1, 1.2, 1.0, 1.58, 9.0, 0.0])
     duration_s = np.array([0.5, 0.2, 0.1, 0.1, 0.1, 0.2, 0.6, 0.04, 1.0, 2.0])
     by_hand = [0.5, 0.75, 1.0, 0.5, 0.0, 1.0, 2.0 / 3.0, 0.75, 0.5, (0.5 + 0.4 + 0.2) / 2.0]
+    np.testing.assert_allclose(mean_level(drive, start_s, duration_s), by_hand, atol=1e-12)
+
+
+def test_a_packet_by_hand() -> None:
+    """`turn_left`, word 7, 0 1110000 1 11, from 1 s on at 10 Hz: dark in the bits 0, 4 to 7, then 11 again."""
+    sends = [{"at": "1 s", "command": "turn_left"}]
+    drive = Drive.model_validate({"packets": {"sends": sends}})
+    start_s = np.array([0.9, 1.0, 1.05, 1.35, 1.75, 2.05, 1.0, 0.0, 6.45, -3.0])
+    duration_s = np.array([0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 1.1, 7.0, 0.1, 0.5])
+    by_hand = [1.0, 0.0, 0.5, 0.25, 0.5, 0.5, 6.0 / 11.0, (7.0 - 2.5) / 7.0, 1.0, 1.0]
     np.testing.assert_allclose(mean_level(drive, start_s, duration_s), by_hand, atol=1e-12)
 
 

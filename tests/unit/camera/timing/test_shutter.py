@@ -11,7 +11,7 @@ from nir_render.camera.timing.shutter import (
     row_profile,
     row_starts_s,
 )
-from nir_render.scene.documents.emitters import FULL_DRIVE, Drive
+from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
 from tests.unit.camera.conftest import CameraMaker
 
 ROWS = 960
