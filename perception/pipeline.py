@@ -19,6 +19,7 @@ import numpy as np
 
 from perception.estimators import Estimator, detect_frames
 from perception.messages.decoder import Decoder
+from perception.messages.paper import PaperDecoder
 from perception.photometry import Sample, expected_image, sample_at, sample_of_detection
 from perception.rig.frame_sets import robot_of, set_time_s
 from perception.rig.measure_set import measure_set
@@ -119,7 +120,9 @@ class Pipeline:
         paper = name == "paper"
         if tracker is None:
             tracker = Tracker(_AS_THE_PAPER if paper else None)
-        return Pipeline(calibrations, "paper" if paper else "robust", tracker, decoder or Decoder)
+        if decoder is None:
+            decoder = PaperDecoder if paper else Decoder
+        return Pipeline(calibrations, "paper" if paper else "robust", tracker, decoder)
 
     def push(self, frames: Sequence[RawFrame], odometry: Sequence[Odometry] = ()) -> Heard:
         """Take the next set of frames.

@@ -36,8 +36,6 @@ def scene_schema() -> dict[str, Any]:
     fog["oneOf"] = [{"required": ["extinction"]}, {"required": ["visibility"]}]
     for name, key in (("Waypoint", "time"), ("Circle", "period")):
         _or_speed(definitions[name], key)
-    sending = definitions["Sending"]
-    definitions["Sending"] = {"title": "Sending", "anyOf": [sending["properties"]["packets"], sending]}
     schema["properties"]["include"] = {"type": "array", "items": {"type": "string"}}
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "nir_render scene"

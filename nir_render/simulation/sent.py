@@ -1,21 +1,21 @@
-"""Who sends what when: the packets of all sources, as they are."""
+"""What the sources of a scene send: the packets, at their true times."""
 
-from collections.abc import Iterator
-
-from nir_render.camera.timing.drive import packet_times_s
 from nir_render.scene.scene import Scene
 from nir_render.truth.sent import SentTruth
-from perception.messages.uart import meaning, word_of
+from perception.messages.uart import FRAME_BITS, REPEATS, meaning
 
 
-def sent_packets(scene: Scene) -> Iterator[SentTruth]:
-    """Yield the packets of each source, at true times."""
+def sent_packets(scene: Scene) -> list[SentTruth]:
+    """Return all packets of all sources, also those that no frame shows, in the order of their starts."""
+    found = []
     for name, (_, source) in scene.sources().items():
-        if source.drive.sends is None:
+        packets = source.drive.packets
+        if packets is None:
             continue
-        robot, _, own = name.partition(".")
-        for packet, (start_s, end_s) in zip(
-            source.drive.sends.packets, packet_times_s(source.drive.sends), strict=True
-        ):
-            word = word_of(packet.command)
-            yield SentTruth(robot, own, start_s, end_s, word, meaning(word))
+        robot, of_robot = name.split(".")
+        packet_s = FRAME_BITS * REPEATS * packets.bit_s
+        found += [
+            SentTruth(robot, of_robot, start_s, start_s + packet_s, word, meaning(word))
+            for start_s, word in packets.starts_s
+        ]
+    return sorted(found, key=lambda packet: (packet.start_s, packet.robot, packet.source))

@@ -9,6 +9,7 @@ given out.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ from perception.messages.uart import IDLE_BITS, meaning
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+Numbers = NDArray[np.int64]
 
 _BLOCK = 3 * STEPS_PER_BIT  # steps that are taken in at once
 _MARGIN = 4  # steps that a sample's exposure may reach over its middle, and half a bit of decency
@@ -34,6 +37,7 @@ _LAST_CHANCE = (IDLE_BITS + 1) * STEPS_PER_BIT  # steps after its end until a pa
 _BACK = _LAST_CHANCE + 4 * _BLOCK  # steps that are kept before the longest packet
 _WORTH_ASKING = 15.0  # log-likelihood over idle from which a packet is looked into
 _GARBAGE = float(np.log(1e-3))  # log-probability that what starts is no packet
+_LIKELY = 7.0  # clock rates whose log-probability is this far below the best one's matter
 _NEIGHBOURS = 6  # steps to either side that count as the same packet
 _FORGET_S = 12.0  # a gap after which a signal starts anew
 _BACKWARDS_S = 1.0  # a clock that jumps back by more starts anew; by less, its samples are left out
@@ -160,48 +164,34 @@ class Decoder:
     def _recurse(self, lattice: Lattice) -> None:
         """Go on with the probability of idle at each step, and note the best packet that ends there."""
         ends = np.arange(self._complete - _BLOCK + 1, self._complete + 1)
-        best: _Candidate | None = None
-        dark = self._dark_in_reach()
-        for rate, length in enumerate(self._clocks.lengths):
-            starts = ends - length
-            before = self._before[rate, starts]
-            ended = before + lattice.garbage(starts, rate) + self._log_garbage
-            promising = lattice.promising(starts, rate) if dark else np.zeros(_BLOCK, bool)
-            if promising.any():
-                words = lattice.words(starts[promising], rate)
-                best = self._best(best, words, before[promising], starts[promising], rate)
-                ended[promising] = np.logaddexp(
-                    ended[promising], before[promising] + self._log_start + _log_sum(words)
-                )
-            idle = np.logaddexp.accumulate(np.concatenate([self._idle[rate : rate + 1], ended]))
-            self._before[rate, ends] = idle[1:]
-            self._idle[rate] = idle[-1]
-        if best is not None:
-            self._note(best)
+        rates = np.repeat(np.arange(len(self._idle)), _BLOCK)
+        starts = (ends - self._clocks.lengths[:, None]).ravel()
+        before = self._before[rates, starts]
+        ended = before + self._log_garbage + lattice.garbage(starts, rates)
+        if self._dark_in_reach():
+            asked = np.flatnonzero(lattice.promising(starts, rates))
+            words = lattice.words(starts[asked], rates[asked])
+            ended[asked] = np.logaddexp(ended[asked], before[asked] + self._log_start + _log_sum(words))
+            self._note_best(words, before[asked], starts[asked], rates[asked])
+        ended = ended.reshape(-1, _BLOCK)
+        idle = np.logaddexp.accumulate(np.concatenate([self._idle[:, None], ended], axis=1), axis=1)
+        self._before[:, ends] = idle[:, 1:]
+        self._idle = idle[:, -1].copy()
 
     def _dark_in_reach(self) -> bool:
         """Return whether anything was dark for as long as a packet: an idle source costs nothing."""
         first = self._complete - _BLOCK - self._clocks.longest
         return float(np.maximum(self._table[0, first:], 0.0).sum()) > _WORTH_ASKING
 
-    def _best(
-        self,
-        best: _Candidate | None,
-        words: Array,
-        before: Array,
-        starts: NDArray[np.int64],
-        rate: int,
-    ) -> _Candidate | None:
-        row, column = np.unravel_index(np.argmax(words + before[:, None]), words.shape)
-        score = float(words[row, column] + before[row])
-        if words[row, column] < _WORTH_ASKING or (best is not None and best.score >= score):
-            return best
-        return _Candidate(score, int(starts[row]) + self._done, rate, int(column))
-
-    def _note(self, found: _Candidate) -> None:
-        """Keep a packet that may have been sent, unless a better one takes its place."""
-        if found.start + _MARGIN < self._spoken_until:
+    def _note_best(self, words: Floats, before: Array, starts: Numbers, rates: Numbers) -> None:
+        """Keep the best packet that may have been sent, unless a better one takes its place."""
+        tops = words.max(axis=1, initial=-np.inf)
+        worthy = (tops > _WORTH_ASKING) & (starts + self._done + _MARGIN >= self._spoken_until)
+        if not worthy.any():
             return
+        row = int(np.argmax(np.where(worthy, tops + before, -np.inf)))
+        score, start = float(tops[row] + before[row]), int(starts[row]) + self._done
+        found = _Candidate(score, start, int(rates[row]), int(np.argmax(words[row])))
         apart = self._clocks.longest - STEPS_PER_BIT
         rivals = [one for one in self._candidates if abs(one.start - found.start) < apart]
         if all(one.score < found.score for one in rivals):
@@ -225,35 +215,33 @@ class Decoder:
     def _message(self, one: _Candidate, lattice: Lattice) -> Message | None:
         """Return a packet as a message if its probability is high enough."""
         here = one.start - self._done
+        starts = np.arange(here - _NEIGHBOURS, here + _NEIGHBOURS + 1)
+        starts, rates = (pair.ravel() for pair in np.meshgrid(starts, np.arange(len(self._idle))))
+        over = starts + self._clocks.lengths[rates] <= self._complete
+        starts, rates = starts[over], rates[over]
+        ends = starts + self._clocks.lengths[rates]
+        score = lattice.words(starts, rates)[:, one.column]
+        log = self._before[rates, starts] + score + self._log_start
+        if _log_sum(log) - _log_sum(self._idle) < np.log(self._settings.confidence):
+            return None  # not even where nothing else is under way
         under_way = self._under_way(lattice)
-        total = np.logaddexp(self._idle, [_log_sum(row) for row in under_way])
-        logs, begins, ends = [], [], []
-        for rate, length in enumerate(self._clocks.lengths):
-            starts = np.arange(here - _NEIGHBOURS, min(here + _NEIGHBOURS, self._complete - length) + 1)
-            if not len(starts):
-                continue
-            score = lattice.words(starts, rate)[:, one.column] + self._log_start
-            after = np.array([self._after(under_way[rate], rate, int(end)) for end in starts + length])
-            logs.append(self._before[rate, starts] + score + after)
-            begins.append(starts)
-            ends.append(starts + length)
-        log = np.concatenate(logs)
-        confidence = min(float(np.exp(_log_sum(log) - _log_sum(total))), 1.0)
+        total = _log_sum(np.logaddexp(self._idle, _log_sum(under_way)))
+        log += self._after(under_way, rates, ends)
+        confidence = min(float(np.exp(_log_sum(log) - total)), 1.0)
         if confidence < self._settings.confidence:
             return None
         weight = np.exp(log - log.max())
-        begin = float(np.average(np.concatenate(begins), weights=weight))
-        end = float(np.average(np.concatenate(ends), weights=weight))
+        begin, end = np.average(np.stack([starts, ends]), axis=1, weights=weight)
         seen = np.flatnonzero(lattice.frames_seen(here, one.rate))
         if not len(seen):
             return None
-        repeats = self._settings.repeats
+        frame = (end - begin) / self._settings.repeats
         word = self._settings.words[one.column]
         return Message(
             robot=self._robot,
             track=self._track,
-            start_s=self._step_s(begin + (end - begin) * int(seen[0]) / repeats),
-            end_s=self._step_s(begin + (end - begin) * (int(seen[-1]) + 1) / repeats),
+            start_s=self._step_s(begin + frame * int(seen[0])),
+            end_s=self._step_s(begin + frame * (int(seen[-1]) + 1)),
             word=word,
             command=meaning(word),
             confidence=confidence,
@@ -265,25 +253,26 @@ class Decoder:
 
         Starts are the steps of a longest packet up to now; only clock rates that matter are looked into.
         """
-        starts = np.arange(self._complete - self._clocks.longest + 1, self._complete + 1)
-        logs = np.full((len(self._clocks.drifts), len(starts)), -np.inf)
-        for rate in np.flatnonzero(self._idle > self._idle.max() - 8.0):
-            going = starts + self._clocks.lengths[rate] > self._complete
-            before = self._before[rate, starts]
-            logs[rate] = before + lattice.garbage(starts, rate) + self._log_garbage
-            asked = going & lattice.promising(starts, rate)
-            if asked.any():
-                words = _log_sum(lattice.words(starts[asked], rate))
-                logs[rate, asked] = np.logaddexp(logs[rate, asked], before[asked] + self._log_start + words)
-            logs[rate, ~going] = -np.inf
+        first = self._complete - self._clocks.longest + 1
+        likely = np.flatnonzero(self._idle > self._idle.max() - _LIKELY)
+        steps = np.arange(first, self._complete + 1)
+        starts, rates = (pair.ravel() for pair in np.meshgrid(steps, likely))
+        going = starts + self._clocks.lengths[rates] > self._complete
+        starts, rates = starts[going], rates[going]
+        log = lattice.garbage(starts, rates) + self._log_garbage
+        asked = np.flatnonzero(lattice.promising(starts, rates))
+        words = _log_sum(lattice.words(starts[asked], rates[asked])) + self._log_start
+        log[asked] = np.logaddexp(log[asked], words)
+        logs = np.full((len(self._idle), len(steps)), -np.inf)
+        logs[rates, starts - first] = log + self._before[rates, starts]
         return logs
 
-    def _after(self, under_way: Array, rate: int, end: int) -> float:
-        """Return the log-probability of all that may follow a packet which ends at a step, up to now."""
+    def _after(self, under_way: Array, rates: Numbers, ends: Numbers) -> Array:
+        """Return the log-probability of all that may follow packets which end at steps, up to now."""
         first = self._complete - self._clocks.longest + 1
-        later = np.arange(max(end, first), self._complete + 1)
-        following = under_way[later - first] - self._before[rate, later]
-        return float(np.logaddexp(0.0, _log_sum(following)))
+        following = (under_way - self._before[:, first : self._complete + 1])[:, ::-1]
+        following = np.logaddexp.accumulate(following, axis=1)[:, ::-1]
+        return np.logaddexp(0.0, following[rates, np.maximum(ends - first, 0)])
 
 
 def decode(signal: Signal, settings: DecoderSettings | None = None) -> tuple[Message, ...]:
@@ -292,11 +281,9 @@ def decode(signal: Signal, settings: DecoderSettings | None = None) -> tuple[Mes
     return decoder.push(signal) + decoder.finish()
 
 
-def _log_sum(logs: Array) -> Array:
+def _log_sum(logs: Floats) -> Array:
     """Return the logarithm of the sum over the last axis."""
     if not logs.shape[-1]:
         return np.full(logs.shape[:-1], -np.inf)
-    top = logs.max(axis=-1)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.asarray(top + np.log(np.exp(logs - top[..., None]).sum(axis=-1)))
+    top = np.maximum(logs.max(axis=-1), -1e30)
+    return np.asarray(top + np.log(np.exp(logs - top[..., None]).sum(axis=-1) + 1e-300))

@@ -30,7 +30,7 @@ _HOPELESS = 6.0
 class Clocks:
     """The clock rates that senders may have, and where the edges of their packets lie, in steps.
 
-    `drifts` are shares, shape (r,); `edges` the steps from a packet's start to each edge, shape (r, bits + 1).
+    `drifts` are shares, shape (r,); `edges` the steps from a start to each edge, shape (r, bits + 1).
     """
 
     def __init__(self, settings: DecoderSettings) -> None:
@@ -47,7 +47,8 @@ def _templates(words: tuple[int, ...]) -> NDArray[np.float32]:
     """Return for each word which of the 44 numbers count, shape (44, words)."""
     bits = frames_of_words()[list(words)].T == 1
     before = np.roll(bits, 1, axis=0)
-    return np.concatenate([~bits, ~before & ~bits, ~before & bits, before & ~bits]).astype(np.float32)
+    counts = np.stack([~bits, ~before & ~bits, ~before & bits, before & ~bits], axis=1)
+    return counts.reshape(4 * FRAME_BITS, len(words)).astype(np.float32)
 
 
 def add_samples(
@@ -97,35 +98,38 @@ def _log_mean(logs: Array) -> Array:
 
 
 class Lattice:
-    """Scores of packets by a table of samples, any packet that begins and ends within it."""
+    """Scores of packets by a table of samples, any packet that begins and ends within it.
+
+    Packets are given by `starts`, in steps, and `rates`, the number of their clock, shape (n,) each.
+    """
 
     def __init__(self, table: Array, clocks: Clocks) -> None:
         self._clocks = clocks
-        self._ended, self._begun, self._garbage, self._seen = np.cumsum(table[_SUMMED], axis=1)
-        self._edges = np.stack([table[_DARK], table[_RISE], table[_FALL]], axis=1)
+        self._sums = np.cumsum(table[_SUMMED], axis=1)
+        ended, begun, self._garbage, self._seen = self._sums
+        edges = [ended, begun, table[_DARK], table[_RISE], table[_FALL]]
+        self._by_edge = np.stack(edges, axis=1).astype(np.float32)
         self._repeats = np.arange(0, clocks.edges.shape[1] - 1, FRAME_BITS)
 
-    def promising(self, starts: Numbers, rate: int) -> NDArray[np.bool_]:
-        """Return at which starts the start bits are not plainly lit, the same shape as `starts`."""
-        edges = self._clocks.edges[rate]
-        begin = starts[:, None] + edges[self._repeats]
-        end = starts[:, None] + edges[self._repeats + 1]
-        return np.asarray((self._ended[end] - self._begun[begin]).sum(axis=1) > -_HOPELESS)
+    def promising(self, starts: Numbers, rates: Numbers) -> NDArray[np.bool_]:
+        """Return which packets' start bits are not plainly lit, shape (n,)."""
+        edges = self._clocks.edges[rates]
+        begin = starts[:, None] + edges[:, self._repeats]
+        end = starts[:, None] + edges[:, self._repeats + 1]
+        return np.asarray((self._sums[0].take(end) - self._sums[1].take(begin)).sum(axis=1) > -_HOPELESS)
 
-    def words(self, starts: Numbers, rate: int) -> Array:
-        """Return the scores of all words for packets that begin at `starts`, shape (starts, words)."""
-        edges = starts[:, None] + self._clocks.edges[rate]
-        dark = self._ended[edges[:, 1:]] - self._begun[edges[:, :-1]]
-        cut = self._edges[edges[:, :-1]]
-        repeats = len(self._repeats)
-        row = np.empty((len(starts), 4, FRAME_BITS), np.float32)
-        row[:, 0] = dark.reshape(-1, repeats, FRAME_BITS).sum(axis=1)
-        row[:, 1:] = cut.reshape(-1, repeats, FRAME_BITS, 3).sum(axis=1).transpose(0, 2, 1)
-        return (row.reshape(-1, 4 * FRAME_BITS) @ self._clocks.templates).astype(np.float64)
+    def words(self, starts: Numbers, rates: Numbers) -> NDArray[np.float32]:
+        """Return the scores of all words, shape (n, words)."""
+        by_edge = self._by_edge.take(starts[:, None] + self._clocks.edges[rates], axis=0)
+        shape = (len(starts), len(self._repeats), FRAME_BITS)
+        row = by_edge[:, :-1, 1:].reshape(*shape, 4).sum(axis=1)
+        row[:, :, 0] = by_edge[:, 1:, 0].reshape(shape).sum(axis=1) - row[:, :, 0]
+        return np.asarray(row.reshape(-1, 4 * FRAME_BITS) @ self._clocks.templates)
 
-    def garbage(self, starts: Numbers, rate: int) -> Array:
-        """Return the score of a stretch as long as a packet in which anything goes, shape (starts,)."""
-        return np.asarray(self._garbage[starts + self._clocks.lengths[rate]] - self._garbage[starts])
+    def garbage(self, starts: Numbers, rates: Numbers) -> Array:
+        """Return the score of a stretch as long as a packet in which anything goes, shape (n,)."""
+        ends = starts + self._clocks.lengths[rates]
+        return np.asarray(self._garbage.take(ends) - self._garbage.take(starts))
 
     def frames_seen(self, start: int, rate: int) -> NDArray[np.bool_]:
         """Return of which repeats each bit was seen, shape (repeats,)."""

@@ -19,7 +19,7 @@ _OUTLIER_SPAN = 3.0  # the levels over which they spread evenly
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples that carry something: mid-exposure, exposure, level, variances dark and lit, shape (n,) each."""
+    """Samples that carry something: mid-exposure, exposure, level, variances, shape (n,) each."""
 
     time_s: Array
     exposure_s: Array

@@ -219,7 +219,7 @@ class Tracker:
     def _feed_swerved(
         self, old: Bank, seen: Observations, taken: Indices, after_s: float
     ) -> tuple[Bank, Indices]:
-        """Feed tracks that have turned on the spot: seen a set ago, now a little beside where they must be."""
+        """Feed tracks that have turned on the spot: seen a set ago, now a bit beside where they must be."""
         lost = np.flatnonzero((taken < 0) & (self._time_s - old.seen_s < 1.5 * after_s))
         free = np.setdiff1d(np.arange(len(seen.range_m)), taken)
         if self.settings.filter == "paper" or not (len(lost) and len(free)):

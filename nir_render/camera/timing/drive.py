@@ -1,14 +1,12 @@
 """How much an emitter sends within a stretch of time, exactly: means of its drive, in closed form."""
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nir_render.scene.documents.emitters import Sun
-from nir_render.scene.documents.times.drives import FULL_DRIVE, BitString, Drive, Sending, SquareWave
+from nir_render.scene.documents.times.drives import FULL_DRIVE, BitString, Drive, Packets, SquareWave
 from nir_render.scene.emission import Emitter
-from perception.messages.uart import FRAME_BITS, encode, word_of
+from perception.messages.uart import encode
 
 Array = NDArray[np.float64]
 
@@ -35,8 +33,8 @@ def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array
         return _of_square(drive.square, start, duration)
     if drive.bits is not None:
         return np.clip(_of_bits(drive.bits, start, duration), 0.0, 1.0)
-    if drive.sends is not None:
-        return _of_packets(drive.sends, start, duration)
+    if drive.packets is not None:
+        return _of_packets(drive.packets, start, duration)
     assert drive.constant is not None  # the model admits no fifth form
     return np.full(start.shape, drive.constant)
 
@@ -79,39 +77,25 @@ def _of_bits(bits: BitString, start_s: Array, duration_s: Array) -> Array:
     return np.divide(summed, length, out=level(first), where=further > 0.0)
 
 
-def packet_times_s(sending: Sending) -> list[tuple[float, float]]:
-    """Return from when to when, by the scene's clock, each packet lasts, its last stop bit included."""
-    slow = 1.0 + sending.clock_drift
-    return [
-        (
-            sending.clock_offset_s + slow * packet.at_s,
-            sending.clock_offset_s + slow * (packet.at_s + packet.repeats * FRAME_BITS / sending.rate_hz),
-        )
-        for packet in sending.packets
-    ]
-
-
-@lru_cache(maxsize=256)
-def _edges(sending: Sending) -> tuple[Array, Array, Array]:
-    """Return the edges of bits, the level before each and after the last, and the dark time up to each."""
-    edges, levels = [], []
-    for packet, (start_s, end_s) in zip(sending.packets, packet_times_s(sending), strict=True):
-        bits = encode(word_of(packet.command), packet.repeats)
-        edges.append(np.linspace(start_s, end_s, len(bits) + 1))
-        levels += [1.0, *bits.astype(np.float64)]
-    all_edges = np.concatenate(edges)
-    dark_s = np.concatenate([[0.0], np.cumsum((1.0 - np.array(levels[1:])) * np.diff(all_edges))])
-    return all_edges, np.array([*levels, 1.0]), dark_s
-
-
-def _of_packets(sending: Sending, start_s: Array, duration_s: Array) -> Array:
-    """Return the mean by the dark time between the ends of each stretch."""
-    edges, levels, dark_s = _edges(sending)
+def _of_packets(packets: Packets, start_s: Array, duration_s: Array) -> Array:
+    """Return the mean: what is left of the first bit, whole bits, a part of the last; lit between packets."""
+    edges_s, levels = [], [np.array([1.0])]
+    for at_s, word in packets.starts_s:
+        bits = encode(word)
+        edges_s.append(at_s + packets.bit_s * np.arange(len(bits) + 1))
+        levels += [bits.astype(float), np.array([1.0])]
+    edge_s, level = np.concatenate(edges_s), np.concatenate(levels)
+    sums_s = np.concatenate([[0.0], np.cumsum(level[1:-1] * np.diff(edge_s))])  # of light, up to each edge
     end_s = start_s + duration_s
-    first, last = np.searchsorted(edges, start_s, side="right"), np.searchsorted(edges, end_s, side="left")
-    dark = np.interp(end_s, edges, dark_s) - np.interp(start_s, edges, dark_s)
-    mean = np.divide(dark, duration_s, out=np.zeros_like(dark), where=duration_s > 0.0)
-    return np.where(last <= first, levels[first], np.clip(1.0 - mean, 0.0, 1.0))
+    first = np.searchsorted(edge_s, start_s, side="right")
+    last = np.maximum(np.searchsorted(edge_s, end_s, side="left"), first)
+    within = first == last
+    final = np.maximum(last - 1, 0)
+    opened = np.minimum(first, len(edge_s) - 1)
+    lit_s = level[first] * (edge_s[opened] - start_s) + (sums_s[final] - sums_s[opened])
+    lit_s += level[last] * (end_s - edge_s[final])
+    mean = np.divide(lit_s, duration_s, out=level[first], where=~within)
+    return np.asarray(np.clip(mean, 0.0, 1.0))
 
 
 def _whole_and_part(number: Array) -> tuple[Array, Array]:

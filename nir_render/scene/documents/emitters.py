@@ -1,4 +1,4 @@
-"""Models of what shines, sources, lamps, the sun, and where to (patterns); when, is in `times/drives.py`."""
+"""Models of what shines: sources, lamps, the sun; where to (patterns)."""
 
 import itertools
 import math

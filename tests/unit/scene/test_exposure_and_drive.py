@@ -8,6 +8,8 @@ import pytest
 from nir_render import InputError, Scene, load_scene
 from nir_render.scene.documents.camera import GlobalShutter, RollingShutter
 from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
+from nir_render.simulation.sent import sent_packets
+from nir_render.truth.sent import parse_sent
 from tests.paths import SCENES
 
 CAMERA = "robots.r1.rig.cameras.front"
@@ -72,8 +74,11 @@ def test_one_form_replaces_another(scene: Scene) -> None:
     [
         (1.01, "less than or equal to 1"),
         (-0.1, "greater than or equal to 0"),
-        ({"constant": 1, "square": {"frequency": "1 kHz"}}, "wanted one of 'constant', 'square', 'bits' and 'sends'"),
-        ({}, "wanted one of 'constant', 'square', 'bits' and 'sends', not none"),
+        (
+            {"constant": 1, "square": {"frequency": "1 kHz"}},
+            "wanted one of 'constant', 'square', 'bits' and 'packets'",
+        ),
+        ({}, "wanted one of .* 'packets', not none"),
         ([1, 0], "is no drive; wanted 0.5"),
         ({"square": {"frequency": "1 kHz", "duty": 1.2}}, "duty.*less than or equal to 1"),
         ({"square": {"frequency": "1 kHz", "duty": -0.1}}, "duty.*greater than or equal to 0"),
@@ -87,6 +92,20 @@ def test_one_form_replaces_another(scene: Scene) -> None:
         ({"bits": {"pattern": "01", "rate": "10 Hz", "repeat": 0}}, "repeat"),
         ({"bits": {"pattern": "01", "rate": "10 Hz", "idle": 2}}, "idle.*less than or equal to 1"),
         ({"bits": {"patern": "01", "rate": "10 Hz"}}, "did you mean 'pattern'"),
+        ({"packets": {"sends": []}}, "sends"),
+        ({"packets": {"sends": [{"at": "1 s"}]}}, "wanted one of 'command', 'text' and 'word', not none"),
+        ({"packets": {"sends": [{"at": "1 s", "command": "foward"}]}}, "'foward' is no command"),
+        ({"packets": {"sends": [{"at": "1 s", "text": "né"}]}}, "'é' is no printable ASCII"),
+        ({"packets": {"sends": [{"at": "1 s", "word": 128}]}}, "word.*less than or equal to 127"),
+        ({"packets": {"sends": [{"at": "1 s", "command": "stop", "word": 0}]}}, "wanted one of 'command'"),
+        (
+            {"packets": {"sends": [{"at": "6 s", "word": 1}, {"at": "0.6 s", "command": "stop"}]}},
+            r"sent at 6 s begins before what is sent at 0\.6 s has ended, at 6\.1 s",
+        ),
+        (
+            {"packets": {"sends": [{"at": "0 s", "text": "no"}, {"at": "10.9 s", "word": 1}]}},
+            "has ended, at 11 s",
+        ),
     ],
 )
 def test_bad_drives_are_refused(scene: Scene, drive: Any, reason: str) -> None:
@@ -217,3 +236,25 @@ def test_a_resolved_scene_keeps_drive_shutter_and_bracket(scene: Scene, tmp_path
     camera = again.camera("r1.front")[1]
     assert camera.shutter == RollingShutter.model_validate({"type": "rolling", "line_time": "12.5 us"})
     assert camera.bracket == pytest.approx((5e-5, 2e-4, 8e-4), rel=1e-15)
+
+
+def test_packets_follow_their_senders_clock(scene: Scene) -> None:
+    """Out of order, back to back, on a clock 1 % slow and 3 ms late: when each starts in the world."""
+    sends = [{"at": "12 s", "text": "ab"}, {"at": "6.5 s", "command": "recover"}, {"at": "1 s", "word": 3}]
+    drive = {"packets": {"sends": sends, "offset": "3 ms", "drift": "1 %"}}
+    packets = scene.with_({DRIVE: drive}).sources()["r2.top"][1].drive.packets
+    assert packets is not None
+    starts_s, words = zip(*packets.starts_s, strict=True)
+    assert words == (3, 11, 97, 98)
+    assert starts_s == pytest.approx([1.013, 6.568, 12.123, 17.678], abs=1e-12)
+    assert packets.bit_s == pytest.approx(0.101)
+
+
+def test_sent_packets_are_told_with_their_times(scene: Scene) -> None:
+    sends = [{"at": "1 s", "command": "disperse"}]
+    sent = sent_packets(scene.with_({DRIVE: {"packets": {"sends": sends, "rate": "20 Hz", "drift": "-2 %"}}}))
+    (packet,) = sent
+    assert parse_sent(packet.record()) == packet
+    assert (packet.robot, packet.source, packet.word, packet.command) == ("r2", "top", 9, "disperse")
+    assert (packet.start_s, packet.end_s) == pytest.approx((0.98, 0.98 + 55 * 0.049))
+    assert sent_packets(scene) == []

@@ -1,6 +1,7 @@
-"""Models of what an emitter sends over time: a number, a square wave, bits, messages."""
+"""Models of what an emitter sends over time: a level, a square wave, bits, packets of a language."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -8,12 +9,12 @@ from pydantic import Field, field_validator, model_validator
 from nir_render.errors import shown
 from nir_render.scene.documents.base import Document, Fraction, Frequency, Positive, Time
 from nir_render.scene.documents.curves import one_form
-from perception.messages.uart import FRAME_BITS, REPEATS, word_of
+from perception.messages.uart import FRAME_BITS, RATE_HZ, REPEATS, word_of
 
-_DRIVE_FORMS = ("constant", "square", "bits", "sends")
+_DRIVE_FORMS = ("constant", "square", "bits", "packets")
 _DRIVE_EXAMPLE = (
-    "0.5, {square: {frequency: 1 kHz, duty: 0.5}}, {bits: {pattern: '0101101111', rate: 10 Hz}} or "
-    "{sends: [{at: 1 s, command: forward}]}"
+    "0.5, {square: {frequency: 1 kHz, duty: 0.5}}, {bits: {pattern: '0101101111', rate: 10 Hz}} "
+    "or {packets: {sends: [{at: 1 s, command: forward}]}}"
 )
 
 Level = Annotated[Fraction, Field(ge=0, le=1)]
@@ -54,69 +55,100 @@ class BitString(Document):
         return pattern
 
 
-class Packet(Document):
-    """What is said once: `command` is one of the language's commands, an ASCII character, or 'word 17'.
+class Send(Document):
+    """What is sent at a time of the sender's clock: a `command`, a `text` of ASCII, or `word`, a number.
 
-    It begins `at` a time of the sender's own clock: its frame, `repeats` times.
+    A command is one of the sixteen; each character of a text is a packet, one right after the other.
     """
 
     example: ClassVar[str] = "{at: 1 s, command: forward}"
 
     at_s: Time
-    command: str
-    repeats: Annotated[int, Field(ge=1, le=1000)] = REPEATS
-
-    @field_validator("command", mode="before")
-    @classmethod
-    def _known(cls, command: Any) -> Any:
-        if isinstance(command, int) and not isinstance(command, bool) and 0 <= command <= 9:
-            return str(command)  # a digit is a character, which YAML reads as a number
-        if not isinstance(command, str):
-            raise ValueError(f"{shown(command)} is no text; write a command such as forward, or 'word 17'")
-        word_of(command)
-        return command
-
-
-class Sending(Document):
-    """Packets of the optical language at `rate`; between them it is idle, which is lit.
-
-    A list of packets may stand for it. The sender's clock is `clock_offset` behind the scene's, and slow by
-    `clock_drift`: its time t is the scene's offset + (1 + drift) t, and its bits last as much longer.
-    """
-
-    example: ClassVar[str] = "{packets: [{at: 1 s, command: forward}], clock_drift: 0.5 %}"
-
-    packets: Annotated[tuple[Packet, ...], Field(min_length=1, max_length=100_000)]
-    rate_hz: Annotated[Frequency, Positive] = 10.0
-    clock_offset_s: Time = 0.0
-    clock_drift: Annotated[Fraction, Field(ge=-0.1, le=0.1)] = 0.0
+    command: str | None = None
+    text: Annotated[str, Field(min_length=1)] | None = None
+    word: Annotated[int, Field(ge=0, le=127)] | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _read(cls, data: Any) -> Any:
-        if isinstance(data, Sequence) and not isinstance(data, str):
-            return {"packets": data}
+    def _one_of_them(cls, data: Any) -> Any:
+        if not isinstance(data, Send):
+            cls.check_keys(data)
+            one_form(data, ("command", "text", "word"))
         return data
+
+    @field_validator("command")
+    @classmethod
+    def _known(cls, command: str | None) -> str | None:
+        if command is not None:
+            word_of(command)
+        return command
+
+    @field_validator("text")
+    @classmethod
+    def _printable(cls, text: str | None) -> str | None:
+        for character in text or "":
+            word_of(character)
+        return text
+
+    @property
+    def words(self) -> tuple[int, ...]:
+        """The words that it is made of, each a packet."""
+        if self.word is not None:
+            return (self.word,)
+        return (word_of(self.command),) if self.command is not None else tuple(map(word_of, self.text or ""))
+
+
+class Packets(Document):
+    """Packets of the optical language: five frames of eleven bits each, lit in between.
+
+    What the sender's clock calls `at` is at `offset` + at · (1 + `drift`) in the world: with a drift above 0
+    it is slow, and its bits are as much longer.
+    """
+
+    example: ClassVar[str] = "{sends: [{at: 1 s, command: forward}]}"
+
+    sends: Annotated[tuple[Send, ...], Field(min_length=1)]
+    rate_hz: Annotated[Frequency, Positive] = RATE_HZ
+    offset_s: Time = 0.0
+    drift: Annotated[Fraction, Field(ge=-0.1, le=0.1)] = 0.0
 
     @model_validator(mode="after")
     def _one_after_the_other(self) -> Self:
-        for k, (packet, after) in enumerate(zip(self.packets, self.packets[1:], strict=False)):
-            end_s = packet.at_s + packet.repeats * FRAME_BITS / self.rate_hz
-            if after.at_s < end_s - 1e-9:
+        packet_s = FRAME_BITS * REPEATS / self.rate_hz
+        in_order = sorted(self.sends, key=lambda send: send.at_s)
+        for one, later in itertools.pairwise(in_order):
+            end_s = one.at_s + packet_s * len(one.words)
+            if later.at_s < end_s - 1e-9:
                 raise ValueError(
-                    f"packet {k + 1} begins at {after.at_s:g} s, before packet {k} ends at {end_s:g} s; send "
-                    "them one after the other"
+                    f"what is sent at {later.at_s:g} s begins before what is sent at {one.at_s:g} s has "
+                    f"ended, at {end_s:g} s: a packet takes {packet_s:g} s; send it later"
                 )
         return self
 
+    @property
+    def starts_s(self) -> tuple[tuple[float, int], ...]:
+        """When each packet starts in the world, and its word, in order of time."""
+        packet_s = FRAME_BITS * REPEATS / self.rate_hz
+        ats = sorted(
+            (send.at_s + number * packet_s, word)
+            for send in self.sends
+            for number, word in enumerate(send.words)
+        )
+        return tuple((self.offset_s + at_s * (1.0 + self.drift), word) for at_s, word in ats)
+
+    @property
+    def bit_s(self) -> float:
+        """How long a bit takes in the world."""
+        return (1.0 + self.drift) / self.rate_hz
+
 
 class Drive(Document):
-    """What an emitter sends over time, as a share of its full power: one of these."""
+    """What an emitter sends over time, as a share of full power: a number, a square wave, bits or packets."""
 
     constant: Level | None = None
     square: SquareWave | None = None
     bits: BitString | None = None
-    sends: Sending | None = None
+    packets: Packets | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -10,7 +10,7 @@ import pytest
 from nir_render.camera.timing.drive import drive_of, mean_level
 from nir_render.scene.documents.emitters import Sun
 from nir_render.scene.documents.times.drives import Drive
-from perception.messages.uart import word_of
+from perception.messages.uart import encode
 
 BITS = {"pattern": "0101101111", "rate": "10 Hz", "start": "50 ms"}
 DRIVES: list[dict[str, Any]] = [
@@ -21,6 +21,15 @@ DRIVES: list[dict[str, Any]] = [
     {"bits": BITS},
     {"bits": {**BITS, "idle": 0.25, "repeat": 3}},
     {"bits": {"pattern": "00101", "rate": "997 Hz", "repeat": "forever", "idle": 0}},
+    {"packets": {"sends": [{"at": "-0.4 s", "text": "a~"}], "rate": "80 Hz"}},
+    {
+        "packets": {
+            "sends": [{"at": "2 s", "command": "hold"}, {"at": "0 s", "word": 77}],
+            "rate": "30 Hz",
+            "offset": "13 ms",
+            "drift": "-1.3 %",
+        }
+    },
 ]
 
 
@@ -31,6 +40,13 @@ def _exactly(drive: Drive, time: Fraction) -> Fraction:
         frequency, duty = Fraction(square.frequency_hz), Fraction(square.duty)
         periods = (time - Fraction(square.phase_s)) * frequency
         return (math.floor(periods) * duty + min(periods - math.floor(periods), duty)) / frequency
+    if drive.packets is not None:
+        dark, bit = Fraction(0), Fraction(drive.packets.bit_s)
+        for start_s, word in drive.packets.starts_s:
+            for number, lit in enumerate(encode(word)):
+                place = (time - Fraction(start_s)) / bit - number
+                dark += 0 if lit else min(max(place, Fraction(0)), Fraction(1)) * bit
+        return time - dark
     assert drive.bits is not None
     bits, levels = drive.bits, [int(bit) for bit in drive.bits.pattern]
     rate, idle = Fraction(bits.rate_hz), Fraction(bits.idle)
@@ -88,6 +104,16 @@ def test_bits_by_hand() -> None:
     np.testing.assert_allclose(mean_level(drive, start_s, duration_s), by_hand, atol=1e-12)
 
 
+def test_a_packet_by_hand() -> None:
+    """`turn_left`, word 7, 0 1110000 1 11, from 1 s on at 10 Hz: dark in the bits 0, 4 to 7, then 11 again."""
+    sends = [{"at": "1 s", "command": "turn_left"}]
+    drive = Drive.model_validate({"packets": {"sends": sends}})
+    start_s = np.array([0.9, 1.0, 1.05, 1.35, 1.75, 2.05, 1.0, 0.0, 6.45, -3.0])
+    duration_s = np.array([0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 1.1, 7.0, 0.1, 0.5])
+    by_hand = [1.0, 0.0, 0.5, 0.25, 0.5, 0.5, 6.0 / 11.0, (7.0 - 2.5) / 7.0, 1.0, 1.0]
+    np.testing.assert_allclose(mean_level(drive, start_s, duration_s), by_hand, atol=1e-12)
+
+
 @pytest.mark.parametrize("document", [*DRIVES, {"constant": 0.3}])
 def test_no_time_at_all_has_the_level_there(document: dict[str, Any]) -> None:
     drive = Drive.model_validate(document)
@@ -99,45 +125,3 @@ def test_constant_drives_and_the_sun() -> None:
     assert (mean_level(Drive(constant=0.3), np.zeros((2, 3)), 0.1) == 0.3).all()
     sun = Sun.model_validate({"azimuth": "0 deg", "elevation": "40 deg", "irradiance": "0.3 W/m^2/nm"})
     assert drive_of(sun).constant == 1.0
-
-
-def _dark_by_hand(drive: Drive, begin_s: float, end_s: float) -> float:
-    """Return the share of a stretch that a packet's source is lit, by a sum over a million points."""
-    at_s = begin_s + (np.arange(1_000_000) + 0.5) * (end_s - begin_s) / 1_000_000
-    assert drive.sends is not None
-    lit = np.ones(at_s.shape)
-    for packet in drive.sends.packets:
-        slow = 1.0 + drive.sends.clock_drift
-        bit = np.floor(
-            ((at_s - drive.sends.clock_offset_s) / slow - packet.at_s) * drive.sends.rate_hz + 1e-12
-        )
-        bits = [0, *(int(k) for k in f"{word_of(packet.command):07b}"[::-1])]
-        bits = [*bits, sum(bits) % 2, 1, 1] * packet.repeats
-        inside = (bit >= 0) & (bit < len(bits))
-        lit[inside] = np.array(bits)[bit[inside].astype(int)]
-    return float(lit.mean())
-
-
-def test_messages_are_sent_by_the_senders_own_clock() -> None:
-    drive = Drive.model_validate(
-        {
-            "sends": {
-                "packets": [{"at": "1 s", "command": "recover"}, {"at": "6.5 s", "command": "A", "repeats": 2}],
-                "clock_offset": "37 ms", "clock_drift": "1 %",
-            }
-        }
-    )  # fmt: skip
-    stretches = [(0.0, 1.0), (0.9, 1.1), (1.0, 7.0), (2.345, 2.346), (6.4, 6.9), (8.0, 9.5), (20.0, 21.0)]
-    for begin_s, end_s in stretches:
-        level = float(mean_level(drive, begin_s, end_s - begin_s))
-        assert level == pytest.approx(_dark_by_hand(drive, begin_s, end_s), abs=3e-6)
-    # Within a bit the level is exact; at an instant it is the bit's. The start bit begins at 37 ms + 1.01 s.
-    assert mean_level(drive, [1.048, 1.0469, 1.05], [0.09, 0.0, 0.0]).tolist() == [0.0, 1.0, 0.0]
-
-
-def test_packets_come_one_after_the_other() -> None:
-    packets = [{"at": "1 s", "command": "stop"}, {"at": "6.4 s", "command": "stop"}]
-    with pytest.raises(ValueError, match=r"packet 1 begins at 6\.4 s, before packet 0 ends at 6\.5 s"):
-        Drive.model_validate({"sends": packets})
-    with pytest.raises(ValueError, match="is no command; wanted one of stop"):
-        Drive.model_validate({"sends": [{"at": "1 s", "command": "fly"}]})
