@@ -91,6 +91,7 @@ def resumed_run_folder(folder: Path, overwrite: bool, digest: str) -> Iterator[t
                 _replace(folder, aside)
             except Exception:
                 shutil.rmtree(aside, ignore_errors=True)
+                lock.unlink(missing_ok=True)
                 raise
     except OSError as error:
         raise disk_error(folder, error) from None

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from perception.track.bank import Bank, taken_states
 from perception.track.kalman import States, innovation_covariance
@@ -142,6 +141,8 @@ def _turned(bank: Bank, track: Indices, seen: Observations) -> Array:
 
 def assigned(pairs: Pairs) -> Indices:
     """Return the pairs, as indices, of the assignment of the greatest total gain; each gains by itself."""
+    from scipy.optimize import linear_sum_assignment  # loads slowly
+
     gains = np.flatnonzero(pairs.gain > 0.0)
     if not len(gains):
         return gains

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from perception.types import Odometry
 
@@ -75,6 +74,8 @@ def pose_at(odometry: Sequence[Odometry], time_s: float) -> Pose:
 
 def poses_at(odometry: Sequence[Odometry], times_s: Array) -> Poses:
     """Do the same for many times, shape (n,)."""
+    from scipy.spatial.transform import Rotation  # loads slowly
+
     n = len(times_s)
     if not odometry:
         return Poses(np.zeros((n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros(n), np.zeros(n))

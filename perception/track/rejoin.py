@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from perception.track.bank import Bank, replaced
 from perception.track.kalman import States
@@ -19,6 +18,8 @@ REJOIN_CHI2 = 28.0
 
 def rejoined(lost: Bank, begun: Bank) -> list[tuple[int, int]]:
     """Return which tracks that begin are the rest of which tracks that are not seen, as pairs of indices."""
+    from scipy.optimize import linear_sum_assignment  # loads slowly
+
     ready = np.flatnonzero((begun.odds >= REJOIN_ODDS) & (begun.hits >= REJOIN_HITS))
     if not (len(ready) and len(lost.number)):
         return []

@@ -35,8 +35,9 @@ def test_a_run_leaves_all_that_the_design_names(run_folder: Path) -> None:
     frames = [f"frames/r1.front/{index:06d}.png" for index in range(10)]
     assert _files(run_folder) == sorted(
         ["calibration.json", "detections.paper.jsonl", "detections.robust.jsonl", *frames, "frames.jsonl",
-         "manifest.json", "measurements.paper.jsonl", "measurements.robust.jsonl", "mirrors.paper.jsonl",
-         "mirrors.robust.jsonl", "preview.png", "report.html", "scene.yaml", "summary.json", "truth.jsonl"]
+         "manifest.json", "measurements.paper.jsonl", "measurements.robust.jsonl", "messages.robust.jsonl",
+         "mirrors.paper.jsonl", "mirrors.robust.jsonl", "poses.jsonl", "preview.gif", "preview.png", "report.html",
+         "scene.yaml", "signals.robust.jsonl", "summary.json", "tracks.robust.jsonl", "truth.jsonl"]
     )  # fmt: skip
     manifest = json.loads((run_folder / "manifest.json").read_text())
     assert sorted(manifest["sha256"]) == [name for name in _files(run_folder) if name != "manifest.json"]
