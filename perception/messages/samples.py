@@ -56,11 +56,15 @@ def likelihood_of_levels(samples: Samples, scale: float) -> LevelLikelihood:
 
     def log_likelihood(share: Array) -> Array:
         variance = samples.dark_variance + share * (samples.lit_variance - samples.dark_variance)
-        off = samples.level - scale * share
-        density = np.exp(-0.5 * off * off / variance) / np.sqrt(2.0 * np.pi * variance)
-        return np.asarray(np.log((1.0 - _OUTLIERS) * density + _OUTLIERS / _OUTLIER_SPAN))
+        return log_density(samples.level - scale * share, variance)
 
     return log_likelihood
+
+
+def log_density(off: Array, variance: Array) -> Array:
+    """Return the log-density of errors, a few of which follow no model."""
+    density = np.exp(-0.5 * off * off / variance) / np.sqrt(2.0 * np.pi * variance)
+    return np.asarray(np.log((1.0 - _OUTLIERS) * density + _OUTLIERS / _OUTLIER_SPAN))
 
 
 class LevelScale:
