@@ -105,9 +105,7 @@ def decode_pair(
 class _PairReader:
     """The samples of a pair, and the scores of packets by them."""
 
-    def __init__(
-        self, samples: Samples, amplitudes: Array, sigmas: Array, settings: DecoderSettings
-    ) -> None:
+    def __init__(self, samples: Samples, amplitudes: Array, sigmas: Array, settings: DecoderSettings) -> None:
         self._samples, self._settings = samples, settings
         self._amplitudes, self._sigmas = amplitudes, sigmas
         self._clocks = Clocks(settings)
@@ -239,9 +237,7 @@ class _PairReader:
 
     def _variance(self, level: Array) -> Array:
         one = self._samples
-        return np.asarray(
-            one.dark_variance + np.maximum(level, 0.0) * (one.lit_variance - one.dark_variance)
-        )
+        return np.asarray(one.dark_variance + np.maximum(level, 0.0) * (one.lit_variance - one.dark_variance))
 
     def _evidence(self, shares: Array, weight: Array) -> float:
         """Return the log-evidence of who sent which share, over the amplitudes (Gaussian)."""
