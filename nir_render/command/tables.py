@@ -64,13 +64,11 @@ def time_table(summary: Mapping[str, Any]) -> Table | None:
         return None
     columns = {
         "track_hota": ("HOTA", "{:.3f}"),
-        "track_idf1": ("IDF1", "{:.3f}"),
         "track_switches": ("switches", "{}"),
         "tracks": ("tracks", "{}"),
-        "track_sources": ("of sources", "{}"),
         "track_position_rmse_m": ("place RMSE\nm", "{:.4f}"),
-        "message_received": ("packets\nreceived", "{}"),
-        "message_sent": ("of", "{}"),
+        "message_sent": ("packets\nsent", "{}"),
+        "message_received": ("re-\nceived", "{}"),
         "message_wrong": ("wrong", "{}"),
     }
     return _filled(Table(title="Over time: tracks and messages", title_justify="left"), columns, followed)

@@ -19,7 +19,6 @@ from perception.messages.uart import encode, meaning, packet_levels
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 WHO_ODDS = 1e3
 """Odds from which it is said who said which."""
@@ -28,17 +27,18 @@ _TRIED = 10  # packets of each source that are tried as a beginning
 _TURNS = 4
 _WORTH = 15.0  # log-likelihood over idle that a packet needs
 _SHIFTS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # of a packet's edges, in steps: they are known to a step
+_LATE = np.linspace(-1.0, 1.0, 9)  # steps by which a start is moved, and by how much the drift,
+_DRIFTS = np.linspace(-2e-3, 2e-3, 9)  # about the packet's middle
 _NEAR = STEPS_PER_BIT  # steps about a packet within which it may be found again in its turn
 
 
 @dataclass(frozen=True)
 class _Packet:
-    """A packet as it may have been sent: its place on the lattice, and its score."""
+    """A packet as it may have been sent: where it starts, in steps, its clock's drift, its word."""
 
-    start: int
-    rate: int
+    start: float
+    drift: float
     word: int
-    score: float
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class _Pair:
     packets: tuple[_Packet | None, _Packet | None]
     amplitudes: Array
     score: float
-    confidence: tuple[float, float]
+    confidence: tuple[float, float] = (0.0, 0.0)
 
 
 def decode_pair(
@@ -119,20 +119,28 @@ class _PairReader:
 
     def times_s(self, packet: _Packet) -> tuple[float, float]:
         """Return when a packet starts, and how long its bits are."""
-        bit_s = (1.0 + float(self._clocks.drifts[packet.rate])) / self._settings.rate_hz
+        bit_s = (1.0 + packet.drift) / self._settings.rate_hz
         return self._origin_s + packet.start * self._clocks.step_s, bit_s
 
     def best(self) -> _Pair | None:
         """Return the pair that explains the samples best; None where nothing was sent."""
-        either = np.array([0.0, 1.0])[:, None]
+        either = np.array([0.0, 1.0, 1.0, 1.0])[:, None]  # lit more often than dark
         found: list[_Pair] = []
         for number in (0, 1):
             lattice = self._lattice(number, either, self._amplitudes)
-            found += [self._settled(number, packet) for packet in self._tops(lattice)]
+            for packet in self._tops(lattice):
+                found.append(self._settled(number, packet))
         if not found:
             return None
         best = max(found, key=lambda pair: pair.score)
-        return replace(best, confidence=(_among(found, best, 0), _among(found, best, 1)))
+        first, second = (min(self._share_of_word(best, one), _among(found, best, one)) for one in (0, 1))
+        return replace(best, confidence=(first, second))
+
+    def _share_of_word(self, pair: _Pair, number: int) -> float:
+        """Return the probability of a source's word among all it may have sent, given the other's."""
+        lattice = self._lattice(number, self._shifted(pair.packets[1 - number]), pair.amplitudes)
+        packet, share = self._read(lattice, None)
+        return share if _alike(packet, pair.packets[number]) else 0.0
 
     def log_odds_of_who(self, pair: _Pair) -> float:
         """Return the log-odds of who said which against the other way round, over the amplitudes."""
@@ -146,21 +154,36 @@ class _PairReader:
         """Read the two sources in turn from a packet of one on."""
         packets: list[_Packet | None] = [None, None]
         packets[number] = packet
-        confidence = [1.0, 1.0]
         amplitudes = self._amplitudes
         for turn in range(_TURNS):
             other = 1 - number if turn % 2 == 0 else number
             given = packets[1 - other]
             lattice = self._lattice(other, self._shifted(given), amplitudes)
-            about = packets[other] if turn >= _TURNS // 2 else None
-            packets[other], share = self._read(lattice, about)
-            confidence[other] = share if about is None else min(share, confidence[other])
+            packets[other] = self._read(lattice, packets[other] if turn >= _TURNS // 2 else None)[0]
             amplitudes = self._fitted(packets)
-        first, second = (self._shifted(one) for one in packets)
-        level = amplitudes[0] * first[:, None] + amplitudes[1] * second[None]
-        score = float(_log_mean(self._density(level.reshape(-1, len(self._samples)))).sum())
+        for _ in range(2):
+            for one in (0, 1):
+                packets[one] = self._polished(packets, one, amplitudes)
+            amplitudes = self._fitted(packets)
+        shares = np.stack([self._share(packet, 0.0) for packet in packets])
+        score = float(self._density(amplitudes @ shares).sum())
         score -= 0.5 * float((((amplitudes - self._amplitudes) / self._sigmas) ** 2).sum())
-        return _Pair((packets[0], packets[1]), amplitudes, score, (confidence[0], confidence[1]))
+        return _Pair((packets[0], packets[1]), amplitudes, score)
+
+    def _polished(self, packets: Sequence[_Packet | None], number: int, amplitudes: Array) -> _Packet | None:
+        """Return a packet with its start and drift between those of the lattice."""
+        packet = packets[number]
+        if packet is None:
+            return None
+        other = amplitudes[1 - number] * self._share(packets[1 - number], 0.0)
+        ways = [
+            replace(packet, start=packet.start + late - 0.5 * self._clocks.longest * drift,
+                    drift=packet.drift + drift)
+            for late in _LATE
+            for drift in _DRIFTS
+        ]  # fmt: skip
+        levels = np.stack([amplitudes[number] * self._share(way, 0.0) + other for way in ways])
+        return ways[int(np.argmax(self._density(levels).sum(axis=1)))]
 
     def _lattice(self, number: int, other: Array, amplitudes: Array) -> Lattice:
         """Return the scores of a source's packets; `other` are the shares that the other may send, (m, n)."""
@@ -177,7 +200,7 @@ class _PairReader:
         """Return the log-density of the samples at levels of the sum, shape (..., n)."""
         return log_density(self._samples.level - level, self._variance(level))
 
-    def _scored(self, lattice: Lattice, starts: NDArray[np.int64]) -> tuple[Indices, Indices, Array]:
+    def _scored(self, lattice: Lattice, starts: NDArray[np.int64]) -> tuple[Array, Array, Array]:
         """Return starts, rates and word scores of all packets that begin at `starts`."""
         steps, rates = (each.ravel() for each in np.meshgrid(starts, np.arange(len(self._clocks.drifts))))
         asked = lattice.promising(steps, rates)
@@ -197,7 +220,7 @@ class _PairReader:
             if len(tops) >= _TRIED or scores[row, column] < _WORTH:
                 break
             if all(one.word != word or abs(one.start - start) > _NEAR for one in tops):
-                tops.append(_Packet(start, int(rates[row]), word, float(scores[row, column])))
+                tops.append(_Packet(start, float(self._clocks.drifts[rates[row]]), word))
         return tops
 
     def _starts(self) -> NDArray[np.int64]:
@@ -220,12 +243,12 @@ class _PairReader:
         total = np.exp(scores - top).sum() + np.exp(-top)
         share = float(np.exp(scores[near, column] - top).sum() / total)
         word = self._settings.words[column]
-        return _Packet(int(steps[row]), int(rates[row]), word, top), min(share, 1.0)
+        return _Packet(int(steps[row]), float(self._clocks.drifts[rates[row]]), word), min(share, 1.0)
 
     def _fitted(self, packets: Sequence[_Packet | None]) -> Array:
         """Return the amplitudes by least squares, with what was known of them; outliers do not count."""
         shares = np.stack([self._share(packet, 0.0) for packet in packets])
-        known: NDArray[np.floating] = self._amplitudes
+        known = self._amplitudes
         for _ in range(2):
             variance = self._variance(known @ shares)
             near = np.abs(self._samples.level - known @ shares) < 4.0 * np.sqrt(variance) + 0.1
@@ -272,7 +295,7 @@ def _among(found: Sequence[_Pair], best: _Pair, number: int) -> float:
         any(_alike(packet, other) for other in (pair.packets[number], pair.packets[1 - number]))
         for pair in found
     ]
-    return min(best.confidence[number], float(weights[same].sum() / weights.sum()))
+    return float(weights[same].sum() / weights.sum())
 
 
 def _alike(one: _Packet | None, other: _Packet | None) -> bool:

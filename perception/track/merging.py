@@ -151,7 +151,7 @@ def dimmed(
     spread = innovation_covariance(states, found)[:, :2, :2]
     off = found.residual_m[:, :2]
     chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
-    across_rad2 = np.sqrt(np.linalg.det(spread)) / apart_m[near] ** 2
+    across_rad2 = np.sqrt(np.maximum(np.linalg.det(spread), 0.0)) / apart_m[near] ** 2
     by_chance = clutter / settings.clutter_solid_angle_sr * math.pi * DIM_CHI2 * across_rad2
     # Where the place itself is hardly known, a bearing says little of whose light it is.
     good = (chi2 < DIM_CHI2) & (across_rad2 < settings.resolution_rad**2) & (by_chance < MOST_CHANCE)
