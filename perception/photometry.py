@@ -75,7 +75,11 @@ class Expected:
 
 
 def expected_image(
-    position_body_m: Array, covariance_m2: Array, frame: RawFrame, calibration: Calibration
+    position_body_m: Array,
+    covariance_m2: Array,
+    frame: RawFrame,
+    calibration: Calibration,
+    extinction_per_m: float | None = None,
 ) -> Expected | None:
     """Return where a source must be in a frame, by its predicted place; None where it is out of view.
 
@@ -83,10 +87,8 @@ def expected_image(
     ----------
     position_body_m, covariance_m2
         Where it is predicted at the frame's time, in body axes, shape (3,), and how well, shape (3, 3).
-
-    Notes
-    -----
-    In fog it is dimmed by what the calibration says of the extinction.
+    extinction_per_m
+        Of the fog, as a set told it; without it what the calibration says.
     """
     towards_m = calibration.rotation_body_camera.T @ (position_body_m - calibration.position_body_m)
     range_m = float(np.linalg.norm(towards_m))
@@ -98,7 +100,8 @@ def expected_image(
         return None
     exposed_s = float(exposure_towards(towards_m / range_m, frame.exposure_s, frame.gain, calibration))
     flux_dn = calibration.range_constant_dn_m2_per_s * exposed_s / range_m**2
-    flux_dn *= math.exp(-calibration.extinction_per_m * range_m)
+    fog_per_m = calibration.extinction_per_m if extinction_per_m is None else extinction_per_m
+    flux_dn *= math.exp(-fog_per_m * range_m)
     if not flux_dn > 0.0:
         return None
     turn = pixel_turn([[u_px, v_px]], calibration)[0]

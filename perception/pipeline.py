@@ -39,6 +39,7 @@ from perception.types import (
 
 _AS_THE_PAPER = TrackerSettings(filter="paper", association="paper", overlap="paper")
 
+_SET_BACK_S = 1.0
 _AT_ONCE_S = 1e-3
 """Frames are of one time if they are no further apart."""
 
@@ -88,6 +89,8 @@ class Pipeline:
         What follows; by default a `Tracker` as it comes.
     decoder
         Makes what reads one track, of the observer's name and the track's number; by default `Decoder`.
+    keep_signals
+        Whether `signals` is to know them all: a robot that runs for days has no use for that.
     """
 
     def __init__(
@@ -96,6 +99,7 @@ class Pipeline:
         estimator: str | Estimator = "robust",
         tracker: Follows | None = None,
         decoder: Callable[[str, int], Reads] = Decoder,
+        keep_signals: bool = False,
     ) -> None:
         self._calibrations = calibrations
         self._estimator = estimator
@@ -104,6 +108,9 @@ class Pipeline:
         self._readers: dict[int, Reads] = {}
         self._latest_s = -math.inf
         self._robot: str | None = None
+        self._extinction_per_m: float | None = None
+        self._last_s: dict[int, float] = {}
+        self._keeps_signals = keep_signals
         self._samples: dict[int, list[Sample]] = {}
 
     @staticmethod
@@ -112,6 +119,7 @@ class Pipeline:
         calibrations: Mapping[str, Calibration],
         tracker: Follows | None = None,
         decoder: Callable[[str, int], Reads] | None = None,
+        keep_signals: bool = False,
     ) -> "Pipeline":
         """Return the stack that goes with an estimator: the paper's own parts where it is `paper`.
 
@@ -122,7 +130,7 @@ class Pipeline:
             tracker = Tracker(_AS_THE_PAPER if paper else None)
         if decoder is None:
             decoder = PaperDecoder if paper else Decoder
-        return Pipeline(calibrations, "paper" if paper else "robust", tracker, decoder)
+        return Pipeline(calibrations, "paper" if paper else "robust", tracker, decoder, keep_signals)
 
     def push(self, frames: Sequence[RawFrame], odometry: Sequence[Odometry] = ()) -> Heard:
         """Take the next set of frames.
@@ -165,7 +173,7 @@ class Pipeline:
         seen = measure_set(frames, detections, self._calibrations)
         time_s = set_time_s(frames)
         tracks = self._tracker.update(time_s, seen.measurements, odometry)
-        messages = self._listen(time_s, frames, seen.detections, tracks, odometry)
+        messages = self._listen(time_s, frames, seen, tracks, odometry)
         return Heard(time_s, seen, tracks, messages)
 
     def finish(self) -> tuple[Message, ...]:
@@ -175,22 +183,28 @@ class Pipeline:
         return tuple(said)
 
     def signals(self) -> tuple[Signal, ...]:
-        """Return how bright every track was so far."""
+        """Return how bright every track was so far; none where they are not kept."""
         return tuple(self._signal(track, samples) for track, samples in self._samples.items() if samples)
 
     def _listen(
         self,
         time_s: float,
         frames: Sequence[RawFrame],
-        detections: Sequence[Sequence[Detection]],
+        seen: SetMeasurements,
         tracks: Sequence[Track],
         odometry: Sequence[Odometry],
     ) -> tuple[Message, ...]:
         """Measure the brightness of each track in a set, and read on."""
         said: list[Message] = []
+        detections = seen.detections
+        if math.isfinite(seen.extinction_per_m):
+            self._extinction_per_m = seen.extinction_per_m
         for number in set(self._readers) - {track.track for track in tracks}:
             said += self._readers.pop(number).finish()
-        if time_s <= self._latest_s:  # what comes late is followed, if the tracker can, but not read
+        if time_s < self._latest_s - _SET_BACK_S:  # the clock was set back: tracks and signals begin anew
+            said += self.finish()
+            self._last_s.clear()
+        elif time_s <= self._latest_s:  # what comes late is followed, if the tracker can, but not read
             return tuple(said)
         self._latest_s = time_s
         by_key = {
@@ -207,10 +221,11 @@ class Pipeline:
             if not known:
                 continue
             best = min(known, key=lambda sample: sample.sigma_lit)
-            kept = self._samples.setdefault(track.track, [])
-            if kept and best.time_s <= kept[-1].time_s:
+            if best.time_s <= self._last_s.get(track.track, -math.inf):
                 continue
-            kept.append(best)
+            self._last_s[track.track] = best.time_s
+            if self._keeps_signals:
+                self._samples.setdefault(track.track, []).append(best)
             if track.ghost == "yes":  # it says what its robot says
                 continue
             if track.track not in self._readers:
@@ -241,7 +256,9 @@ class Pipeline:
     ) -> Sample | None:
         """Return the brightness of a track, which is `there` in a frame; None where nothing is known."""
         calibration = self._calibrations[frame.camera]
-        expected = expected_image(there.position_body_m, there.covariance[:3, :3], frame, calibration)
+        expected = expected_image(
+            there.position_body_m, there.covariance[:3, :3], frame, calibration, self._extinction_per_m
+        )
         if expected is None:
             return None
         own = [key for key in track.detections if key[:2] == (frame.camera, frame.index)]

@@ -67,6 +67,7 @@ class OwnParts:
             calibrations,
             # Loaded anew for each robot: what a tracker keeps in its file is one robot's.
             tracker=None if self.tracker is None else load_tracker(self.tracker),
+            keep_signals=True,
             decoder=None if decoder is None else lambda robot, track: OwnReader(decoder, calibrations),  # noqa: ARG005
         )
 

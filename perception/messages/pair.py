@@ -19,6 +19,7 @@ from perception.messages.uart import encode, meaning, packet_levels
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 WHO_ODDS = 1e3
 """Odds from which it is said who said which."""
@@ -128,8 +129,7 @@ class _PairReader:
         found: list[_Pair] = []
         for number in (0, 1):
             lattice = self._lattice(number, either, self._amplitudes)
-            for packet in self._tops(lattice):
-                found.append(self._settled(number, packet))
+            found += [self._settled(number, packet) for packet in self._tops(lattice)]
         if not found:
             return None
         best = max(found, key=lambda pair: pair.score)
@@ -200,7 +200,7 @@ class _PairReader:
         """Return the log-density of the samples at levels of the sum, shape (..., n)."""
         return log_density(self._samples.level - level, self._variance(level))
 
-    def _scored(self, lattice: Lattice, starts: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    def _scored(self, lattice: Lattice, starts: NDArray[np.int64]) -> tuple[Indices, Indices, Array]:
         """Return starts, rates and word scores of all packets that begin at `starts`."""
         steps, rates = (each.ravel() for each in np.meshgrid(starts, np.arange(len(self._clocks.drifts))))
         asked = lattice.promising(steps, rates)
@@ -248,7 +248,7 @@ class _PairReader:
     def _fitted(self, packets: Sequence[_Packet | None]) -> Array:
         """Return the amplitudes by least squares, with what was known of them; outliers do not count."""
         shares = np.stack([self._share(packet, 0.0) for packet in packets])
-        known = self._amplitudes
+        known: NDArray[np.floating] = self._amplitudes
         for _ in range(2):
             variance = self._variance(known @ shares)
             near = np.abs(self._samples.level - known @ shares) < 4.0 * np.sqrt(variance) + 0.1

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+BLIND_M2 = 1e5
+"""A range of a greater variance is none."""
+
 
 class States(NamedTuple):
     """Of n tracks.
@@ -111,11 +114,20 @@ def updated(states: States, innovations: Innovations) -> States:
     gain that is the best by Schmidt would choose between measurements by how far their shared errors differ
     from the state's. These are a few per cent of ranges, and differ by what noise is in the predicted ranges:
     it would follow measurements that happen to come out nearer, and be wrong about it.
+
+    Where only the bearing counts nothing moves along it. H is turned by a bearing that is itself noisy, and
+    would draw the track towards the observer by its noise, a little with each update, and call it certain;
+    what parallax a moving observer has is given up for that.
     """
     rows, residual, noise, load = innovations
     known = states.covariance - states.common[:, :, None] * states.common[:, None, :]
     crossed = known @ rows.transpose(0, 2, 1)
     gain = np.linalg.solve(rows @ crossed + noise, crossed.transpose(0, 2, 1)).transpose(0, 2, 1)
+    blind = noise[:, 2, 2] > BLIND_M2
+    if blind.any():
+        along = rows[blind, 2, :3]
+        aside = np.eye(3) - along[:, :, None] * along[:, None, :]
+        gain[blind] = np.einsum("ab,nij->naibj", np.eye(2), aside).reshape(-1, 6, 6) @ gain[blind]
     left = np.eye(6) - gain @ rows
     turned = gain.transpose(0, 2, 1)
     pushed = np.einsum("nij,nj->ni", gain, load)

@@ -80,10 +80,22 @@ class Observations(NamedTuple):
         return Observations._make(column[rows] for column in self)
 
 
+def usable(measurements: Sequence[Measurement]) -> list[int]:
+    """Return which measurements say where something is: finite times, places and bearings."""
+    return [
+        k
+        for k, one in enumerate(measurements)
+        if np.isfinite([one.time_s, *one.origin_body_m, *one.bearing_body]).all()
+    ]
+
+
 def observed(
     measurements: Sequence[Measurement], poses: Poses, time_s: float, settings: TrackerSettings
 ) -> Observations:
-    """Turn measurements, each by the observer's pose at its time, into the odometry frame."""
+    """Turn measurements, each by the observer's pose at its time, into the odometry frame.
+
+    Places and bearings must be finite (`usable`).
+    """
     m = len(measurements)
     origin_m = np.array([one.origin_body_m for one in measurements]).reshape(m, 3)
     bearing = np.array([one.bearing_body for one in measurements]).reshape(m, 3)
@@ -91,7 +103,7 @@ def observed(
     range_m = np.array([one.range_m for one in measurements], dtype=float)
     common_m = np.array([one.range_sigma_common_m for one in measurements], dtype=float)
     angle = covariance[:, :2, :2].copy()
-    angle[np.isnan(angle).any(axis=(1, 2))] = settings.bearing_sigma_rad**2 * np.eye(2)
+    angle[~np.isfinite(angle).all(axis=(1, 2))] = settings.bearing_sigma_rad**2 * np.eye(2)
     angle += (poses.rotation_sigma_rad**2)[:, None, None] * np.eye(2)
     claimed = np.isfinite(covariance[:, 2, 2])
     common_m = np.where(claimed, np.nan_to_num(common_m), settings.range_common_relative * range_m)

@@ -12,7 +12,7 @@ from perception.track.bank import Bank, newborn, replaced, taken_states
 from perception.track.fed import fed, swerved
 from perception.track.kalman import predicted, wandered
 from perception.track.merging import Shared, dimmed, shared_flares
-from perception.track.observations import Observations, observed
+from perception.track.observations import Observations, observed, usable
 from perception.track.odometry import Pose, pose_at, poses_at
 from perception.track.rejoin import continued, rejoined
 from perception.track.settings import TrackerSettings
@@ -67,6 +67,7 @@ class Tracker:
         self._next = 1
         self._clutter = LEAST_CLUTTER
         self._bank = _nobody()
+        self._odometry: tuple[Odometry, ...] = ()
         self._sharing: frozenset[tuple[int, int]] = frozenset()
 
     def update(
@@ -81,7 +82,8 @@ class Tracker:
         measurements
             Of one robot, in one set of frames.
         odometry
-            Its records around that time, by time; empty: it stands still.
+            Its records around that time, by time. Without any the last ones still hold; who never gave any
+            stands still.
 
         Raises
         ------
@@ -90,7 +92,9 @@ class Tracker:
         """
         if not math.isfinite(time_s):
             raise ValueError(f"time of a set is {time_s}; wanted seconds")
+        measurements = [measurements[k] for k in usable(measurements)]
         self._name(measurements)
+        odometry = self._last_known(odometry)
         if time_s < self._time_s - self.settings.late_s:
             self._bank, self._time_s = _nobody(), -math.inf
         if time_s < self._time_s:
@@ -119,10 +123,16 @@ class Tracker:
         odometry
             As in `update`, around that time.
         """
-        pose = pose_at(odometry, time_s)
+        pose = pose_at(odometry or self._odometry, time_s)
         after_s = time_s - self._time_s if math.isfinite(self._time_s) else 0.0
         bank = self._moved(after_s, pose)
         return life.tracks(bank.taken(bank.number > 0), self._robot, time_s, pose, {})
+
+    def _last_known(self, odometry: Sequence[Odometry]) -> Sequence[Odometry]:
+        """Return the odometry of a set: where a set comes without, the last two records go on."""
+        if odometry:
+            self._odometry = tuple(odometry[-2:])
+        return odometry or self._odometry
 
     def _name(self, measurements: Sequence[Measurement]) -> None:
         names = sorted({one.robot for one in measurements} | ({self._robot} - {""}))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from perception.track import Tracker, TrackerSettings
-from perception.types import Measurement, Track
+from perception.types import Measurement, Odometry, Track
 from tests.unit.perception.simulation import random
 from tests.unit.perception.track.world import (
     COMMON,
@@ -323,3 +323,42 @@ def test_trackers_are_independent_and_repeatable() -> None:
             np.testing.assert_array_equal(a.covariance, b.covariance)
     assert matched(simulated[-1], one[-1], 0.4)
     assert turn(0.0)[0, 0] == 1.0
+
+
+@pytest.mark.parametrize("bearing_sigma_rad", [3e-4, 2e-3])
+def test_bearings_alone_leave_the_range_where_it_was(bearing_sigma_rad: float) -> None:
+    """Two seconds with ranges, three with bearings alone: the track neither falls in nor claims to know."""
+    tracker, place_m = Tracker(), np.array([3.0, 0.0, 0.0])
+    for step in range(150):
+        one = measurement(place_m, step / 30.0, random(1701, step), bearing_sigma_rad=bearing_sigma_rad)
+        if step >= 60:
+            one = dataclasses.replace(one, range_m=math.nan)
+        tracks = tracker.update(step / 30.0, [one])
+    (track,) = tracks
+    off_m = track.position_body_m - place_m
+    sigma_m = math.sqrt(track.covariance[0, 0])
+    assert 0.2 < sigma_m < 2.0
+    assert abs(off_m[0]) < 3.0 * sigma_m
+    assert np.abs(off_m[1:]).max() < 0.02
+
+
+def test_what_says_nowhere_is_left_out() -> None:
+    tracker = Tracker()
+    good, bad = np.array([3.0, 0.0, 0.0]), np.array([2.0, 1.0, 0.0])
+    for step in range(40):
+        rng = random(1702, step)
+        nowhere = dataclasses.replace(measurement(bad, step / 30.0, rng), origin_body_m=(math.nan, 0.0, 0.0))
+        tracks = tracker.update(step / 30.0, [measurement(good, step / 30.0, rng), nowhere])
+    assert [(track.track, track.unseen_s) for track in tracks] == [(1, 0.0)]
+
+
+def test_a_set_without_odometry_goes_on_with_the_last() -> None:
+    tracker = Tracker()
+    pose = Odometry("r1", 0.0, np.array([5.0, 0.0, 0.0]), np.eye(3))
+    for step in range(40):
+        time_s = step / 30.0
+        known = [] if step == 30 else [dataclasses.replace(pose, time_s=time_s)]
+        one = measurement(np.array([3.0, 0.0, 0.0]), time_s, random(1703, step))
+        for track in tracker.update(time_s, [one], known):
+            assert abs(track.position_body_m[0] - 3.0) < 0.2
+            assert track.track == 1
