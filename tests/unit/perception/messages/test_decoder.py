@@ -23,7 +23,7 @@ def _sent(case: int, k: int, noise: float, seconds: float = 9.5, **how: float) -
 
 @pytest.mark.parametrize(("noise", "how"), [(0.1, {}), (0.2, {"dropped": 0.05}), (0.2, {"fps": 100.0})])
 def test_every_word_is_read_where_light_is_plain(noise: float, how: dict[str, float]) -> None:
-    for k in range(24):
+    for k in range(12):
         word, start_s, heard = _sent(2100, k, noise, **how)
         (message,) = decode(heard)
         assert (message.word, message.frames) == (word, 5)
