@@ -112,7 +112,10 @@ def _checked(message: Any, signal: Signal, where: str) -> Message:
         raise DecoderError(f"{where}: word of a message is {message.word!r}; wanted a whole number")
     if not 0 <= message.word < WORDS:
         raise DecoderError(f"{where}: word of a message is {message.word}; wanted 0 to {WORDS - 1}")
-    if not (0.0 <= message.confidence <= 1.0 and np.isfinite([message.start_s, message.end_s]).all()):
+    numbers = (message.start_s, message.end_s, message.confidence, message.frames)
+    if not all(isinstance(one, int | float | np.number) for one in numbers):
+        raise DecoderError(f"{where}: start_s, end_s, confidence and frames of a message are {numbers}")
+    if not (0.0 <= message.confidence <= 1.0 and np.isfinite(numbers).all()):
         raise DecoderError(
             f"{where}: a message goes from {message.start_s} to {message.end_s} s with confidence "
             f"{message.confidence}; wanted finite times and a probability"

@@ -124,6 +124,8 @@ def _checked(track: object, where: str) -> Track:
             raise TrackerError(f"{where}: {name} of a track: {error}") from None
         if arrays[name].shape != shape:
             raise TrackerError(f"{where}: {name} of a track has shape {arrays[name].shape}; wanted {shape}")
+        if not np.isfinite(arrays[name]).all():
+            raise TrackerError(f"{where}: {name} of a track is not finite; leave out what is not known")
     if not isinstance(track.track, int | np.integer):
         raise TrackerError(f"{where}: number of a track is {track.track!r}; wanted a whole number")
     return dataclasses.replace(track, track=int(track.track), **arrays)

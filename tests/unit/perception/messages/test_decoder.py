@@ -1,6 +1,7 @@
 """The decoder on signals made by hand: what is read, what is refused, and nothing wrong."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,12 +10,12 @@ from perception.messages.decoder import Decoder, decode
 from perception.messages.paper import decode_paper
 from perception.messages.settings import DecoderSettings
 from perception.messages.uart import COMMANDS, aliases
-from perception.types import Signal
+from perception.types import Message, Signal
 from tests.unit.perception.messages.wire import signal
 from tests.unit.perception.simulation import random
 
 
-def _sent(case: int, k: int, noise: float, seconds: float = 9.5, **how: float) -> tuple[int, float, Signal]:
+def _sent(case: int, k: int, noise: float, seconds: float = 9.5, **how: Any) -> tuple[int, float, Signal]:
     rng = random(case, k)
     word, start_s = int(rng.integers(128)), 2.0 + rng.uniform(0.0, 0.1)
     drift = rng.uniform(-0.015, 0.015)
@@ -22,7 +23,7 @@ def _sent(case: int, k: int, noise: float, seconds: float = 9.5, **how: float) -
 
 
 @pytest.mark.parametrize(("noise", "how"), [(0.1, {}), (0.2, {"dropped": 0.05}), (0.2, {"fps": 100.0})])
-def test_every_word_is_read_where_light_is_plain(noise: float, how: dict[str, float]) -> None:
+def test_every_word_is_read_where_light_is_plain(noise: float, how: dict[str, Any]) -> None:
     for k in range(12):
         word, start_s, heard = _sent(2100, k, noise, **how)
         (message,) = decode(heard)
@@ -90,7 +91,8 @@ def test_it_reads_on_the_way_as_it_does_at_once() -> None:
     heard = signal([(1.5, 8), (8.0, 65), (15.0, 3)], 24.0, 0.15, rng)
     whole = decode(heard)
     assert [message.word for message in whole] == [8, 65, 3]
-    decoder, said = Decoder("r1", 1), []
+    decoder = Decoder("r1", 1)
+    said: list[Message] = []
     for k in range(0, len(heard.time_s), 5):
         part = {name: getattr(heard, name)[k : k + 5] for name in ("time_s", "exposure_s", "level")}
         said += decoder.push(
