@@ -50,7 +50,7 @@ docs: setup
 
 bench: setup
 	@set -e; for file in benchmarks/*.py; do \
-		if [ -f "$$file" ]; then $(BIN)/python "$$file"; fi; \
+		if [ -f "$$file" ]; then PYTHONPATH=. $(BIN)/python -P "$$file"; fi; \
 	done
 
 clean:
