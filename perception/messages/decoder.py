@@ -24,7 +24,7 @@ from perception.messages.lattice import (
 )
 from perception.messages.samples import LevelScale, likelihood_of_levels, usable_samples
 from perception.messages.settings import DecoderSettings
-from perception.messages.uart import IDLE_BITS, meaning
+from perception.messages.uart import IDLE_BITS, aliases, meaning
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]
@@ -33,11 +33,11 @@ Numbers = NDArray[np.int64]
 
 _BLOCK = 3 * STEPS_PER_BIT  # steps that are taken in at once
 _MARGIN = 4  # steps that a sample's exposure may reach over its middle, and half a bit of decency
-_LAST_CHANCE = (IDLE_BITS + 1) * STEPS_PER_BIT  # steps after its end until a packet must have been settled
+_LAST_CHANCE = (IDLE_BITS + 2) * STEPS_PER_BIT  # steps after its end until a packet must have been settled
 _BACK = _LAST_CHANCE + 4 * _BLOCK  # steps that are kept before the longest packet
 _WORTH_ASKING = 15.0  # log-likelihood over idle from which a packet is looked into
 _GARBAGE = float(np.log(1e-3))  # log-probability that what starts is no packet
-_LIKELY = 7.0  # clock rates whose log-probability is this far below the best one's matter
+_LIKELY = 7.0  # clock rates whose log-probability is not this far below the best one's come first
 _NEIGHBOURS = 6  # steps to either side that count as the same packet
 _FORGET_S = 12.0  # a gap after which a signal starts anew
 _BACKWARDS_S = 1.0  # a clock that jumps back by more starts anew; by less, its samples are left out
@@ -70,6 +70,11 @@ class Decoder:
         step_rate = self._settings.packets_per_s * self._clocks.step_s
         self._log_start = float(np.log(step_rate / len(self._settings.words)))
         self._log_garbage = float(np.log(step_rate)) + _GARBAGE
+        known = set(self._settings.words)
+        self._rotated = [
+            any(other in known and other != word for _, other in aliases(word))
+            for word in self._settings.words
+        ]
         self._restart()
 
     def _restart(self) -> None:
@@ -220,14 +225,20 @@ class Decoder:
         over = starts + self._clocks.lengths[rates] <= self._complete
         starts, rates = starts[over], rates[over]
         ends = starts + self._clocks.lengths[rates]
+        if not self._phase_known(one, lattice):
+            return None
         score = lattice.words(starts, rates)[:, one.column]
         log = self._before[rates, starts] + score + self._log_start
         if _log_sum(log) - _log_sum(self._idle) < np.log(self._settings.confidence):
             return None  # not even where nothing else is under way
-        under_way = self._under_way(lattice)
-        total = _log_sum(np.logaddexp(self._idle, _log_sum(under_way)))
+        # The clocks on which idle is likely come first: most that is refused is refused by them.
+        likely = self._idle > self._idle.max() - _LIKELY
+        under_way = self._under_way(lattice, likely)
+        if self._share(log + self._after(under_way, rates, ends), under_way) < self._settings.confidence:
+            return None
+        under_way = np.maximum(under_way, self._under_way(lattice, ~likely))
         log += self._after(under_way, rates, ends)
-        confidence = min(float(np.exp(_log_sum(log) - total)), 1.0)
+        confidence = self._share(log, under_way)
         if confidence < self._settings.confidence:
             return None
         weight = np.exp(log - log.max())
@@ -248,13 +259,27 @@ class Decoder:
             frames=len(seen),
         )
 
-    def _under_way(self, lattice: Lattice) -> Array:
+    def _phase_known(self, one: _Candidate, lattice: Lattice) -> bool:
+        """Return whether a word cannot be another's rotation, or idle was seen before it or after it."""
+        if not self._rotated[one.column]:
+            return True
+        start, idle = one.start - self._done, int(self._clocks.idle[one.rate])
+        end = start + int(self._clocks.lengths[one.rate])
+        after = end + idle <= self._complete and lattice.idle_seen(end + idle, one.rate)
+        return after or lattice.idle_seen(start, one.rate)
+
+    def _share(self, log: Array, under_way: Array) -> float:
+        """Return the share of some explanations among all: idle now, or a packet under way."""
+        total = _log_sum(np.logaddexp(self._idle, _log_sum(under_way)))
+        return min(float(np.exp(_log_sum(log) - total)), 1.0)
+
+    def _under_way(self, lattice: Lattice, asked_rates: NDArray[np.bool_]) -> Array:
         """Return the log-probability of packets that began and have not ended, shape (rates, starts).
 
-        Starts are the steps of a longest packet up to now; only clock rates that matter are looked into.
+        Starts are the steps of a longest packet up to now; only the clock rates asked for are looked into.
         """
         first = self._complete - self._clocks.longest + 1
-        likely = np.flatnonzero(self._idle > self._idle.max() - _LIKELY)
+        likely = np.flatnonzero(asked_rates)
         steps = np.arange(first, self._complete + 1)
         starts, rates = (pair.ravel() for pair in np.meshgrid(steps, likely))
         going = starts + self._clocks.lengths[rates] > self._complete

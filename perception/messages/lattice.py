@@ -12,19 +12,22 @@ from numpy.typing import NDArray
 
 from perception.messages.samples import LevelLikelihood, Samples
 from perception.messages.settings import DecoderSettings
-from perception.messages.uart import FRAME_BITS, frames_of_words
+from perception.messages.uart import FRAME_BITS, IDLE_BITS, frames_of_words
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 STEPS_PER_BIT = 8
 _RATES = 11  # clock rates from −drift to +drift: neighbours part by 1.3 steps over a packet
-_JITTER = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # where in its step an edge lies, in steps
+# Where an edge may lie about its step, in steps, and how probably: the lattice rounds start, rate and edge.
+_JITTER = np.array([-0.9, -0.35, 0.0, 0.35, 0.9])
+_LOG_JITTER = np.log([0.1, 0.25, 0.3, 0.25, 0.1])
 _GARBAGE_LEVELS = np.linspace(0.0, 1.0, 5)[:, None]
 _ENDED, _BEGUN, _DARK, _RISE, _FALL, _GARBAGE, _SEEN = range(7)
 _SUMMED = [_ENDED, _BEGUN, _GARBAGE, _SEEN]
 ROWS = 7
-_HOPELESS = 6.0
+_HOPELESS = 6.0  # log-likelihood for lit against dark that tells
+_DARK_BIT = 3.0  # and for dark against lit
 
 
 class Clocks:
@@ -39,6 +42,7 @@ class Clocks:
         bits = np.arange(FRAME_BITS * settings.repeats + 1)
         self.edges: Numbers = np.rint(STEPS_PER_BIT * np.outer(1.0 + self.drifts, bits)).astype(np.int64)
         self.lengths: Numbers = self.edges[:, -1]
+        self.idle: Numbers = np.ceil(STEPS_PER_BIT * IDLE_BITS * (1.0 + self.drifts)).astype(np.int64)
         self.longest = int(self.lengths.max())
         self.templates = _templates(settings.words)
 
@@ -66,8 +70,8 @@ def add_samples(
     garbage = np.log(np.exp(score(_GARBAGE_LEVELS) - lit).mean(axis=0))
     middle = (samples.time_s - origin_s) / step_s
     half = 0.5 * samples.exposure_s / step_s
-    begun = np.floor(middle - half - 0.5).astype(np.int64) + 1  # the first edge that may cut it
-    ended = np.ceil(middle + half + 0.5).astype(np.int64)  # the first one after it
+    begun = np.floor(middle - half - 1.0).astype(np.int64) + 1  # the first edge that may cut it
+    ended = np.ceil(middle + half + 1.0).astype(np.int64)  # the first one after it
     table[_ENDED] += np.bincount(ended, dark, size)[:size]
     table[_BEGUN] += np.bincount(begun, dark, size)[:size]
     table[_GARBAGE] += np.bincount(ended, garbage, size)[:size]
@@ -75,10 +79,10 @@ def add_samples(
     for further in range(int((ended - begun).max(initial=0))):
         edge = begun + further
         cut = edge < ended
-        place = np.add.outer(np.array(_JITTER), edge - middle + half) / (2.0 * half)
+        place = np.add.outer(_JITTER, edge - middle + half) / (2.0 * half)
         before = np.clip(place, 0.0, 1.0)
-        fall = np.where(cut, _log_mean(score(before)) - lit, 0.0)
-        rise = np.where(cut, _log_mean(score(1.0 - before)) - lit, 0.0)
+        fall = np.where(cut, _over_jitter(score(before)) - lit, 0.0)
+        rise = np.where(cut, _over_jitter(score(1.0 - before)) - lit, 0.0)
         table[_DARK] += np.bincount(edge, np.where(cut, dark, 0.0), size)[:size]
         table[_RISE] += np.bincount(edge, rise, size)[:size]
         table[_FALL] += np.bincount(edge, fall, size)[:size]
@@ -92,9 +96,10 @@ def moved_on(table: Array, steps: int) -> None:
     table[_ENDED, 0] += open_score  # of samples that began before the window and end within it
 
 
-def _log_mean(logs: Array) -> Array:
-    top = logs.max(axis=0)
-    return np.asarray(top + np.log(np.exp(logs - top).mean(axis=0)))
+def _over_jitter(logs: Array) -> Array:
+    weighted = logs + _LOG_JITTER[:, None]
+    top = weighted.max(axis=0)
+    return np.asarray(top + np.log(np.exp(weighted - top).sum(axis=0)))
 
 
 class Lattice:
@@ -135,3 +140,14 @@ class Lattice:
         """Return of which repeats each bit was seen, shape (repeats,)."""
         seen = np.diff(self._seen[start + self._clocks.edges[rate]])
         return np.asarray((seen > 0).reshape(-1, FRAME_BITS).all(axis=1))
+
+    def idle_seen(self, start: int, rate: int) -> bool:
+        """Return whether the source was plainly lit in the eleven bits before a step, which is no start then.
+
+        No packet holds eleven lit bits. Two of them may have been missed; none may look dark.
+        """
+        bit = STEPS_PER_BIT * (1.0 + float(self._clocks.drifts[rate]))
+        edges = start - np.rint(bit * np.arange(IDLE_BITS + 1)).astype(np.int64)[::-1]
+        dark = self._sums[0][edges[1:]] - self._sums[1][edges[:-1]]
+        seen = np.diff(self._seen[edges]) > 0
+        return bool(seen.sum() >= IDLE_BITS - 2 and dark.max() < _DARK_BIT and dark.sum() < -_HOPELESS)

@@ -1,0 +1,259 @@
+"""How well messages are read, and how fast: one JSON object. `--quick` takes a minute, all of it about an hour.
+
+Amplitude over noise is that of one sample, at 30 FPS and 10 Hz: three samples a bit.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from perception.messages.decoder import Decoder, decode
+from perception.messages.lattice import ROWS, Clocks, Lattice, add_samples
+from perception.messages.pair import decode_pair
+from perception.messages.paper import decode_paper
+from perception.messages.samples import likelihood_of_levels, usable_samples
+from perception.messages.settings import DecoderSettings
+from perception.types import Signal
+from tests.unit.perception.messages.signals import (
+    Sent,
+    any_packet,
+    frame_times,
+    heard,
+    shares,
+    signal_of,
+)
+from tests.unit.perception.simulation import random
+
+THEORY = {1: 3.18, 5: 1.40}
+"""A/σ for 10⁻³ of payload bits, whole words, phase and drift unknown (PHYSICS.md 8)."""
+WHERE = {1: (2.8, 3.0, 3.18, 3.37, 3.6), 5: (1.2, 1.3, 1.4, 1.48, 1.6)}
+
+
+def most_likely(signal: Signal, sent: Sent, settings: DecoderSettings, told: bool = False) -> int:
+    """Return the word of the most likely packet that starts within half a bit of the true start.
+
+    `told`: on the true clock, at the true start, to the lattice's step.
+    """
+    clocks = Clocks(settings)
+    columns = (signal.time_s, signal.exposure_s, signal.level, signal.sigma_dark, signal.sigma_lit)
+    samples = usable_samples(*columns, settings)
+    origin_s = float(samples.time_s[0]) - 10 * clocks.step_s
+    size = int((samples.time_s[-1] - origin_s) / clocks.step_s) + clocks.longest + 20
+    table = np.zeros((ROWS, size))
+    add_samples(table, samples, likelihood_of_levels(samples, 1.0), origin_s, clocks.step_s)
+    start = (sent.start_s - origin_s) / clocks.step_s
+    steps = np.array([round(start)]) if told else np.arange(np.ceil(start - 4), np.floor(start + 4) + 1)
+    rates = np.arange(len(clocks.drifts))
+    if told:
+        rates = rates[[np.argmin(np.abs(clocks.drifts - sent.drift))]]
+    starts, numbers = (each.ravel() for each in np.meshgrid(steps.astype(int), rates))
+    words = Lattice(table, clocks).words(starts, numbers).astype(float)
+    return int(np.argmax(np.log(np.exp(words - words.max()).sum(axis=0))))
+
+
+def wrong_bits(word: int, read: int) -> int:
+    return (word ^ read).bit_count()
+
+
+def error_rates(runs: int) -> dict[str, Any]:
+    """Payload bits wrong where something must be said, and the paper's decoder beside it."""
+    found: dict[str, Any] = {}
+    for repeats, where in WHERE.items():
+        settings = DecoderSettings(repeats=repeats, lit_floor=0.0, dark_floor=0.0)
+        rows = {}
+        for snr in where:
+            rng = random(810, repeats, round(100 * snr))
+            wrong = 0
+            for run in range(runs):
+                sent = any_packet(rng, run % 128, repeats=repeats)
+                wrong += wrong_bits(run % 128, most_likely(heard(rng, [sent], snr), sent, settings))
+            rows[f"{snr:g}"] = with_error(wrong, 7 * runs)
+        found[f"{repeats} frames"] = {"theory_snr_at_1e-3": THEORY[repeats], "payload_bit_errors": rows}
+    rows = {}
+    for snr in (1.9, 3.0, 5.0, 6.0, 7.0, 8.0, 10.0):
+        rng = random(811, round(100 * snr))
+        received = wrong = 0
+        for run in range(runs):
+            read = decode_paper(heard(rng, [any_packet(rng, run % 128)], snr))
+            received += any(message.word == run % 128 for message in read)
+            wrong += any(message.word != run % 128 for message in read)
+        rows[f"{snr:g}"] = {"received": received / runs, "wrong": wrong / runs}
+    found["paper"] = rows
+    return found
+
+
+def with_error(wrong: int, of: int) -> dict[str, float]:
+    return {"rate": wrong / of, "sigma": float(np.sqrt(max(wrong, 1)) / of)}
+
+
+def dropped(runs: int) -> dict[str, Any]:
+    """5 % of the frames dropped: beside a decoder that is told phase and clock."""
+    settings = DecoderSettings(lit_floor=0.0, dark_floor=0.0)
+    rows = {}
+    for snr in (1.1, 1.25, 1.4, 1.57):  # 1 dB apart
+        rng = random(812, round(100 * snr))
+        wrong = told = 0
+        for run in range(runs):
+            sent = any_packet(rng, run % 128)
+            signal = heard(rng, [sent], snr, drops=0.05)
+            wrong += wrong_bits(run % 128, most_likely(signal, sent, settings))
+            told += wrong_bits(run % 128, most_likely(signal, sent, settings, told=True))
+        rows[f"{snr:g}"] = {"decoder": with_error(wrong, 7 * runs), "told": with_error(told, 7 * runs)}
+    return rows
+
+
+def packets(runs: int, settings: DecoderSettings, drops: float = 0.0) -> dict[str, Any]:
+    """The whole decoder: nothing known beforehand, nothing said below its confidence."""
+    rows = {}
+    for snr in (2.0, 3.0, 5.0, 10.0):
+        rng = random(813, len(settings.words), round(10 * snr), round(1000 * drops))
+        received = wrong = 0
+        for run in range(runs):
+            word = settings.words[run % len(settings.words)]
+            read = decode(heard(rng, [any_packet(rng, word)], snr, drops=drops), settings)
+            received += any(message.word == word for message in read)
+            wrong += sum(message.word != word for message in read)
+        rows[f"{snr:g}"] = {"packets": runs, "received": received / runs, "wrong": wrong}
+    return rows
+
+
+def inside(runs: int) -> dict[str, Any]:
+    """Recordings that start inside a packet, all words in turn, at A/σ 4 to 100; they end anywhere."""
+    rng = random(814)
+    right = wrong = 0
+    for run in range(runs):
+        sent = Sent(run % 128, 0.0, rng.uniform(-0.015, 0.015))
+        end_s = sent.end_s + rng.choice([-0.5, 0.0, 0.3, 1.2, 2.5])
+        begin_s = rng.uniform(0.01, min(5.4, end_s - 0.5))
+        snr = rng.choice([4.0, 8.0, 20.0, 100.0])
+        read = decode(heard(rng, [sent], float(snr), begin_s=begin_s, end_s=float(end_s)))
+        right += any(message.word == sent.word for message in read)
+        wrong += any(message.word != sent.word for message in read)
+    return {"recordings": runs, "read": right, "wrong": wrong}
+
+
+def merges(runs: int) -> dict[str, Any]:
+    """Two sources that send, whose light falls together for a while, told to the decoder or not."""
+    rows = {}
+    for told in (True, False):
+        rng = random(815, told)
+        right = wrong = 0
+        for run in range(runs):
+            sent = any_packet(rng, run % 128)
+            other = any_packet(rng, int(rng.integers(128)), start_s=rng.uniform(-4.0, 6.0))
+            times_s = frame_times(rng, 0.0, sent.end_s + 1.5, 30.0, 0.0)
+            begin_s, lasts_s = rng.uniform(0.0, 7.0), rng.uniform(0.1, 3.0)
+            together = (times_s > begin_s) & (times_s < begin_s + lasts_s)
+            level = shares(times_s, [sent], 1e-3)
+            level = level + together * rng.uniform(0.2, 2.0) * shares(times_s, [other], 1e-3)
+            signal = signal_of(times_s, level, 0.1, rng)
+            if told:
+                signal.sigma_dark[together] = signal.sigma_lit[together] = np.inf
+            read = decode(signal)
+            right += any(message.word == sent.word for message in read)
+            wrong += sum(message.word != sent.word for message in read)
+        rows["told" if told else "untold"] = {"merges": runs, "received": right, "wrong": wrong}
+    return rows
+
+
+def false_messages(hours: float) -> dict[str, Any]:
+    """Messages from what sends none: idle, lamps at twice the mains' frequency, noise, random bits."""
+    rows = {}
+    for number, name in enumerate(("idle", "lamp 100 Hz", "lamp 120 Hz", "noise", "random bits")):
+        rng = random(816, number)
+        times_s = frame_times(rng, 0.0, 3600.0 * hours, 30.003, 0.0)
+        level = np.ones(len(times_s))
+        if name.startswith("lamp"):
+            level = 0.5 + 0.5 * np.sin(2.0 * np.pi * float(name.split()[1]) * times_s)
+        if name == "noise":
+            level = rng.uniform(0.0, 1.0, len(times_s))
+        if name == "random bits":
+            level = rng.integers(0, 2, int(times_s[-1] * 10) + 1)[(times_s * 10).astype(int)].astype(float)
+        said = len(decode(signal_of(times_s, level, 0.1, rng)))
+        rows[name] = {"hours": hours, "messages": said}
+    return rows
+
+
+def pairs(runs: int) -> dict[str, Any]:
+    """Two sources in one pixel, the weaker at 8 σ, clocks 0.5 % apart, one up to a packet later."""
+    rows = {}
+    for ratio in (0.98, 0.9, 0.7, 0.5, 0.2):
+        rng = random(817, round(100 * ratio))
+        both = said_who = wrong_who = wrong = 0
+        for _ in range(runs):
+            words = [int(word) for word in rng.integers(128, size=2)]
+            drift = rng.uniform(-0.01, 0.01)
+            first = Sent(words[0], 2.0 + rng.uniform(0.0, 0.1), drift + 0.0025)
+            second = Sent(words[1], 2.0 + rng.uniform(0.0, 5.5), drift - 0.0025)
+            times_s = frame_times(rng, 0.0, 15.0, 30.0, 0.0)
+            level = shares(times_s, [first], 1e-3) + ratio * shares(times_s, [second], 1e-3)
+            known = (1.0 + 0.05 * rng.standard_normal(), ratio * (1.0 + 0.05 * rng.standard_normal()))
+            signal = signal_of(times_s, level, ratio / 8.0, rng)
+            read = decode_pair(signal, known, (0.05, 0.05 * ratio), (1, 2))
+            both += sorted(message.word for message in read) == sorted(words)
+            wrong += sum(message.word not in words for message in read)
+            sure = [message for message in read if message.ambiguous_with is None]
+            said_who += len(sure) == 2
+            wrong_who += any(message.word != words[message.track - 1] for message in sure)
+        rows[f"1:{ratio:g}"] = {
+            "runs": runs,
+            "both_words": both / runs,
+            "words_wrong": wrong,
+            "said_who": said_who / runs,
+            "wrong_who": wrong_who,
+        }
+    return rows
+
+
+def speed() -> dict[str, float]:
+    """Milliseconds of one core for each set of 20 tracks that all send without a pause, in real time."""
+    rows = {}
+    for fps in (30.0, 100.0):
+        rng = random(818, int(fps))
+        heard_all = [
+            heard(rng, [Sent(n, 0.5 + 5.6 * k) for k in range(5)], 10.0, fps=fps, end_s=29.0)
+            for n in range(20)
+        ]
+        decoders = [Decoder("r1", n) for n in range(20)]
+        sets = len(heard_all[0].time_s) // 4
+        started = time.process_time()
+        for at in range(sets):
+            for decoder, signal in zip(decoders, heard_all, strict=True):
+                some = slice(4 * at, 4 * at + 4)
+                decoder.push(
+                    Signal("r1", 1, signal.time_s[some], signal.exposure_s[some], signal.level[some],
+                           signal.sigma_dark[some], signal.sigma_lit[some])
+                )  # fmt: skip
+        rows[f"{fps:g} FPS"] = round(1e3 * (time.process_time() - started) / (4 * sets), 3)
+    return rows
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a twentieth to a hundredth of the runs")
+    parser.add_argument("--only", help="one part")
+    arguments = parser.parse_args()
+    quick = arguments.quick
+    parts = {
+        "speed_ms_per_set_of_20_tracks": speed,
+        "error_rates": lambda: error_rates(256 if quick else 20_000),
+        "dropped_5_percent": lambda: dropped(128 if quick else 5_000),
+        "packets_all_words": lambda: packets(128 if quick else 10_000, DecoderSettings()),
+        "packets_commands": lambda: packets(64 if quick else 10_000, DecoderSettings(words=tuple(range(16)))),
+        "packets_5_percent_dropped": lambda: packets(64 if quick else 5_000, DecoderSettings(), 0.05),
+        "recordings_that_start_inside": lambda: inside(512 if quick else 100_000),
+        "merges": lambda: merges(64 if quick else 10_000),
+        "false_messages": lambda: false_messages(0.1 if quick else 10.0),
+        "pairs": lambda: pairs(3 if quick else 500),
+    }
+    if arguments.only is not None and arguments.only not in parts:
+        parser.error(f"there is no part {arguments.only!r}; wanted one of {', '.join(parts)}")
+    wanted = [arguments.only] if arguments.only else parts
+    print(json.dumps({name: parts[name]() for name in wanted}, indent=2))
