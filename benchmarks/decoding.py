@@ -1,4 +1,4 @@
-"""How well messages are read, and how fast: one JSON object. `--quick` takes a minute, all of it about an hour.
+"""How well messages are read, and how fast: one JSON object. A minute or two; with `--full` about an hour.
 
 Amplitude over noise is that of one sample, at 30 FPS and 10 Hz: three samples a bit.
 """
@@ -32,7 +32,7 @@ from tests.unit.perception.messages.signals import (
 from tests.unit.perception.simulation import random
 
 THEORY = {1: 3.18, 5: 1.40}
-"""A/σ for 10⁻³ of payload bits, whole words, phase and drift unknown (PHYSICS.md 8)."""
+"""A/σ for 10⁻³ of payload bits, whole words, phase and drift unknown (docs/physics.md, Optical language)."""
 WHERE = {1: (2.8, 3.0, 3.18, 3.37, 3.6), 5: (1.2, 1.3, 1.4, 1.48, 1.6)}
 
 
@@ -59,6 +59,7 @@ def most_likely(signal: Signal, sent: Sent, settings: DecoderSettings, told: boo
 
 
 def wrong_bits(word: int, read: int) -> int:
+    """Return how many payload bits of a word are read wrong."""
     return (word ^ read).bit_count()
 
 
@@ -90,6 +91,7 @@ def error_rates(runs: int) -> dict[str, Any]:
 
 
 def with_error(wrong: int, of: int) -> dict[str, float]:
+    """Return a rate and its standard deviation."""
     return {"rate": wrong / of, "sigma": float(np.sqrt(max(wrong, 1)) / of)}
 
 
@@ -110,7 +112,7 @@ def dropped(runs: int) -> dict[str, Any]:
 
 
 def packets(runs: int, settings: DecoderSettings, drops: float = 0.0) -> dict[str, Any]:
-    """The whole decoder: nothing known beforehand, nothing said below its confidence."""
+    """Run the whole decoder: nothing known beforehand, nothing said below its confidence."""
     rows = {}
     for snr in (2.0, 3.0, 5.0, 10.0):
         rng = random(813, len(settings.words), round(10 * snr), round(1000 * drops))
@@ -125,7 +127,7 @@ def packets(runs: int, settings: DecoderSettings, drops: float = 0.0) -> dict[st
 
 
 def inside(runs: int) -> dict[str, Any]:
-    """Recordings that start inside a packet, all words in turn, at A/σ 4 to 100; they end anywhere."""
+    """Decode recordings that start inside a packet, all words in turn, at A/σ 4 to 100; they end anywhere."""
     rng = random(814)
     right = wrong = 0
     for run in range(runs):
@@ -237,10 +239,10 @@ def speed() -> dict[str, float]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a twentieth to a hundredth of the runs")
+    parser.add_argument("--full", action="store_true", help="twenty to a hundred times the runs")
     parser.add_argument("--only", help="one part")
     arguments = parser.parse_args()
-    quick = arguments.quick
+    quick = not arguments.full
     parts = {
         "speed_ms_per_set_of_20_tracks": speed,
         "error_rates": lambda: error_rates(256 if quick else 20_000),

@@ -88,6 +88,5 @@ def pieces(signal: Signal, ends: Sequence[int]) -> list[Signal]:
     cuts = [0, *ends, len(signal.time_s)]
     columns = (signal.time_s, signal.exposure_s, signal.level, signal.sigma_dark, signal.sigma_lit)
     return [
-        Signal(signal.robot, signal.track, *(column[a:b] for column in columns))
-        for a, b in pairwise(cuts)
+        Signal(signal.robot, signal.track, *(column[a:b] for column in columns)) for a, b in pairwise(cuts)
     ]
