@@ -268,7 +268,7 @@ class Decoder:
         after = end + idle <= self._complete and lattice.idle_seen(end + idle, one.rate)
         return after or lattice.idle_seen(start, one.rate)
 
-    def _share(self, log: Array, under_way: NDArray[np.floating]) -> float:
+    def _share(self, log: NDArray[np.floating], under_way: NDArray[np.floating]) -> float:
         """Return the share of some explanations among all: idle now, or a packet under way."""
         total = _log_sum(np.logaddexp(self._idle, _log_sum(under_way)))
         return min(float(np.exp(_log_sum(log) - total)), 1.0)
