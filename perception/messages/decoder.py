@@ -31,13 +31,15 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 Numbers = NDArray[np.int64]
 
-_BLOCK = 3 * STEPS_PER_BIT  # steps that are taken in at once
+_BLOCK = 5 * STEPS_PER_BIT  # steps that are taken in at once
 _MARGIN = 4  # steps that a sample's exposure may reach over its middle, and half a bit of decency
 _LAST_CHANCE = (IDLE_BITS + 2) * STEPS_PER_BIT  # steps after its end until a packet must have been settled
 _BACK = _LAST_CHANCE + 4 * _BLOCK  # steps that are kept before the longest packet
 _WORTH_ASKING = 15.0  # log-likelihood over idle from which a packet is looked into
 _GARBAGE = float(np.log(1e-3))  # log-probability that what starts is no packet
-_LIKELY = 7.0  # clock rates whose log-probability is not this far below the best one's come first
+_LIKELY = 7.0  # a packet's clocks are those whose log-probability is not this far below the best one's
+_CONTRADICTS = 25.0  # log-likelihood of another word in one frame: another's light fell in with its own
+_KEPT = 3  # packets that are looked into of those that end in a block
 _NEIGHBOURS = 6  # steps to either side that count as the same packet
 _FORGET_S = 12.0  # a gap after which a signal starts anew
 _BACKWARDS_S = 1.0  # a clock that jumps back by more starts anew; by less, its samples are left out
@@ -89,14 +91,17 @@ class Decoder:
         self._before = np.full((rates, self._complete + 1), np.log(0.5 / self._clocks.longest))
         self._before -= np.log(self._settings.packets_per_s * self._clocks.step_s)
         self._idle = np.full(rates, np.log(0.5))
+        self._looked = np.zeros(rates, bool)
+        self._under_way = np.full((rates, self._clocks.longest), -np.inf)
         self._candidates: list[_Candidate] = []
         self._spoken_until = -np.inf
 
     def push(self, signal: Signal) -> tuple[Message, ...]:
         """Take in samples of the track, later than those before; return the messages that they complete."""
-        rows = np.stack(
-            [signal.time_s, signal.exposure_s, signal.level, signal.sigma_dark, signal.sigma_lit]
-        ).astype(float)
+        columns = (signal.time_s, signal.exposure_s, signal.level, signal.sigma_dark, signal.sigma_lit)
+        rows = np.array(columns, float)
+        if rows.shape[1] == 1 and 0.0 < rows[0, 0] - self._last_s <= _FORGET_S:
+            return tuple(self._take(rows))  # as it is in a stream, and quicker
         messages: list[Message] = []
         while rows.shape[1]:
             time_s = rows[0]
@@ -189,24 +194,35 @@ class Decoder:
         return float(np.maximum(self._table[0, first:], 0.0).sum()) > _WORTH_ASKING
 
     def _note_best(self, words: Floats, before: Array, starts: Numbers, rates: Numbers) -> None:
-        """Keep the best packet that may have been sent, unless a better one takes its place."""
+        """Keep the best packets that may have been sent, of neighbours the best."""
         tops = words.max(axis=1, initial=-np.inf)
         worthy = (tops > _WORTH_ASKING) & (starts + self._done + _MARGIN >= self._spoken_until)
-        if not worthy.any():
-            return
-        row = int(np.argmax(np.where(worthy, tops + before, -np.inf)))
-        score, start = float(tops[row] + before[row]), int(starts[row]) + self._done
-        found = _Candidate(score, start, int(rates[row]), int(np.argmax(words[row])))
-        apart = self._clocks.longest - STEPS_PER_BIT
-        rivals = [one for one in self._candidates if abs(one.start - found.start) < apart]
-        if all(one.score < found.score for one in rivals):
-            self._candidates = [one for one in self._candidates if one not in rivals] + [found]
+        score = np.where(worthy, tops + before, -np.inf)
+        for _ in range(_KEPT):
+            row = int(np.argmax(score)) if len(score) else 0
+            if not len(score) or score[row] == -np.inf:
+                break
+            start, column = int(starts[row]) + self._done, int(np.argmax(words[row]))
+            found = _Candidate(float(score[row]), start, int(rates[row]), column)
+            score[np.abs(starts - starts[row]) <= STEPS_PER_BIT] = -np.inf
+            same = [
+                one
+                for one in self._candidates
+                if one.column == column and abs(one.start - start) <= STEPS_PER_BIT
+            ]
+            if all(one.score < found.score for one in same):
+                self._candidates = [one for one in self._candidates if one not in same] + [found]
+        self._candidates = sorted(self._candidates, key=lambda one: -one.score)[: 2 * _KEPT]
 
     def _settle(self, lattice: Lattice) -> list[Message]:
         """Give out the packets that have become clear; forget those that had their chance."""
         messages: list[Message] = []
         kept: list[_Candidate] = []
+        self._looked[:] = False
+        self._under_way[:] = -np.inf
         for one in self._candidates:
+            if one.start + _MARGIN < self._spoken_until:
+                continue
             over = self._complete - (one.start - self._done + int(self._clocks.lengths[one.rate]))
             message = self._message(one, lattice) if over >= _MARGIN else None
             if message is not None:
@@ -220,27 +236,31 @@ class Decoder:
     def _message(self, one: _Candidate, lattice: Lattice) -> Message | None:
         """Return a packet as a message if its probability is high enough."""
         here = one.start - self._done
-        starts = np.arange(here - _NEIGHBOURS, here + _NEIGHBOURS + 1)
-        starts, rates = (pair.ravel() for pair in np.meshgrid(starts, np.arange(len(self._idle))))
+        shift = np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
+        # On other clocks the same packet is where the middle of what was seen of it stays.
+        unseen = min(max(self._begin_at - self._done - here, 0), int(self._clocks.lengths[one.rate]))
+        middle = 0.5 * (1.0 + unseen / self._clocks.lengths[one.rate])
+        longer = self._clocks.lengths - self._clocks.lengths[one.rate]
+        starts = (here + shift - np.rint(middle * longer).astype(np.int64)[:, None]).ravel()
+        rates = np.repeat(np.arange(len(self._idle)), len(shift))
         over = starts + self._clocks.lengths[rates] <= self._complete
         starts, rates = starts[over], rates[over]
         ends = starts + self._clocks.lengths[rates]
         if not self._phase_known(one, lattice):
             return None
+        if lattice.contradiction(here, one.rate, one.column) > _CONTRADICTS:
+            return None
         score = lattice.words(starts, rates)[:, one.column]
         log = self._before[rates, starts] + score + self._log_start
-        if _log_sum(log) - _log_sum(self._idle) < np.log(self._settings.confidence):
-            return None  # not even where nothing else is under way
-        # The clocks on which idle is likely come first: most that is refused is refused by them.
-        likely = self._idle > self._idle.max() - _LIKELY
-        under_way = self._under_way(lattice, likely)
-        if self._share(log + self._after(under_way, rates, ends), under_way) < self._settings.confidence:
-            return None
-        under_way = np.maximum(under_way, self._under_way(lattice, ~likely))
-        log += self._after(under_way, rates, ends)
-        confidence = self._share(log, under_way)
-        if confidence < self._settings.confidence:
-            return None
+        # What is under way on the packet's own clocks refuses most that is refused.
+        own = np.zeros(len(self._idle), bool)
+        own[rates[log > log.max() - _LIKELY]] = True
+        for asked in (own, ~own):
+            self._look_under_way(lattice, asked)
+            confidence = self._share(log + self._after(rates, ends))
+            if confidence < self._settings.confidence:
+                return None
+        log += self._after(rates, ends)
         weight = np.exp(log - log.max())
         begin, end = np.average(np.stack([starts, ends]), axis=1, weights=weight)
         seen = np.flatnonzero(lattice.frames_seen(here, one.rate))
@@ -260,44 +280,48 @@ class Decoder:
         )
 
     def _phase_known(self, one: _Candidate, lattice: Lattice) -> bool:
-        """Return whether a word cannot be another's rotation, or idle was seen before it or after it."""
-        if not self._rotated[one.column]:
+        """Return whether a word cannot be another's rotation, or else where its packet starts.
+
+        That is where idle was seen before it or after it, or where it follows on one that was given out.
+        """
+        since = one.start - self._spoken_until
+        if not self._rotated[one.column] or -_NEIGHBOURS <= since < IDLE_BITS * STEPS_PER_BIT:
             return True
         start, idle = one.start - self._done, int(self._clocks.idle[one.rate])
         end = start + int(self._clocks.lengths[one.rate])
         after = end + idle <= self._complete and lattice.idle_seen(end + idle, one.rate)
         return after or lattice.idle_seen(start, one.rate)
 
-    def _share(self, log: NDArray[np.floating], under_way: NDArray[np.floating]) -> float:
+    def _share(self, log: Floats) -> float:
         """Return the share of some explanations among all: idle now, or a packet under way."""
-        total = _log_sum(np.logaddexp(self._idle, _log_sum(under_way)))
+        total = _log_sum(np.logaddexp(self._idle, _log_sum(self._under_way)))
         return min(float(np.exp(_log_sum(log) - total)), 1.0)
 
-    def _under_way(self, lattice: Lattice, asked_rates: NDArray[np.bool_]) -> Array:
-        """Return the log-probability of packets that began and have not ended, shape (rates, starts).
+    def _look_under_way(self, lattice: Lattice, asked: NDArray[np.bool_]) -> None:
+        """Find the log-probability of packets that began and have not ended, on some of the clocks.
 
-        Starts are the steps of a longest packet up to now; only the clock rates asked for are looked into.
+        Starts are the steps of a longest packet up to now. Where a block has looked already it is not done
+        again.
         """
+        asked = asked & ~self._looked
+        self._looked |= asked
         first = self._complete - self._clocks.longest + 1
-        likely = np.flatnonzero(asked_rates)
         steps = np.arange(first, self._complete + 1)
-        starts, rates = (pair.ravel() for pair in np.meshgrid(steps, likely))
+        starts, rates = (pair.ravel() for pair in np.meshgrid(steps, np.flatnonzero(asked)))
         going = starts + self._clocks.lengths[rates] > self._complete
         starts, rates = starts[going], rates[going]
         log = lattice.garbage(starts, rates) + self._log_garbage
-        asked = np.flatnonzero(lattice.promising(starts, rates))
-        words = _log_sum(lattice.words(starts[asked], rates[asked])) + self._log_start
-        log[asked] = np.logaddexp(log[asked], words)
-        logs = np.full((len(self._idle), len(steps)), -np.inf)
-        logs[rates, starts - first] = log + self._before[rates, starts]
-        return logs
+        likely = np.flatnonzero(lattice.promising(starts, rates))
+        words = _log_sum(lattice.words(starts[likely], rates[likely])) + self._log_start
+        log[likely] = np.logaddexp(log[likely], words)
+        self._under_way[rates, starts - first] = log + self._before[rates, starts]
 
-    def _after(self, under_way: Array, rates: Numbers, ends: Numbers) -> Array:
+    def _after(self, rates: Numbers, ends: Numbers) -> Array:
         """Return the log-probability of all that may follow packets which end at steps, up to now."""
         first = self._complete - self._clocks.longest + 1
-        following = (under_way - self._before[:, first : self._complete + 1])[:, ::-1]
+        following = (self._under_way - self._before[:, first : self._complete + 1])[:, ::-1]
         following = np.logaddexp.accumulate(following, axis=1)[:, ::-1]
-        return np.logaddexp(0.0, following[rates, np.maximum(ends - first, 0)])
+        return np.asarray(np.logaddexp(0.0, following[rates, np.maximum(ends - first, 0)]))
 
 
 def decode(signal: Signal, settings: DecoderSettings | None = None) -> tuple[Message, ...]:

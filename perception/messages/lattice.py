@@ -131,6 +131,14 @@ class Lattice:
         row[:, :, 0] = by_edge[:, 1:, 0].reshape(shape).sum(axis=1) - row[:, :, 0]
         return np.asarray(row.reshape(-1, 4 * FRAME_BITS) @ self._clocks.templates)
 
+    def contradiction(self, start: int, rate: int, column: int) -> float:
+        """Return by how much another word explains one of a packet's frames better, for the worst of them."""
+        by_edge = self._by_edge[start + self._clocks.edges[rate]]
+        row = by_edge[:-1, 1:].copy()
+        row[:, 0] = by_edge[1:, 0] - row[:, 0]
+        words = row.reshape(len(self._repeats), -1) @ self._clocks.templates
+        return float((words.max(axis=1) - words[:, column]).max())
+
     def garbage(self, starts: Numbers, rates: Numbers) -> Array:
         """Return the score of a stretch as long as a packet in which anything goes, shape (n,)."""
         ends = starts + self._clocks.lengths[rates]

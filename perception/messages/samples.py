@@ -73,7 +73,7 @@ class LevelScale:
     What is old counts less: the factor may change slowly.
     """
 
-    _KEEP = 0.97  # of the weight, for each block of three bits: ten seconds
+    _KEEP = 0.97  # of the weight, for each block of five bits: 17 seconds
 
     def __init__(self, sigma: float) -> None:
         self._prior = 1.0 / max(sigma, 1e-6) ** 2
