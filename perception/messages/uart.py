@@ -147,7 +147,7 @@ def packet_levels(
     dark_s = np.concatenate([[0.0], np.cumsum(1.0 - bits)]) * bit_s
     edges_s = packet_start_s + bit_s * np.arange(len(bits) + 1)
     dark = np.interp(start_s + duration_s, edges_s, dark_s) - np.interp(start_s, edges_s, dark_s)
-    return np.asarray(1.0 - dark / duration_s)
+    return np.asarray(np.clip(1.0 - dark / duration_s, 0.0, 1.0))
 
 
 def _character(character: str) -> int:

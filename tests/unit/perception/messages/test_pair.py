@@ -5,6 +5,7 @@ import pytest
 
 from perception.messages.pair import decode_pair
 from perception.types import Signal
+from tests.unit.perception.messages.signals import Sent, frame_times, shares, signal_of
 from tests.unit.perception.messages.wire import EXPOSURE_S, lit
 from tests.unit.perception.simulation import random
 
@@ -39,3 +40,21 @@ def test_both_words_are_read_and_who_said_which_where_it_can_be_told(ratio: floa
         if ratio == 0.98:
             assert all(one.ambiguous_with is not None for one in said) or words[0] == words[1]
     assert read >= 9
+
+
+def _sum(sent: tuple[Sent | None, Sent | None], ratio: float, seed: int) -> Signal:
+    rng = random(840, seed)
+    times_s = frame_times(rng, 0.0, 15.0, 30.0, 0.0)
+    lit = [shares(times_s, [] if one is None else [one], 1e-3) for one in sent]
+    return signal_of(times_s, lit[0] + ratio * lit[1], ratio / 8.0, rng)
+
+
+def test_one_of_two_sends() -> None:
+    (message,) = decode_pair(_sum((None, Sent(19, 3.0)), 0.5, 1), (1.0, 0.5), (0.05, 0.025), (1, 2))
+    assert (message.word, message.track, message.ambiguous_with) == (19, 2, None)
+
+
+def test_two_that_send_nothing_say_nothing() -> None:
+    assert decode_pair(_sum((None, None), 0.5, 2), (1.0, 0.5), (0.05, 0.025), (1, 2)) == ()
+    empty = Signal("r1", 1, *np.empty((5, 0)))
+    assert decode_pair(empty, (1.0, 0.5), (0.05, 0.025), (1, 2)) == ()
