@@ -16,6 +16,9 @@ Indices = NDArray[np.int64]
 LEAST_ODDS = -1.0
 """A tentative track below is none."""
 
+_MERGED_MOST = 10.0
+"""Times `merged_life_s`: longer than this no track lives on a shared flare."""
+
 MOST_GHOST, GHOST_STEP, GHOST_SAID = 6.0, 1.0, 2.0
 """Log-odds of being a mirror image: floor and ceiling, what one set may add, from where on it is said.
 
@@ -29,7 +32,11 @@ def survivors(bank: Bank, time_s: float, settings: TrackerSettings) -> Bank:
     unseen_s = time_s - bank.seen_s
     confirmed = bank.number > 0
     lives_s = np.where(confirmed, settings.life_s, settings.tentative_life_s)
-    alive = (unseen_s <= lives_s) & (time_s - bank.alone_s <= settings.merged_life_s)
+    # Who was seen alone for long is there for sure, and may stand behind another for as long.
+    merged_s = np.clip(
+        bank.alone_s - bank.born_s, settings.merged_life_s, _MERGED_MOST * settings.merged_life_s
+    )
+    alive = (unseen_s <= lives_s) & (time_s - bank.alone_s <= merged_s)
     return bank.taken(alive & (confirmed | (bank.odds > LEAST_ODDS)))
 
 

@@ -1,5 +1,6 @@
-"""Flares that are not one source's whole light: of two tracks, or a part of one; they feed bearings alone."""
+"""Flares that are not one source's whole light, but several tracks' or a part: they feed bearings alone."""
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -19,45 +20,70 @@ FLAGGED_ODDS = 2.0
 """What it adds that the estimator itself took a flare for several."""
 
 SHARED_ODDS = 3.0
-"""By so much must light of both explain a flare better than light of one: else a track that is not there
-could live on in the glare of another. Two that shared the last one may explain it worse by as much."""
+"""By so much must light of several explain a flare better than light of one: else a track that is not there
+could live on in the glare of another. Those that shared the last one may explain it worse by as much."""
 
 DOUBT_ODDS = 8.0
-"""Where light of both explains a flare worse than light of one by less, its range does not count."""
+"""Where light of several explains a flare worse than light of one by less, its range does not count."""
 
 DIM_CHI2, MOST_CHANCE = 14.0, 0.01
 
+_SWERVE_SIGMAS = 2.0
+_MOST_IN_ONE, _MOST_NEAR = 3, 6
+"""Tracks in one flare, and tracks near one of which these are looked for."""
+
 
 class Shared(NamedTuple):
-    """One measurement for two tracks: which, and how far these are apart."""
+    """One measurement for several tracks.
+
+    Attributes
+    ----------
+    measurement, tracks
+        Which.
+    apart_rad
+        How far these are apart at most.
+    swerved
+        Whether they are predicted so far apart that they would be seen apart: one has turned or stopped.
+    """
 
     measurement: int
-    tracks: tuple[int, int]
+    tracks: tuple[int, ...]
     apart_rad: float
+    swerved: bool
+
+
+class _Group(NamedTuple):
+    """Tracks whose light one measurement may be, and by how much better that is than the assignment."""
+
+    odds: float
+    shared: Shared
 
 
 def shared_flares(
     bank: Bank,
     seen: Observations,
-    observer_m: Array,
     gain: Array,
     taken: Indices,
+    time_s: float,
     clutter: float,
-    before: frozenset[tuple[int, int]],
+    before: frozenset[frozenset[int]],
     settings: TrackerSettings,
 ) -> tuple[list[Shared], Array]:
-    """Tell which measurements are the light of two tracks rather than what was assigned.
+    """Tell which measurements are the light of two tracks or three rather than what was assigned.
 
-    Fluxes add up, so two at r_a and r_b look like one at (r_a⁻² + r_b⁻²)^−½, at the bearing that their fluxes
-    weigh. How far a track *seems* by flux is known better than how far it is: the shared error of its range
-    cancels, and a change by a tenth tells.
+    Fluxes add up, so sources at r_i look like one at (Σ r_i⁻²)^−½, at the bearing that their fluxes weigh.
+    How far a track *seems* by flux is known better than how far it is: the shared error of its range cancels,
+    and a change by a tenth tells. Ranges and bearings count from the camera that saw the flare: two in one
+    line with it are not in one with the body's origin.
 
     Parameters
     ----------
-    bank, seen, observer_m
-        Predicted confirmed tracks, measurements of the set, where the observer is.
+    bank, seen
+        Predicted confirmed tracks, measurements of the set.
     gain, taken
         Of each track the gain of its own measurement (0 if none) and which it is (−1), shape (n,).
+    time_s
+        The set's.
     clutter, settings
         As in `gated_pairs`.
     before
@@ -68,64 +94,93 @@ def shared_flares(
     What is shared; and for each track how far the other is from it whose light may be in its flare: such a
     flare's range is not to be trusted. NaN elsewhere, shape (n,).
     """
-    arm_m = bank.mean[:, :3] - observer_m
-    far_m = np.maximum(np.linalg.norm(arm_m, axis=1), LEAST_RANGE_M)
-    along = arm_m / far_m[:, None]
-    close = along @ along.T > math.cos(settings.resolution_rad)
-    firsts, seconds = np.nonzero(np.triu(close, 1))
+    doubtful = np.full(len(gain), np.nan)
+    if len(gain) < 2 or not len(seen.range_m):
+        return [], doubtful
+    arm_m = bank.mean[None, :, :3] - seen.origin_m[:, None]
+    far_m = np.maximum(np.linalg.norm(arm_m, axis=2), LEAST_RANGE_M)
+    along = arm_m / far_m[:, :, None]
+    off2 = np.sum((along - seen.bearing[:, None]) ** 2, axis=2)
+    near = np.isfinite(seen.range_m)[:, None] & (off2 < (3.0 * settings.resolution_rad) ** 2)
+    groups: list[_Group] = []
+    for k in np.flatnonzero(near.sum(axis=1) >= 2).tolist():
+        owners = set(np.flatnonzero(taken == k).tolist())
+        rows = np.flatnonzero(near[k])
+        rows = np.sort(rows[np.argsort(off2[k, rows], kind="stable")[:_MOST_NEAR]])
+        for size in range(2, _MOST_IN_ONE + 1):
+            for chosen in itertools.combinations(rows.tolist(), size):
+                group = _explained(bank, seen, k, chosen, far_m[k], along[k], time_s, clutter, settings)
+                if group is None or not owners <= set(chosen):
+                    continue
+                numbers = {int(bank.number[row]) for row in chosen}
+                together = any(len(numbers & others) >= 2 for others in before)
+                odds = (
+                    group.odds
+                    + (SHARED_ODDS if together else -SHARED_ODDS)
+                    - float(np.sum(gain[list(chosen)]))
+                )
+                if odds > -DOUBT_ODDS:
+                    groups.append(group._replace(odds=odds))
     found: list[Shared] = []
-    doubtful = np.full(len(far_m), np.nan)
-    if not (len(firsts) and len(seen.range_m)):
-        return found, doubtful
-    place = bank.covariance[:, :3, :3]
+    tracks: set[int] = set()
+    for odds, shared in sorted(groups, key=lambda group: -group.odds):
+        if tracks & set(shared.tracks) or any(shared.measurement == one.measurement for one in found):
+            continue
+        if odds > 0.0:
+            found.append(shared)
+            tracks |= set(shared.tracks)
+        else:
+            free = [row for row in shared.tracks if np.isnan(doubtful[row])]
+            doubtful[free] = shared.apart_rad
+    return found, doubtful
+
+
+def _explained(
+    bank: Bank,
+    seen: Observations,
+    k: int,
+    tracks: tuple[int, ...],
+    far_m: Array,
+    along: Array,
+    time_s: float,
+    clutter: float,
+    settings: TrackerSettings,
+) -> _Group | None:
+    """Return how well measurement `k` is the sum of tracks' light, against clutter; None if it cannot be."""
+    rows = list(tracks)
+    far_m, along = far_m[rows], along[rows]
+    turned_rad2 = (settings.swerve_m_per_s * (time_s - bank.seen_s[rows]) / far_m) ** 2
+    apart = list(itertools.combinations(range(len(rows)), 2))
+    apart_rad = [float(np.linalg.norm(along[a] - along[b])) for a, b in apart]
+    slack_rad = [_SWERVE_SIGMAS * math.sqrt(turned_rad2[a] + turned_rad2[b]) for a, b in apart]
+    if any(way > settings.resolution_rad + most for way, most in zip(apart_rad, slack_rad, strict=True)):
+        return None
+    swerved = max(apart_rad) > settings.resolution_rad
+    widest_rad = 0.5 * settings.resolution_rad if swerved else max(apart_rad)
+    place = bank.covariance[rows, :3, :3]
     on_m2 = np.einsum("ni,nij,nj->n", along, place, along)
     across_rad2 = (np.trace(place, axis1=1, axis2=2) - on_m2) / (2.0 * far_m**2)
-    used: set[int] = set()
-    busy: set[int] = set()
-    for a, b in zip(firsts.tolist(), seconds.tolist(), strict=True):
-        pair = [a, b]
-        if used & {a, b}:
-            continue
-        seems_m = float(np.sum(far_m[pair] ** -2.0) ** -0.5)
-        share = seems_m**2 / far_m[pair] ** 2
-        bearing = share @ along[pair]
-        angle2 = np.sum((seen.bearing - bearing) ** 2, axis=1)
-        near = np.flatnonzero(np.isfinite(seen.range_m) & (angle2 < (3.0 * settings.resolution_rad) ** 2))
-        others = np.setdiff1d(taken, taken[pair])
-        for k in near.tolist():
-            if k in others or k in busy:
-                continue
-            load = seen.common_m[k] / seen.range_m[k] * far_m[pair]
-            crossed = np.einsum("ni,ni->n", along[pair], bank.common[pair, :3])
-            relative2 = np.maximum(on_m2[pair] + 2.0 * load * crossed + load**2, 0.0) / far_m[pair] ** 2
-            apart_rad = float(np.linalg.norm(along[a] - along[b]))
-            range2 = seen.noise_m2[k] + seems_m**2 * float(share**2 @ relative2)
-            lateral2 = (
-                float(share**2 @ across_rad2[pair])
-                + 0.5 * float(np.trace(seen.angle_rad2[k]))
-                + (0.2 * apart_rad) ** 2
-            ) * seems_m**2
-            chi2 = angle2[k] * seems_m**2 / lateral2 + (seen.range_m[k] - seems_m) ** 2 / range2
-            if chi2 > settings.gate_chi2:
-                continue
-            both = -0.5 * chi2 - math.log(lateral2) - 0.5 * math.log(range2) - 1.5 * math.log(2.0 * math.pi)
-            both += math.log(settings.seen_probability)
-            both += FLAGGED_ODDS * bool(seen.merged[k])
-            both += SHARED_ODDS if (bank.number[a], bank.number[b]) in before else -SHARED_ODDS
-            both -= float(
-                log_clutter(
-                    seen.range_m[k : k + 1], np.array([True]), clutter, settings.clutter_solid_angle_sr
-                )[0]
-            )
-            alone = float(np.sum(gain[pair]))
-            if both < alone and both > alone - DOUBT_ODDS:
-                doubtful[pair] = apart_rad
-            if both > alone:
-                found.append(Shared(k, (a, b), apart_rad))
-                used |= {a, b}
-                busy.add(k)
-                break
-    return found, doubtful
+    if swerved:
+        across_rad2 += turned_rad2
+    seems_m = float(np.sum(far_m**-2.0) ** -0.5)
+    share = seems_m**2 / far_m**2
+    angle2 = float(np.sum((seen.bearing[k] - share @ along) ** 2))
+    load = seen.common_m[k] / seen.range_m[k] * far_m
+    crossed = np.einsum("ni,ni->n", along, bank.common[rows, :3])
+    relative2 = np.maximum(on_m2 + 2.0 * load * crossed + load**2, 0.0) / far_m**2
+    range2 = seen.noise_m2[k] + seems_m**2 * float(share**2 @ relative2)
+    lateral2 = (
+        float(share**2 @ across_rad2) + 0.5 * float(np.trace(seen.angle_rad2[k])) + (0.2 * widest_rad) ** 2
+    ) * seems_m**2
+    chi2 = angle2 * seems_m**2 / lateral2 + (seen.range_m[k] - seems_m) ** 2 / range2
+    if chi2 > settings.gate_chi2:
+        return None
+    odds = -0.5 * chi2 - math.log(lateral2) - 0.5 * math.log(range2) - 1.5 * math.log(2.0 * math.pi)
+    odds += math.log(settings.seen_probability) + FLAGGED_ODDS * bool(seen.merged[k])
+    by_chance = log_clutter(
+        seen.range_m[k : k + 1], np.array([True]), clutter, settings.clutter_solid_angle_sr
+    )
+    return _Group(odds - float(by_chance[0]), Shared(k, tracks, widest_rad, swerved))
 
 
 def dimmed(

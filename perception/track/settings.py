@@ -32,7 +32,8 @@ class TrackerSettings:
         A confirmed track that is unseen for longer dies. The longest dark run of a message leaves 0.967 s
         between lit samples at 30 FPS (docs/physics.md, Tracking).
     merged_life_s
-        A track that for so long was seen only together with another dies: it may never have been one.
+        A track that for so long was seen only together with another dies, as it may never have been one;
+        one that was seen alone for longer lives for as long, up to ten times this.
     tentative_life_s
         The same as `life_s`, for a track that is not yet confirmed, at most.
     unseen_cost_per_s

@@ -68,7 +68,7 @@ class Tracker:
         self._clutter = LEAST_CLUTTER
         self._bank = _nobody()
         self._odometry: tuple[Odometry, ...] = ()
-        self._sharing: frozenset[tuple[int, int]] = frozenset()
+        self._sharing: frozenset[frozenset[int]] = frozenset()
 
     def update(
         self, time_s: float, measurements: Sequence[Measurement], odometry: Sequence[Odometry] = ()
@@ -201,11 +201,11 @@ class Tracker:
         doubtful = np.full(len(taken), np.nan)
         if self.settings.overlap == "sound":
             shared, doubtful = shared_flares(
-                old, seen, self._pose.position_m, gain, taken, self._clutter, self._sharing, self.settings
+                old, seen, gain, taken, self._time_s, self._clutter, self._sharing, self.settings
             )
-        both = np.array([one.tracks for one in shared], dtype=np.int64).reshape(-1)
-        light = np.repeat(np.array([one.measurement for one in shared], dtype=np.int64), 2)
-        apart = np.repeat(np.array([one.apart_rad for one in shared], dtype=float), 2)
+        both = np.array([row for one in shared for row in one.tracks], dtype=np.int64)
+        light = np.array([one.measurement for one in shared for _ in one.tracks], dtype=np.int64)
+        apart = np.array([one.apart_rad for one in shared for _ in one.tracks], dtype=float)
         taken[both] = -1
         alone = np.flatnonzero(taken >= 0)
         when, how = self._time_s, self.settings
@@ -215,11 +215,14 @@ class Tracker:
         old = life.judged_ghosts(old, alone, seen.ghost[taken[alone]])
         if len(both):
             spread = np.maximum(apart, how.resolution_rad / 8.0)
+            turned = np.array([row for one in shared if one.swerved for row in one.tracks], dtype=np.int64)
+            if len(turned):
+                old = old.with_states(replaced(old.states, turned, swerved(old, turned, when, how).states))
             old = fed(old, both, seen.taken(light), np.zeros(len(both)), when, how, spread, alone=False)
             taken[both] = light
-        now = {(int(old.number[a]), int(old.number[b])) for _, (a, b), _ in shared}
+        now = {frozenset(old.number[list(one.tracks)].tolist()) for one in shared}
         seen_alone = set(old.number[alone].tolist())
-        self._sharing = frozenset(now | {pair for pair in self._sharing if not seen_alone & set(pair)})
+        self._sharing = frozenset(now | {some for some in self._sharing if not seen_alone & some})
         dim, edge = dimmed(old, seen, taken, self._clutter, how)
         if len(dim):
             old = fed(old, dim, seen.taken(edge), np.zeros(len(dim)), when, how, np.zeros(len(dim)))

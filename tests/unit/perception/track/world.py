@@ -34,7 +34,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Observer:
-    """Its pose in the world, and what it thinks of it."""
+    """Its pose in the world, what it thinks of it, and where in its body the camera is."""
 
     path: Path = lambda _: np.zeros(3)
     yaw: Callable[[float], float] = lambda _: 0.0
@@ -42,6 +42,7 @@ class Observer:
     rotation_sigma_rad: float = 0.0
     position_walk: float = 0.0
     rotation_walk: float = 0.0
+    camera_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def turn(yaw: float) -> Array:
@@ -165,12 +166,12 @@ def sets(
         place, back = at.path(when), turn(at.yaw(when)).T
         truth = np.array([back @ (robot.path(when) - place) for robot in robots])
         lights = [
-            (truth[k], robot.lit(when) * robot.flux / factor[k] ** 2)
+            (truth[k] - at.camera_m, robot.lit(when) * robot.flux / factor[k] ** 2)
             for k, robot in enumerate(robots)
             if robot.seen(when) and robot.lit(when) > 0.05
         ]
         hits = [
-            measurement(p, when, rng, k, flux=f, common=0.0, merged=m)
+            measurement(p + at.camera_m, when, rng, k, flux=f, common=0.0, merged=m, origin_m=at.camera_m)
             for k, (p, f, m) in enumerate(_merged(lights))
         ]
         hits += clutter(false, when, rng)
