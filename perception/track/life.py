@@ -1,5 +1,6 @@
 """Birth, confirmation and death of tracks, what is said of ghosts, and tracks as they leave the tracker."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -16,6 +17,8 @@ Indices = NDArray[np.int64]
 LEAST_ODDS = -1.0
 """A tentative track below is none."""
 
+_SETS_UNSEEN = 2.5
+
 _MERGED_MOST = 10.0
 """Times `merged_life_s`: longer than this no track lives on a shared flare."""
 
@@ -27,11 +30,16 @@ was wrong can be mended within a dozen sets.
 """
 
 
-def survivors(bank: Bank, time_s: float, settings: TrackerSettings) -> Bank:
-    """Return the tracks that are alive at a time: by seconds unseen, and by odds while tentative."""
+def survivors(bank: Bank, time_s: float, period_s: float, settings: TrackerSettings) -> Bank:
+    """Return the tracks that are alive at a time: by seconds unseen, and by odds while tentative.
+
+    Where sets are rare (`period_s` apart) seconds are few, and two sets without it are what ends a track.
+    """
     unseen_s = time_s - bank.seen_s
     confirmed = bank.number > 0
     lives_s = np.where(confirmed, settings.life_s, settings.tentative_life_s)
+    if math.isfinite(period_s):
+        lives_s = np.maximum(lives_s, _SETS_UNSEEN * period_s)
     # Who was seen alone for long is there for sure, and may stand behind another for as long.
     merged_s = np.clip(
         bank.alone_s - bank.born_s, settings.merged_life_s, _MERGED_MOST * settings.merged_life_s

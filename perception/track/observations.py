@@ -1,6 +1,6 @@
 """Measurements of a set as arrays in the observer's odometry frame, and what they say beyond predictions."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,37 @@ LEAST_RANGE_M = 0.05
 _MOST_CORRELATION = 0.95
 _MOST_GROWTH = 4.0
 _KNOWN_RANGE = 0.3
+_SLOWER = 1.05
+
+
+class Beat(NamedTuple):
+    """When sets came last, and how long they are apart where nothing is missing."""
+
+    last_s: float
+    period_s: float
+
+
+def beaten(rhythm: Mapping[str, Beat], names: Iterable[str], time_s: float) -> dict[str, Beat]:
+    """Return the rhythm after a set in which `names` were seen to see.
+
+    A time without any is no slower rhythm: the shortest way between two counts, and is forgotten slowly.
+    """
+    now = dict(rhythm)
+    for name in names:
+        if name not in now:
+            now[name] = Beat(time_s, np.inf)
+        elif time_s > now[name].last_s:
+            last_s, period_s = now[name]
+            now[name] = Beat(time_s, min(time_s - last_s, _SLOWER * period_s))
+    return now
+
+
+def _period_s(cameras: Sequence[str], rhythm: Mapping[str, Beat]) -> float:
+    """Return the period of the fastest of some cameras; 0 where none is known."""
+    known = [
+        rhythm[name].period_s for name in cameras if name in rhythm and np.isfinite(rhythm[name].period_s)
+    ]
+    return min(known, default=0.0)
 
 
 class Observations(NamedTuple):
@@ -46,6 +77,8 @@ class Observations(NamedTuple):
         Variance of the observer's place, per axis, shape (m,).
     after_s
         Time after the set's, shape (m,).
+    period_s
+        How long ago its camera could have seen it before: cameras may take turns, shape (m,).
     merged, saturated
         As measured, shape (m,).
     ghost
@@ -61,6 +94,7 @@ class Observations(NamedTuple):
     common_m: Array
     shaken_m2: Array
     after_s: Array
+    period_s: Array
     merged: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
     ghost: Array
@@ -90,11 +124,15 @@ def usable(measurements: Sequence[Measurement]) -> list[int]:
 
 
 def observed(
-    measurements: Sequence[Measurement], poses: Poses, time_s: float, settings: TrackerSettings
+    measurements: Sequence[Measurement],
+    poses: Poses,
+    time_s: float,
+    settings: TrackerSettings,
+    rhythm: Mapping[str, Beat] | None = None,
 ) -> Observations:
     """Turn measurements, each by the observer's pose at its time, into the odometry frame.
 
-    Places and bearings must be finite (`usable`).
+    Places and bearings must be finite (`usable`). `rhythm` has how often each camera sees (`beaten`).
     """
     m = len(measurements)
     origin_m = np.array([one.origin_body_m for one in measurements]).reshape(m, 3)
@@ -121,6 +159,7 @@ def observed(
         common_m=np.nan_to_num(common_m),
         shaken_m2=poses.position_sigma_m**2,
         after_s=np.array([one.time_s for one in measurements], dtype=float) - time_s,
+        period_s=np.array([_period_s(one.cameras, rhythm or {}) for one in measurements], dtype=float),
         merged=np.array([one.merged for one in measurements], dtype=bool),
         saturated=np.array([one.saturated for one in measurements], dtype=bool),
         ghost=np.array([one.ghost_probability for one in measurements], dtype=float),

@@ -12,7 +12,7 @@ from perception.track.bank import Bank, newborn, replaced, taken_states
 from perception.track.fed import fed, swerved
 from perception.track.kalman import predicted, wandered
 from perception.track.merging import Shared, dimmed, shared_flares
-from perception.track.observations import Observations, observed, usable
+from perception.track.observations import Beat, Observations, beaten, observed, usable
 from perception.track.odometry import Pose, pose_at, poses_at
 from perception.track.rejoin import continued, rejoined
 from perception.track.settings import TrackerSettings
@@ -32,6 +32,9 @@ SURE_ODDS = 6.0
 
 In a crowd of false detections the gate of a dark track holds some soon, and one that follows such is lost.
 """
+
+_SETS = ""
+"""In the rhythm, what stands for all cameras."""
 
 DAWN_S = 0.06
 """In sets that follow each other faster, of the first light after darkness only the bearing counts.
@@ -69,6 +72,7 @@ class Tracker:
         self._bank = _nobody()
         self._odometry: tuple[Odometry, ...] = ()
         self._sharing: frozenset[frozenset[int]] = frozenset()
+        self._rhythm: dict[str, Beat] = {}
 
     def update(
         self, time_s: float, measurements: Sequence[Measurement], odometry: Sequence[Odometry] = ()
@@ -96,7 +100,7 @@ class Tracker:
         self._name(measurements)
         odometry = self._last_known(odometry)
         if time_s < self._time_s - self.settings.late_s:
-            self._bank, self._time_s = _nobody(), -math.inf
+            self._bank, self._time_s, self._rhythm = _nobody(), -math.inf, {}
         if time_s < self._time_s:
             return self.predicted(time_s, odometry)
         pose = pose_at(odometry, time_s)
@@ -104,8 +108,10 @@ class Tracker:
         self._bank = self._moved(after_s, pose)
         self._time_s, self._pose = time_s, pose
         times_s = np.array([one.time_s for one in measurements], dtype=float)
-        seen = observed(measurements, poses_at(odometry, times_s), time_s, self.settings)
-        self._bank = life.survivors(self._bank, time_s, self.settings)
+        cameras = {camera for one in measurements for camera in one.cameras}
+        self._rhythm = beaten(self._rhythm, {_SETS} | cameras, time_s)
+        seen = observed(measurements, poses_at(odometry, times_s), time_s, self.settings, self._rhythm)
+        self._bank = life.survivors(self._bank, time_s, self._rhythm[_SETS].period_s, self.settings)
         which = self._associate(seen, after_s)
         self._bank, self._next = life.confirmed(self._bank, self._next, self.settings)
         keys: dict[int, Keys] = {
@@ -190,7 +196,9 @@ class Tracker:
     def _feed_confirmed(self, old: Bank, seen: Observations, after_s: float) -> tuple[Bank, Indices]:
         """Feed confirmed tracks, and return which measurement each took, −1 for none."""
         pairs = self._pairs(old, seen, self._clutter)
-        unsure = (self._time_s - old.seen_s > 1.5 * after_s)[pairs.track] & (pairs.gain < SURE_ODDS)
+        period_s = np.maximum(seen.period_s, after_s)
+        unseen_s = self._time_s - old.seen_s[pairs.track]
+        unsure = (unseen_s > 1.5 * period_s[pairs.measurement]) & (pairs.gain < SURE_ODDS)
         pairs = pairs._replace(gain=np.where(unsure, 0.0, pairs.gain))
         chosen = assigned(pairs)
         taken = np.full(len(old.number), -1, dtype=np.int64)
@@ -209,7 +217,8 @@ class Tracker:
         taken[both] = -1
         alone = np.flatnonzero(taken >= 0)
         when, how = self._time_s, self.settings
-        dawn = (when - old.seen_s[alone] > 1.5 * after_s) & (after_s < DAWN_S)
+        period_s = period_s[taken[alone]]
+        dawn = (when - old.seen_s[alone] > 1.5 * period_s) & (period_s < DAWN_S)
         spread = np.where(dawn, 0.0, doubtful[alone])
         old = fed(old, alone, seen.taken(taken[alone]), chi2[alone], when, how, spread)
         old = life.judged_ghosts(old, alone, seen.ghost[taken[alone]])
@@ -233,7 +242,8 @@ class Tracker:
         self, old: Bank, seen: Observations, taken: Indices, after_s: float
     ) -> tuple[Bank, Indices]:
         """Feed tracks that have turned on the spot: seen a set ago, now a bit beside where they must be."""
-        lost = np.flatnonzero((taken < 0) & (self._time_s - old.seen_s < 1.5 * after_s))
+        recent_s = 1.5 * float(np.max(seen.period_s, initial=after_s))
+        lost = np.flatnonzero((taken < 0) & (self._time_s - old.seen_s < recent_s))
         free = np.setdiff1d(np.arange(len(seen.range_m)), taken)
         if self.settings.filter == "paper" or not (len(lost) and len(free)):
             return old, taken

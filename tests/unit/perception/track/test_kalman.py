@@ -109,7 +109,7 @@ def _observations(place_m: Array, bearing2: Array, range2: Array) -> Observation
     return Observations(
         np.zeros((n, 3)), bearing_axes(place_m / range_m[:, None]), range_m,
         bearing2[:, None, None] * np.eye(2), np.zeros((n, 2)), range2, np.zeros(n), np.zeros(n), np.zeros(n),
-        np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), np.zeros(n),
+        np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), np.zeros(n),
     )  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from tests.unit.perception.track.world import (
     matched,
     measurement,
     occlusion,
+    relative_noise,
     run,
     sets,
     straight,
@@ -241,6 +242,32 @@ def test_predictions_leave_the_tracker_as_it_was() -> None:
     assert ahead.unseen_s == pytest.approx(1.5 - 29 / 30.0)
     again = tracker.predicted(1.5)[0]
     np.testing.assert_array_equal(ahead.covariance, again.covariance)
+
+
+def test_cameras_that_take_turns_range_as_well_as_one() -> None:
+    """Each sees one robot in every second set: no set between makes its light a first one after darkness."""
+    rng = random(1666)
+    tracker = Tracker()
+    for n in range(120):
+        when = n / 60.0
+        place, camera = (([3.0, 0.0, 0.0], "a.front"), ([-3.0, 0.3 * when, 0.0], "a.back"))[n % 2]
+        seen = measurement(np.array(place), when, rng, common=0.0, claimed_common=0.0)
+        tracks = tracker.update(when, [dataclasses.replace(seen, cameras=(camera,))])
+    assert [track.track for track in tracks] == [1, 2]
+    for track in tracks:
+        along = track.position_body_m / np.linalg.norm(track.position_body_m)
+        assert np.sqrt(along @ track.covariance[:3, :3] @ along) < relative_noise(3.0) * 3.0
+
+
+@pytest.mark.parametrize("fps", [0.5, 2.0])
+def test_rare_sets_make_tracks_too(fps: float) -> None:
+    rng = random(1667)
+    tracker = Tracker()
+    for n in range(12):
+        tracks = tracker.update(n / fps, [measurement(np.array([3.0, 0.0, 0.0]), n / fps, rng)])
+    assert [track.track for track in tracks] == [1]
+    assert tracker.update(12 / fps, [])[0].track == 1
+    assert tracker.update(12 / fps + 6.0, []) == ()
 
 
 # --- ranges that are not known, ghosts, partial light ---
