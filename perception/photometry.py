@@ -147,8 +147,7 @@ def sample_at(
     None where nothing can be said: a flare lies upon the place, or may be the source after all; pixels are
     clipped; the place is too uncertain and the source too faint for its absence to say that it is dark.
     """
-    disc_rad = float(angular_radius_rad(expected.range_m, calibration.source_radius_m))
-    width_px = _width_px(expected.u_px, expected.v_px, disc_rad, calibration)
+    width_px = image_width_px(expected, calibration)
     if width_px > _LARGEST_PX:
         return None
     gain = gain_dn_per_e(frame, calibration)
@@ -198,6 +197,12 @@ def sample_at(
     if not 0.0 < sigma_e < lit_e:
         return None
     return _sample(flux_e / lit_e, sigma_e / lit_e, expected, frame, calibration)
+
+
+def image_width_px(expected: Expected, calibration: Calibration) -> float:
+    """Return the standard deviation of the image of a source, the pixel's own aperture left out."""
+    disc_rad = float(angular_radius_rad(expected.range_m, calibration.source_radius_m))
+    return _width_px(expected.u_px, expected.v_px, disc_rad, calibration)
 
 
 def _chance_missed(

@@ -11,7 +11,7 @@ brightness is measured in every frame, dark or lit (`photometry`), and read (`me
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,7 +20,8 @@ import numpy as np
 from perception.estimators import Estimator, detect_frames
 from perception.messages.decoder import Decoder
 from perception.messages.paper import PaperDecoder
-from perception.photometry import Sample, expected_image, sample_at, sample_of_detection
+from perception.pairs import PairReader, SumSample, inseparable, sample_of_sum
+from perception.photometry import Expected, Sample, expected_image, sample_at, sample_of_detection
 from perception.rig.frame_sets import robot_of, set_time_s
 from perception.rig.measure_set import measure_set
 from perception.track.settings import TrackerSettings
@@ -88,7 +89,8 @@ class Pipeline:
     tracker
         What follows; by default a `Tracker` as it comes.
     decoder
-        Makes what reads one track, of the observer's name and the track's number; by default `Decoder`.
+        Makes what reads one track, of the observer's name and the track's number; by default `Decoder`,
+        which is helped by a `PairReader` while two tracks are in one place of the image.
     keep_signals
         Whether `signals` is to know them all: a robot that runs for days has no use for that.
     """
@@ -106,6 +108,7 @@ class Pipeline:
         self._tracker: Follows = Tracker() if tracker is None else tracker
         self._decoder = decoder
         self._readers: dict[int, Reads] = {}
+        self._pairs = PairReader() if decoder is Decoder else None
         self._latest_s = -math.inf
         self._robot: str | None = None
         self._extinction_per_m: float | None = None
@@ -180,6 +183,9 @@ class Pipeline:
         """Return the messages that can be told as no more frames will come."""
         said = [message for reader in self._readers.values() for message in reader.finish()]
         self._readers.clear()
+        if self._pairs is not None:
+            said += self._pairs.push(self._robot or "", self._latest_s, {}, said)
+            said += self._pairs.finish(self._robot or "")
         return tuple(said)
 
     def signals(self) -> tuple[Signal, ...]:
@@ -211,11 +217,16 @@ class Pipeline:
             (hit.camera, hit.index, number): hit for found in detections for number, hit in enumerate(found)
         }
         fed = Counter(key for track in tracks for key in track.detections)
-        places = [self._at(frame, time_s, tracks, odometry) for frame in frames]
+        places = [self._expected(frame, time_s, tracks, odometry) for frame in frames]
+        resolved = {key for key, count in fed.items() if count == 1}
+        together = [
+            _together(there, tracks, frame, resolved, self._calibrations[frame.camera])
+            for there, frame in zip(places, frames, strict=True)
+        ]
         for track in tracks:
             samples = [
-                self._sample(track, there.get(track.track, track), frame, found, by_key, fed)
-                for there, frame, found in zip(places, frames, detections, strict=True)
+                self._sample(track, there.get(track.track), frame, found, by_key, fed, mixed)
+                for there, frame, found, mixed in zip(places, frames, detections, together, strict=True)
             ]
             known = [sample for sample in samples if sample is not None]
             if not known:
@@ -232,7 +243,35 @@ class Pipeline:
                 self._readers[track.track] = self._decoder(track.robot, track.track)
             reader = self._readers[track.track]
             said += reader.push(self._signal(track.track, [best]))
+        if self._pairs is not None:
+            sums: dict[tuple[int, int], SumSample] = {}
+            for there, frame, found, mixed in zip(places, frames, detections, together, strict=True):
+                for one, other in mixed:
+                    calibration = self._calibrations[frame.camera]
+                    total = sample_of_sum(there[one], there[other], found, frame, calibration)
+                    if total is not None:
+                        sums.setdefault((one, other), total)
+            said += self._pairs.push(self._robot or "", time_s, sums, said)
         return tuple(said)
+
+    def _expected(
+        self, frame: RawFrame, time_s: float, tracks: Sequence[Track], odometry: Sequence[Odometry]
+    ) -> dict[int, Expected]:
+        """Return where the tracks in view must be in a frame, and how bright, by number."""
+        now = self._at(frame, time_s, tracks, odometry)
+        expected = {}
+        for track in tracks:
+            there = now.get(track.track, track)
+            image = expected_image(
+                there.position_body_m,
+                there.covariance[:3, :3],
+                frame,
+                self._calibrations[frame.camera],
+                self._extinction_per_m,
+            )
+            if image is not None:
+                expected[track.track] = image
+        return expected
 
     def _at(
         self, frame: RawFrame, time_s: float, tracks: Sequence[Track], odometry: Sequence[Odometry]
@@ -248,18 +287,16 @@ class Pipeline:
     def _sample(
         self,
         track: Track,
-        there: Track,
+        expected: Expected | None,
         frame: RawFrame,
         found: Sequence[Detection],
         by_key: Mapping[tuple[str, int, int], Detection],
         fed: Mapping[tuple[str, int, int], int],
+        together: Collection[tuple[int, int]],
     ) -> Sample | None:
-        """Return the brightness of a track, which is `there` in a frame; None where nothing is known."""
+        """Return the brightness of a track in a frame; None where nothing is known of its own light."""
         calibration = self._calibrations[frame.camera]
-        expected = expected_image(
-            there.position_body_m, there.covariance[:3, :3], frame, calibration, self._extinction_per_m
-        )
-        if expected is None:
+        if expected is None or any(track.track in pair for pair in together):
             return None
         own = [key for key in track.detections if key[:2] == (frame.camera, frame.index)]
         if own:
@@ -275,3 +312,21 @@ class Pipeline:
             [[one.time_s, one.exposure_s, one.level, one.sigma_dark, one.sigma_lit] for one in samples]
         ).reshape(-1, 5)
         return Signal(self._robot or "", track, *columns.T)
+
+
+def _together(
+    expected: Mapping[int, Expected],
+    tracks: Sequence[Track],
+    frame: RawFrame,
+    resolved: Collection[tuple[str, int, int]],
+    calibration: Calibration,
+) -> list[tuple[int, int]]:
+    """Return the pairs of tracks that are one image in a frame: no mirror images, none found as two."""
+    own = {
+        track.track
+        for track in tracks
+        if any(key in resolved and key[:2] == (frame.camera, frame.index) for key in track.detections)
+    }
+    robots = {track.track for track in tracks if track.ghost != "yes"}
+    of_robots = {number: one for number, one in expected.items() if number in robots}
+    return [pair for pair in inseparable(of_robots, calibration) if not own.issuperset(pair)]

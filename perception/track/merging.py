@@ -29,6 +29,7 @@ DOUBT_ODDS = 8.0
 DIM_CHI2, MOST_CHANCE = 14.0, 0.01
 
 _SWERVE_SIGMAS = 2.0
+_UNSURE_SPLIT = 0.03
 _MOST_IN_ONE, _MOST_NEAR = 3, 6
 """Tracks in one flare, and tracks near one of which these are looked for."""
 
@@ -44,12 +45,27 @@ class Shared(NamedTuple):
         How far these are apart at most.
     swerved
         Whether they are predicted so far apart that they would be seen apart: one has turned or stopped.
+    total
+        Where they seem to be by the flux of all, with what was known of that before.
     """
 
     measurement: int
     tracks: tuple[int, ...]
     apart_rad: float
     swerved: bool
+    total: "Sum"
+
+
+class Sum(NamedTuple):
+    """Where tracks in one flare seem to be by the flux of all, the variance of that, and when."""
+
+    range_m: float
+    variance_m2: float
+    time_s: float
+
+
+Sums = dict[frozenset[int], Sum]
+"""Of those that shared a flare a short time ago, by the tracks' numbers."""
 
 
 class _Group(NamedTuple):
@@ -66,7 +82,7 @@ def shared_flares(
     taken: Indices,
     time_s: float,
     clutter: float,
-    before: frozenset[frozenset[int]],
+    before: Sums,
     settings: TrackerSettings,
 ) -> tuple[list[Shared], Array]:
     """Tell which measurements are the light of two tracks or three rather than what was assigned.
@@ -87,7 +103,8 @@ def shared_flares(
     clutter, settings
         As in `gated_pairs`.
     before
-        Numbers of those that shared a flare when they were last seen.
+        Those that shared a flare a short time ago. What their sum was it still is but for how they moved
+        since: so it is known far better than by their ranges, which do not count one by one.
 
     Returns
     -------
@@ -109,10 +126,12 @@ def shared_flares(
         rows = np.sort(rows[np.argsort(off2[k, rows], kind="stable")[:_MOST_NEAR]])
         for size in range(2, _MOST_IN_ONE + 1):
             for chosen in itertools.combinations(rows.tolist(), size):
-                group = _explained(bank, seen, k, chosen, far_m[k], along[k], time_s, clutter, settings)
+                numbers = frozenset(bank.number[list(chosen)].tolist())
+                group = _explained(
+                    bank, seen, k, chosen, far_m[k], along[k], time_s, before.get(numbers), clutter, settings
+                )
                 if group is None or not owners <= set(chosen):
                     continue
-                numbers = {int(bank.number[row]) for row in chosen}
                 together = any(len(numbers & others) >= 2 for others in before)
                 odds = (
                     group.odds
@@ -143,6 +162,7 @@ def _explained(
     far_m: Array,
     along: Array,
     time_s: float,
+    then: Sum | None,
     clutter: float,
     settings: TrackerSettings,
 ) -> _Group | None:
@@ -169,10 +189,22 @@ def _explained(
     crossed = np.einsum("ni,ni->n", along, bank.common[rows, :3])
     relative2 = np.maximum(on_m2 + 2.0 * load * crossed + load**2, 0.0) / far_m**2
     range2 = seen.noise_m2[k] + seems_m**2 * float(share**2 @ relative2)
+    measured_m, noise_m2 = float(seen.range_m[k]), float(seen.noise_m2[k])
+    off_m, total = measured_m - seems_m, Sum(measured_m, noise_m2, time_s)
+    if then is not None:
+        # ∂s/∂r_i = (s / r_i)³
+        slope, after_s = (seems_m / far_m) ** 3, time_s - then.time_s
+        speed = float(slope @ np.einsum("ni,ni->n", along, bank.mean[rows, 3:]))
+        speed2 = float(slope**2 @ np.einsum("ni,nij,nj->n", along, bank.covariance[rows, 3:, 3:], along))
+        now_m, now_m2 = then.range_m + speed * after_s, then.variance_m2 + speed2 * after_s**2
+        if noise_m2 + now_m2 < range2:
+            range2, off_m = noise_m2 + now_m2, measured_m - now_m
+        weight = now_m2 / (now_m2 + noise_m2)
+        total = Sum(now_m + weight * (measured_m - now_m), (1.0 - weight) * now_m2, time_s)
     lateral2 = (
         float(share**2 @ across_rad2) + 0.5 * float(np.trace(seen.angle_rad2[k])) + (0.2 * widest_rad) ** 2
     ) * seems_m**2
-    chi2 = angle2 * seems_m**2 / lateral2 + (seen.range_m[k] - seems_m) ** 2 / range2
+    chi2 = angle2 * seems_m**2 / lateral2 + off_m**2 / range2
     if chi2 > settings.gate_chi2:
         return None
     odds = -0.5 * chi2 - math.log(lateral2) - 0.5 * math.log(range2) - 1.5 * math.log(2.0 * math.pi)
@@ -180,7 +212,19 @@ def _explained(
     by_chance = log_clutter(
         seen.range_m[k : k + 1], np.array([True]), clutter, settings.clutter_solid_angle_sr
     )
-    return _Group(odds - float(by_chance[0]), Shared(k, tracks, widest_rad, swerved))
+    return _Group(odds - float(by_chance[0]), Shared(k, tracks, widest_rad, swerved, total))
+
+
+def split_in_doubt(seen: Observations, settings: TrackerSettings) -> NDArray[np.bool_]:
+    """Return which measurements are half of a flare that was taken apart, and hardly could be, shape (m,).
+
+    How its light is shared out among the two is uncertain, and as only what looks like two is taken apart, it
+    comes out uneven more often than not: such a range does not count.
+    """
+    close = seen.bearing @ seen.bearing.T > math.cos(0.5 * settings.resolution_rad)
+    np.fill_diagonal(close, val=False)
+    unsure = ~(seen.noise_m2 < (_UNSURE_SPLIT * seen.range_m) ** 2)
+    return np.asarray(close.any(axis=1) & unsure)
 
 
 def dimmed(

@@ -11,7 +11,7 @@ from perception.track.association import Pairs, assigned, gated_pairs, paper_pai
 from perception.track.bank import Bank, newborn, replaced, taken_states
 from perception.track.fed import fed, swerved
 from perception.track.kalman import predicted, wandered
-from perception.track.merging import Shared, dimmed, shared_flares
+from perception.track.merging import Shared, Sums, dimmed, shared_flares, split_in_doubt
 from perception.track.observations import Beat, Observations, beaten, observed, usable
 from perception.track.odometry import Pose, pose_at, poses_at
 from perception.track.rejoin import continued, rejoined
@@ -71,7 +71,7 @@ class Tracker:
         self._clutter = LEAST_CLUTTER
         self._bank = _nobody()
         self._odometry: tuple[Odometry, ...] = ()
-        self._sharing: frozenset[frozenset[int]] = frozenset()
+        self._sharing: Sums = {}
         self._rhythm: dict[str, Beat] = {}
 
     def update(
@@ -100,7 +100,7 @@ class Tracker:
         self._name(measurements)
         odometry = self._last_known(odometry)
         if time_s < self._time_s - self.settings.late_s:
-            self._bank, self._time_s, self._rhythm = _nobody(), -math.inf, {}
+            self._bank, self._time_s, self._rhythm, self._sharing = _nobody(), -math.inf, {}, {}
         if time_s < self._time_s:
             return self.predicted(time_s, odometry)
         pose = pose_at(odometry, time_s)
@@ -219,7 +219,8 @@ class Tracker:
         when, how = self._time_s, self.settings
         period_s = period_s[taken[alone]]
         dawn = (when - old.seen_s[alone] > 1.5 * period_s) & (period_s < DAWN_S)
-        spread = np.where(dawn, 0.0, doubtful[alone])
+        bearing_only = dawn | split_in_doubt(seen, how)[taken[alone]]
+        spread = np.where(bearing_only, 0.0, doubtful[alone])
         old = fed(old, alone, seen.taken(taken[alone]), chi2[alone], when, how, spread)
         old = life.judged_ghosts(old, alone, seen.ghost[taken[alone]])
         if len(both):
@@ -229,9 +230,9 @@ class Tracker:
                 old = old.with_states(replaced(old.states, turned, swerved(old, turned, when, how).states))
             old = fed(old, both, seen.taken(light), np.zeros(len(both)), when, how, spread, alone=False)
             taken[both] = light
-        now = {frozenset(old.number[list(one.tracks)].tolist()) for one in shared}
-        seen_alone = set(old.number[alone].tolist())
-        self._sharing = frozenset(now | {some for some in self._sharing if not seen_alone & some})
+        now = {frozenset(old.number[list(one.tracks)].tolist()): one.total for one in shared}
+        lately = {who: one for who, one in self._sharing.items() if when - one.time_s < how.life_s}
+        self._sharing = lately | now
         dim, edge = dimmed(old, seen, taken, self._clutter, how)
         if len(dim):
             old = fed(old, dim, seen.taken(edge), np.zeros(len(dim)), when, how, np.zeros(len(dim)))

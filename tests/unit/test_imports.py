@@ -34,6 +34,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.geometry": (),
     "nir_render.errors": (),
     "perception.pipeline": (),
+    "perception.pairs": (),
     "perception.photometry": (),
     "perception.track": (),
     "perception.messages": (),

@@ -6,19 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from perception import Heard, Message, Odometry, Pipeline, RawFrame
 from perception.messages.uart import encode
-from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expose, random
+from tests.unit.perception.stage import CAMERAS, EXPOSURE_S, RATE_HZ, frame_of
 
 Array = NDArray[np.float64]
 
-CAMERA = calibration(
-    width_px=240, height_px=120, fx_px=160.0, fy_px=160.0, cx_px=119.5, cy_px=59.5, source_radius_m=1e-4
-)
-CAMERAS = {CAMERA.camera: CAMERA}
-EXPOSURE_S, RATE_HZ = 2e-4, 30.0
 WORDS = {"near": 8, "far": 65}
 START_S = {"near": 1.23, "far": 1.71}
 
@@ -36,32 +30,14 @@ def _lit(who: str, time_s: float) -> bool:
     return not 0 <= bit < len(bits) or bool(bits[bit])
 
 
-def _pixel(place_m: Array) -> tuple[float, float, float]:
-    local = CAMERA.rotation_body_camera.T @ (place_m - CAMERA.position_body_m)
-    u = CAMERA.cx_px + CAMERA.fx_px * local[0] / local[2]
-    v = CAMERA.cy_px + CAMERA.fy_px * local[1] / local[2]
-    return float(u), float(v), float(np.linalg.norm(local))
-
-
-def _shares(at_px: float, count: int) -> Array:
-    """Return how much of a point's image each row, or column, of pixels gets."""
-    return np.diff(ndtr((np.arange(count + 1) - 0.5 - at_px) / CAMERA.psf_sigma_px))
-
-
 def _frame(index: int, turned_rad: float = 0.0, empty: bool = False) -> RawFrame:
     """Return a frame of an observer that has turned to the left by an angle."""
-    time_s = index / RATE_HZ
-    middle_s = time_s + 0.5 * EXPOSURE_S
+    middle_s = index / RATE_HZ + 0.5 * EXPOSURE_S
     cosine, sine = np.cos(turned_rad), np.sin(turned_rad)
     turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    lit = [_pixel(turn @ _place_m(who, middle_s)) for who in WORDS if _lit(who, middle_s) and not empty]
-    mean_e = np.full((CAMERA.height_px, CAMERA.width_px), 2.0)
-    for u_px, v_px, range_m in lit:
-        slant = np.hypot(np.hypot(u_px - CAMERA.cx_px, v_px - CAMERA.cy_px) / CAMERA.fx_px, 1.0)
-        flux_e = FLUX_PER_S_AT_1_M * EXPOSURE_S / slant / range_m**2
-        mean_e += flux_e * np.outer(_shares(v_px, CAMERA.height_px), _shares(u_px, CAMERA.width_px))
-    frame = expose(mean_e, CAMERA, random(7, index), EXPOSURE_S)
-    return replace(frame, index=index, time_s=time_s)
+    return frame_of(
+        index, [turn @ _place_m(who, middle_s) for who in WORDS if _lit(who, middle_s) and not empty]
+    )
 
 
 @pytest.fixture(scope="module")

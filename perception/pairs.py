@@ -1,0 +1,173 @@
+"""Tracks whose images no camera tells apart: the sum of their light is measured, and both are read from it.
+
+While two are in one place of the image neither has a brightness of its own that could be trusted: who of them
+is lit is a matter of the sum. It is kept as long as they are together, and read (`messages.pair`) when
+they have parted.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perception.messages.pair import decode_pair
+from perception.messages.settings import DecoderSettings
+from perception.photometry import Expected, Sample, image_width_px, sample_at, sample_of_detection
+from perception.types import Calibration, Detection, Message, RawFrame, Signal
+
+UNLIKE = 0.05
+"""Standard deviation of a source's flux over what its track predicts, relative, beside the track's own."""
+
+_APART = 1.5
+_SURE_PX = 2.0
+"""Images are one up to this many widths apart; a place less certain than so many pixels says less of that."""
+
+_PARTED_S = 1.5
+_LONGEST_S, _KEPT_S = 18.0, 7.0
+"""Tracks have parted for good; a signal so long is read, and its end is kept: a packet lasts 5.5 s."""
+
+_SHORTEST_S = 2.2
+_IDLE_SIGMAS = 5.0
+_SAME_S = 1.1
+"""Two messages with one word are one if their packets begin within a frame of each other."""
+
+Tracks = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class SumSample:
+    """Brightness of two sources in one place.
+
+    Attributes
+    ----------
+    sample
+        Of the sum, over what the first is when lit.
+    ratio
+        How bright the second is over the first, by where they are predicted.
+    """
+
+    sample: Sample
+    ratio: float
+
+
+def inseparable(expected: Mapping[int, Expected], calibration: Calibration) -> list[Tracks]:
+    """Return the pairs of tracks, by number, whose images in a frame are one, as far as places are known."""
+    numbers = list(expected)
+    images = list(expected.values())
+    place_px = np.array([[one.u_px, one.v_px] for one in images]).reshape(-1, 2)
+    width_px = np.array([image_width_px(one, calibration) for one in images])
+    unsure_px = np.array([one.sigma_px for one in images])
+    apart_px = np.hypot(*(place_px[:, None] - place_px).transpose(2, 0, 1))
+    blurred_px = np.hypot(
+        np.maximum.outer(width_px, width_px), np.minimum(np.hypot.outer(unsure_px, unsure_px), _SURE_PX)
+    )
+    close = np.argwhere(np.triu(apart_px < _APART * blurred_px, 1))
+    return [(numbers[k], numbers[n]) for k, n in close.tolist()]
+
+
+def sample_of_sum(
+    one: Expected, other: Expected, found: Sequence[Detection], frame: RawFrame, calibration: Calibration
+) -> SumSample | None:
+    """Return how bright two inseparable sources are together; None where nothing can be said.
+
+    All that was found within their images is theirs; where nothing was, both may be dark: that is measured.
+    """
+    ratio = other.flux_dn / one.flux_dn
+    share = ratio / (1.0 + ratio)
+    between = Expected(
+        u_px=one.u_px + share * (other.u_px - one.u_px),
+        v_px=one.v_px + share * (other.v_px - one.v_px),
+        sigma_px=max(one.sigma_px, other.sigma_px),
+        range_m=one.range_m,
+        flux_dn=one.flux_dn,
+    )
+    apart_px = math.hypot(one.u_px - other.u_px, one.v_px - other.v_px)
+    reach_px = apart_px + 2.0 * _APART * math.hypot(
+        image_width_px(one, calibration), min(between.sigma_px, _SURE_PX)
+    )
+    theirs = [hit for hit in found if math.hypot(hit.u_px - between.u_px, hit.v_px - between.v_px) < reach_px]
+    if not theirs:
+        dark = sample_at(between, found, frame, calibration)
+        return None if dark is None else SumSample(dark, ratio)
+    samples = [sample_of_detection(hit, between, frame, calibration) for hit in theirs]
+    if not all(math.isfinite(hit.flux_sigma_dn) for hit in theirs):
+        return None  # clipped beyond recovery: how much there is of both is not said
+    total = Sample(
+        samples[0].time_s,
+        samples[0].exposure_s,
+        sum(sample.level for sample in samples),
+        math.hypot(*(sample.sigma_dark for sample in samples)),
+        math.hypot(*(sample.sigma_lit for sample in samples)),
+    )
+    return SumSample(total, ratio)
+
+
+@dataclass
+class _Together:
+    """What was measured of a pair while it was together."""
+
+    samples: list[SumSample] = field(default_factory=list)
+
+    @property
+    def span_s(self) -> float:
+        return self.samples[-1].sample.time_s - self.samples[0].sample.time_s
+
+
+class PairReader:
+    """Reads pairs of tracks while no camera tells them apart."""
+
+    def __init__(self, settings: DecoderSettings | None = None) -> None:
+        self._settings = settings
+        self._pairs: dict[Tracks, _Together] = {}
+        self._said: list[Message] = []
+
+    def push(
+        self, robot: str, time_s: float, sums: Mapping[Tracks, SumSample], said: Iterable[Message]
+    ) -> tuple[Message, ...]:
+        """Take the samples of a set, and what single tracks said; return what pairs say.
+
+        A pair is read once it has parted, or when it has been together for long. What one of its tracks was
+        heard to say by itself is not said again.
+        """
+        self._said = [message for message in self._said if time_s - message.end_s < 2.0 * _LONGEST_S]
+        self._said += said
+        for tracks, sample in sums.items():
+            together = self._pairs.setdefault(tracks, _Together())
+            if not together.samples or sample.sample.time_s > together.samples[-1].sample.time_s:
+                together.samples.append(sample)
+        heard: list[Message] = []
+        for tracks in list(self._pairs):
+            together = self._pairs[tracks]
+            if time_s - together.samples[-1].sample.time_s > _PARTED_S:
+                heard += self._read(robot, tracks, self._pairs.pop(tracks))
+            elif together.span_s > _LONGEST_S:
+                heard += self._read(robot, tracks, together)
+                together.samples = [one for one in together.samples if time_s - one.sample.time_s < _KEPT_S]
+        return tuple(heard)
+
+    def finish(self, robot: str) -> tuple[Message, ...]:
+        """Return what the pairs say that are still together."""
+        heard = [message for tracks, one in self._pairs.items() for message in self._read(robot, tracks, one)]
+        self._pairs.clear()
+        return tuple(heard)
+
+    def _read(self, robot: str, tracks: Tracks, together: _Together) -> list[Message]:
+        if together.span_s < _SHORTEST_S:
+            return []
+        samples = [one.sample for one in together.samples]
+        ratio = float(np.median([one.ratio for one in together.samples]))
+        columns = np.array([[s.time_s, s.exposure_s, s.level, s.sigma_dark, s.sigma_lit] for s in samples]).T
+        if (columns[2] > 1.0 + ratio - _IDLE_SIGMAS * np.hypot(columns[4], UNLIKE * (1.0 + ratio))).all():
+            return []  # both were lit all the time
+        found = decode_pair(
+            Signal(robot, tracks[0], *columns), (1.0, ratio), (UNLIKE, UNLIKE * ratio), tracks, self._settings
+        )
+        new = [message for message in found if not any(_same(message, other) for other in self._said)]
+        self._said += new
+        return new
+
+
+def _same(one: Message, other: Message) -> bool:
+    """Say whether two messages are one that was heard twice."""
+    return one.word == other.word and abs(one.start_s - other.start_s) < _SAME_S
