@@ -84,6 +84,33 @@ def sample_facts(light: Light) -> dict[str, Any]:
     }
 
 
+def ambient_facts(scene: Scene) -> dict[str, Any] | None:
+    """Return what lights a scene besides its robots, as it was rendered; null where nothing does.
+
+    Of a lamp whose table ends before 1100 nm, `infrared` is the interval of what it may send beyond, over
+    what was rendered. An illuminance counts direct light alone: materials hold values at 940 nm only, so that
+    what walls throw on a plane in visible light is not known.
+    """
+    document = scene.document
+    lamps: dict[str, Any] = {}
+    for name, lamp in document.shining_lamps.items():
+        beyond = lamp.infrared
+        interval = None
+        if beyond is not None:
+            interval = {"share": beyond.share, "least": beyond.least, "most": beyond.most}
+        lamps[name] = {"luminous_flux_lm": _rounded(lamp.luminous_flux_lm), "infrared": interval}
+    facts: dict[str, Any] = {"lamps": lamps} if lamps else {}
+    if document.illuminance is not None:
+        level_lx, written_lx = document.illuminance.level_lx, document.written_illuminance_lx
+        facts["illuminance"] = {
+            "level_lx": level_lx,
+            "factor_of_lamps": _rounded(level_lx / written_lx),
+            "interreflection": False,
+            "reason": "materials hold values at 940 nm, none over 380 to 780 nm",
+        }
+    return facts or None
+
+
 def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return how far interpolated light is off where it was held out, and the times between renders.
 

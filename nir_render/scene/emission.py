@@ -1,8 +1,21 @@
 """What a light group sends: its spectrum of unit flux, and how many units of emission."""
 
-from nir_render.scene.documents.emitters import Lamp, Source, Sun
+from functools import lru_cache
+
+from nir_render.scene.documents.ambient.lamps import Infrared, Lamp
+from nir_render.scene.documents.ambient.sun import Sun
+from nir_render.scene.documents.curves import CurveDocument
+from nir_render.scene.documents.emitters import Source
 from nir_render.spectra.curve import Curve, constant_curve
-from nir_render.spectra.illuminants import SILICON_M, incandescent_flux_w, incandescent_spectrum
+from nir_render.spectra.illuminants import (
+    SILICON_M,
+    CieLamp,
+    incandescent_flux_w,
+    incandescent_spectrum,
+    radiant_flux_w,
+    table_of,
+    with_infrared,
+)
 
 Emitter = Source | Lamp | Sun
 
@@ -10,7 +23,7 @@ Emitter = Source | Lamp | Sun
 def emission_spectrum(emitter: Emitter) -> Curve:
     """Return the spectrum of an emitter, of unit flux, in 1/m."""
     if isinstance(emitter, Lamp):
-        return incandescent_spectrum(emitter.temperature_k, "the lamp's spectrum")
+        return _lamp_spectrum(emitter.temperature_k, emitter.illuminant, emitter.infrared)
     if isinstance(emitter, Sun):
         return constant_curve(1.0, *SILICON_M, "the sun's spectrum").normalised()
     return emitter.spectrum.curve("the source's spectrum").normalised()
@@ -23,7 +36,34 @@ def emission_units(emitter: Emitter) -> float:
     is 1 W/m² of irradiance across its direction, from 300 to 1100 nm too.
     """
     if isinstance(emitter, Lamp):
-        return incandescent_flux_w(emitter.luminous_flux_lm, emitter.temperature_k)
+        return _lamp_flux_w(
+            emitter.luminous_flux_lm, emitter.temperature_k, emitter.illuminant, emitter.infrared
+        )
     if isinstance(emitter, Sun):
         return emitter.irradiance_w_per_m3 * (SILICON_M[1] - SILICON_M[0])
     return emitter.flux_w
+
+
+@lru_cache(maxsize=64)
+def _lamp_spectrum(
+    temperature_k: float | None, illuminant: CieLamp | CurveDocument | None, infrared: Infrared | None
+) -> Curve:
+    name = "the lamp's spectrum"
+    if illuminant is None:
+        assert temperature_k is not None  # a lamp has one of both
+        return incandescent_spectrum(temperature_k, name)
+    table = illuminant.curve(name) if isinstance(illuminant, CurveDocument) else table_of(illuminant)
+    return table.normalised() if infrared is None else with_infrared(table, infrared.share)
+
+
+@lru_cache(maxsize=64)
+def _lamp_flux_w(
+    luminous_flux_lm: float,
+    temperature_k: float | None,
+    illuminant: CieLamp | CurveDocument | None,
+    infrared: Infrared | None,
+) -> float:
+    if illuminant is None:
+        assert temperature_k is not None  # a lamp has one of both
+        return incandescent_flux_w(luminous_flux_lm, temperature_k)
+    return radiant_flux_w(luminous_flux_lm, _lamp_spectrum(temperature_k, illuminant, infrared))

@@ -11,9 +11,11 @@ from pydantic import ValidationError
 from nir_render.errors import InputError, shown
 from nir_render.scene.bodies import shapes_at
 from nir_render.scene.checks import check
+from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Sun
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
-from nir_render.scene.documents.emitters import Lamp, Source, Sun
+from nir_render.scene.documents.emitters import Source
 from nir_render.scene.explain import Places, explain
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
@@ -72,7 +74,7 @@ class Scene:
     def emitters(self) -> dict[str, Source | Lamp | Sun]:
         """Return what each light group is, by name: `robot.source`, then `lamps.name`, then `sun`."""
         known: dict[str, Source | Lamp | Sun] = {name: source for name, (_, source) in self.sources().items()}
-        known |= {f"lamps.{name}": lamp for name, lamp in self.document.lamps.items()}
+        known |= {f"lamps.{name}": lamp for name, lamp in self.document.shining_lamps.items()}
         return known if self.document.sun is None else known | {"sun": self.document.sun}
 
     def at(self, time_s: float) -> Snapshot:
@@ -92,7 +94,7 @@ class Scene:
             },
             standing=shapes_at(document.shapes, time_s),
             materials=document.materials,
-            lamps=document.lamps,
+            lamps=document.shining_lamps,
             sun=document.sun,
             fog=document.fog,
             render=document.render,

@@ -13,22 +13,26 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from nir_render.errors import InputError, shown
 from nir_render.scene.bodies import body_shapes
+from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Sun
 from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import RenderSettings, reflects_or_scatters
-from nir_render.scene.documents.emitters import Lamp, Source, Sun
+from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import MaterialDocument
 from nir_render.scene.documents.shapes import ShapeDocument
-from nir_render.scene.documents.times.drives import Drive
+from nir_render.scene.documents.times.drives import Drive, SourceDrive
 from nir_render.scene.emission import Emitter
 from nir_render.scene.explain import explain
 from nir_render.scene.motion import Velocity
 from nir_render.scene.pose import Pose, camera_mount, source_mount
 from nir_render.scene.text.units import LENGTH
+
+_SOURCE_DRIVE: TypeAdapter[Drive] = TypeAdapter(SourceDrive)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +218,6 @@ class Snapshot:
 
     def _drive(self, name: str, drive: Any) -> Drive:
         try:
-            return Drive.model_validate(drive)
+            return _SOURCE_DRIVE.validate_python(drive)
         except ValidationError as error:
             raise InputError(*explain(error, drive, f"{self.origin}: the drive of {name}")) from None

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from nir_render.camera.optics.lens import corner_directions
+from nir_render.scene.documents.ambient.sun import Sun
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.documents.emitters import Sun
 from nir_render.scene.documents.shapes import Mesh, ShapeDocument
 from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter

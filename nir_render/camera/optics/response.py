@@ -18,9 +18,10 @@ from scipy import constants
 from scipy.interpolate import PchipInterpolator
 
 from nir_render.camera.optics.lens import field_of, intrinsics_of
+from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Sun
 from nir_render.scene.documents.base import Orientation
 from nir_render.scene.documents.camera import Camera, GlobalShutter
-from nir_render.scene.documents.emitters import Lamp, Sun
 from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter, emission_spectrum
 from nir_render.spectra.curve import Curve

@@ -21,7 +21,8 @@ _ALTERNATIVES = (
     {"extinction", "visibility"},
     {"full_well", "saturation_capacity"},
     {"values", "file"},
-    {"constant", "square", "bits"},
+    {"constant", "square", "bits", "flicker"},
+    {"temperature", "illuminant"},
     {"auto_exposure", "bracket"},
 )
 
