@@ -9,9 +9,11 @@ import numpy as np
 
 from nir_render.camera.render_noise import RenderNoise
 from nir_render.light.light import Light
+from nir_render.scene.emission import emission_spectrum, emission_units
 from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import Shot
 from nir_render.simulation.refresh import HELD_OUT, RefreshError
+from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.fingerprint import package_versions
 from nir_render.transport.indirect.sample_plan import MOST_SAMPLES
 
@@ -100,6 +102,14 @@ def ambient_facts(scene: Scene) -> dict[str, Any] | None:
             interval = {"share": beyond.share, "least": beyond.least, "most": beyond.most}
         lamps[name] = {"luminous_flux_lm": _rounded(lamp.luminous_flux_lm), "infrared": interval}
     facts: dict[str, Any] = {"lamps": lamps} if lamps else {}
+    for name in ("sun", "sky"):
+        emitter = scene.emitters().get(name)
+        if emitter is not None:
+            units, spectrum = emission_units(emitter), emission_spectrum(emitter)
+            facts[name] = {
+                "irradiance_w_per_m2": _rounded(units),
+                "at_940_nm_w_per_m2_per_nm": _rounded(units * float(spectrum(BAND_M)) * 1e-9),
+            }
     if document.illuminance is not None:
         level_lx, written_lx = document.illuminance.level_lx, document.written_illuminance_lx
         facts["illuminance"] = {

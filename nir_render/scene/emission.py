@@ -3,7 +3,7 @@
 from functools import lru_cache
 
 from nir_render.scene.documents.ambient.lamps import Infrared, Lamp
-from nir_render.scene.documents.ambient.sun import Sun
+from nir_render.scene.documents.ambient.sun import Air, Skylight, Sun
 from nir_render.scene.documents.curves import CurveDocument
 from nir_render.scene.documents.emitters import Source
 from nir_render.spectra.curve import Curve, constant_curve
@@ -16,8 +16,9 @@ from nir_render.spectra.illuminants import (
     table_of,
     with_infrared,
 )
+from nir_render.spectra.sunlight import Column, Sunlight, sunlight
 
-Emitter = Source | Lamp | Sun
+Emitter = Source | Lamp | Sun | Skylight
 
 
 def emission_spectrum(emitter: Emitter) -> Curve:
@@ -25,7 +26,14 @@ def emission_spectrum(emitter: Emitter) -> Curve:
     if isinstance(emitter, Lamp):
         return _lamp_spectrum(emitter.temperature_k, emitter.illuminant, emitter.infrared)
     if isinstance(emitter, Sun):
-        return constant_curve(1.0, *SILICON_M, "the sun's spectrum").normalised()
+        if emitter.air is None:
+            return constant_curve(1.0, *SILICON_M, "the sun's spectrum").normalised()
+        return _behind(emitter.air, emitter).direct.normalised()
+    if isinstance(emitter, Skylight):
+        if emitter.sky.irradiance_w_per_m3 is not None:
+            return constant_curve(1.0, *SILICON_M, "the sky's spectrum").normalised()
+        assert emitter.sun.air is not None  # a sky has one of both
+        return _behind(emitter.sun.air, emitter.sun).diffuse.normalised()
     return emitter.spectrum.curve("the source's spectrum").normalised()
 
 
@@ -33,15 +41,31 @@ def emission_units(emitter: Emitter) -> float:
     """Return how many of its units an emitter sends, over its whole spectrum.
 
     The unit of a source and of a lamp is 1 W of radiant flux, a lamp's from 300 to 1100 nm; that of the sun
-    is 1 W/m² of irradiance across its direction, from 300 to 1100 nm too.
+    is 1 W/m² of irradiance across its direction, that of the sky 1 W/m² on a horizontal plane, both from 300
+    to 1100 nm too.
     """
     if isinstance(emitter, Lamp):
         return _lamp_flux_w(
             emitter.luminous_flux_lm, emitter.temperature_k, emitter.illuminant, emitter.infrared
         )
     if isinstance(emitter, Sun):
-        return emitter.irradiance_w_per_m3 * (SILICON_M[1] - SILICON_M[0])
+        if emitter.air is not None:
+            return emitter.passed * _behind(emitter.air, emitter).direct.integral()
+        assert emitter.irradiance_w_per_m3 is not None  # a sun has one of both
+        return emitter.passed * emitter.irradiance_w_per_m3 * (SILICON_M[1] - SILICON_M[0])
+    if isinstance(emitter, Skylight):
+        if emitter.sky.irradiance_w_per_m3 is not None:
+            return emitter.sky.clouds * emitter.sky.irradiance_w_per_m3 * (SILICON_M[1] - SILICON_M[0])
+        assert emitter.sun.air is not None  # a sky has one of both
+        return emitter.sky.clouds * _behind(emitter.sun.air, emitter.sun).diffuse.integral()
     return emitter.flux_w
+
+
+def _behind(air: Air, sun: Sun) -> Sunlight:
+    column = Column(
+        air.precipitable_water_m, air.ozone_m, air.turbidity, air.altitude_m, air.ground_reflectance
+    )
+    return sunlight(column, sun.elevation_rad, sun.day_of_year)
 
 
 @lru_cache(maxsize=64)

@@ -11,11 +11,10 @@ from pydantic import ValidationError
 from nir_render.errors import InputError, shown
 from nir_render.scene.bodies import shapes_at
 from nir_render.scene.checks import check
-from nir_render.scene.documents.ambient.lamps import Lamp
-from nir_render.scene.documents.ambient.sun import Sun
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.emitters import Source
+from nir_render.scene.emission import Emitter
 from nir_render.scene.explain import Places, explain
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
@@ -71,11 +70,13 @@ class Scene:
             for source_name, source in robot.rig.sources.items()
         }
 
-    def emitters(self) -> dict[str, Source | Lamp | Sun]:
-        """Return what each light group is, by name: `robot.source`, then `lamps.name`, then `sun`."""
-        known: dict[str, Source | Lamp | Sun] = {name: source for name, (_, source) in self.sources().items()}
+    def emitters(self) -> dict[str, Emitter]:
+        """Return what each light group is, by name: `robot.source`, then `lamps.name`, `sun`, `sky`."""
+        known: dict[str, Emitter] = {name: source for name, (_, source) in self.sources().items()}
         known |= {f"lamps.{name}": lamp for name, lamp in self.document.shining_lamps.items()}
-        return known if self.document.sun is None else known | {"sun": self.document.sun}
+        known |= {} if self.document.sun is None else {"sun": self.document.sun}
+        skylight = self.document.skylight
+        return known if skylight is None else known | {"sky": skylight}
 
     def at(self, time_s: float) -> Snapshot:
         """Return the world of this scene at a time, robots where their motions have brought them.
@@ -100,6 +101,7 @@ class Scene:
             render=document.render,
             seed=document.seed,
             origin=self.path,
+            skylight=document.skylight,
         )
 
     def resolved_yaml(self) -> str:

@@ -3,6 +3,7 @@
 from typing import Any
 
 from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Air
 from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import SceneDocument
 from nir_render.scene.documents.emitters import Source
@@ -19,6 +20,7 @@ _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     Camera,
     Rig,
     Lamp,
+    Air,
 )
 
 

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from nir_render.errors import InputError, shown
 from nir_render.scene.bodies import body_shapes
 from nir_render.scene.documents.ambient.lamps import Lamp
-from nir_render.scene.documents.ambient.sun import Sun
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import RenderSettings, reflects_or_scatters
 from nir_render.scene.documents.emitters import Source
@@ -72,6 +72,8 @@ class Snapshot:
         Bodies that no robot carries, where they are, and what bodies are made of, by name.
     lamps, sun, fog
         What else shines, and what the air holds.
+    skylight
+        The sky under its sun, None where there is none.
     render
         How finely transport samples.
     seed
@@ -90,6 +92,7 @@ class Snapshot:
     render: RenderSettings
     seed: int = 0
     origin: str = "snapshot"
+    skylight: Skylight | None = None
 
     @cached_property
     def shapes(self) -> Mapping[str, ShapeDocument]:
@@ -110,10 +113,11 @@ class Snapshot:
 
     @cached_property
     def emitters(self) -> Mapping[str, Emitter]:
-        """What each light group is, by name: `robot.source`, then `lamps.name`, then `sun`."""
+        """What each light group is, by name: `robot.source`, then `lamps.name`, `sun`, `sky`."""
         known: dict[str, Emitter] = {name: placed.source for name, placed in self.sources.items()}
         known |= {f"lamps.{name}": lamp for name, lamp in self.lamps.items()}
-        return known if self.sun is None else known | {"sun": self.sun}
+        known |= {} if self.sun is None else {"sun": self.sun}
+        return known if self.skylight is None else known | {"sky": self.skylight}
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -136,7 +140,9 @@ class Snapshot:
         """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""
         if not self.emitters:
             return False
-        return bool(self.lamps) or reflects_or_scatters(self.shapes, self.materials, self.fog)
+        if self.lamps or self.skylight is not None:
+            return True
+        return reflects_or_scatters(self.shapes, self.materials, self.fog)
 
     def moved(
         self,

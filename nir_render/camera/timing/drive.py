@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nir_render.scene.documents.ambient.sun import Sun
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.times.drives import FULL_DRIVE, BitString, Drive, Flicker, Packets, SquareWave
 from nir_render.scene.emission import Emitter
 from perception.messages.uart import encode
@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 
 
 def drive_of(emitter: Emitter) -> Drive:
-    """Return the drive of an emitter; the sun shines evenly."""
-    return FULL_DRIVE if isinstance(emitter, Sun) else emitter.drive
+    """Return the drive of an emitter; sun and sky shine evenly."""
+    return FULL_DRIVE if isinstance(emitter, Sun | Skylight) else emitter.drive
 
 
 def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array:

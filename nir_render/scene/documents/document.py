@@ -22,7 +22,7 @@ from pydantic_core import CoreSchema, core_schema
 from nir_render.errors import shown
 from nir_render.geometry import rectangle_frame
 from nir_render.scene.documents.ambient.lamps import IlluminanceDocument, Lamp
-from nir_render.scene.documents.ambient.sun import Sun
+from nir_render.scene.documents.ambient.sun import Sky, Skylight, Sun
 from nir_render.scene.documents.base import Document, Name, Orientation, Position, Positive, Time
 from nir_render.scene.documents.camera import Rig
 from nir_render.scene.documents.files import expand_preset, preset_names
@@ -187,6 +187,7 @@ class SceneDocument(Document):
     lamps: dict[Name, Lamp] = {}
     illuminance: IlluminanceDocument | None = None
     sun: Sun | None = None
+    sky: Sky | None = None
     fog: Fog | None = None
 
     @model_validator(mode="before")
@@ -236,6 +237,17 @@ class SceneDocument(Document):
         return self
 
     @model_validator(mode="after")
+    def _sky_has_its_sun(self) -> Self:
+        if self.sky is None:
+            return self
+        if self.sun is None or (self.sun.air is None and self.sky.irradiance_w_per_m3 is None):
+            raise ValueError(
+                "sky: its light follows from the sun's place and 'air'; write such as sun: {azimuth: 30 deg, "
+                "elevation: 40 deg, air: g173} (clouds: 0 hides its disc)"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _lamps_reach_the_plane(self) -> Self:
         if self.illuminance is None:
             return self
@@ -256,6 +268,14 @@ class SceneDocument(Document):
         """What lamps, as they are written, bring to the plane of `illuminance` directly; 0 without one."""
         plane = self.illuminance
         return 0.0 if plane is None else sum(_brought_lx(lamp, plane) for lamp in self.lamps.values())
+
+    @property
+    def skylight(self) -> Skylight | None:
+        """The sky under its sun, None without one."""
+        if self.sky is None:
+            return None
+        assert self.sun is not None  # a sky without a sun has been refused
+        return Skylight.model_construct(sky=self.sky, sun=self.sun)
 
     @cached_property
     def shining_lamps(self) -> dict[str, Lamp]:
@@ -292,7 +312,9 @@ class SceneDocument(Document):
         sources = any(robot.rig.sources for robot in self.robots.values())
         if not (sources or self.lamps or self.sun is not None):
             return False
-        return bool(self.lamps) or reflects_or_scatters(self.all_shapes(), self.materials, self.fog)
+        if self.lamps or self.sky is not None:
+            return True
+        return reflects_or_scatters(self.all_shapes(), self.materials, self.fog)
 
     def frame_times_s(self) -> list[float]:
         """Return the start of each frame's exposure."""

@@ -23,6 +23,7 @@ _ALTERNATIVES = (
     {"values", "file"},
     {"constant", "square", "bits", "flicker"},
     {"temperature", "illuminant"},
+    {"irradiance", "air"},
     {"auto_exposure", "bracket"},
 )
 
