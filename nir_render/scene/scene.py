@@ -71,8 +71,9 @@ class Scene:
         }
 
     def emitters(self) -> dict[str, Emitter]:
-        """Return what each light group is, by name: `robot.source`, then `lamps.name`, `sun`, `sky`."""
+        """Return what each light group is: `robot.source`, `beacons.name`, `lamps.name`, `sun`, `sky`."""
         known: dict[str, Emitter] = {name: source for name, (_, source) in self.sources().items()}
+        known |= {f"beacons.{name}": source for name, source in (self.document.beacons or {}).items()}
         known |= {f"lamps.{name}": lamp for name, lamp in self.document.shining_lamps.items()}
         known |= {} if self.document.sun is None else {"sun": self.document.sun}
         skylight = self.document.skylight
@@ -102,6 +103,7 @@ class Scene:
             seed=document.seed,
             origin=self.path,
             skylight=document.skylight,
+            beacons=document.beacons or {},
         )
 
     def resolved_yaml(self) -> str:

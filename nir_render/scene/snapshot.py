@@ -8,7 +8,7 @@ it. Transport and camera know the world by snapshots alone.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -74,6 +74,8 @@ class Snapshot:
         What else shines, and what the air holds.
     skylight
         The sky under its sun, None where there is none.
+    beacons
+        Sources that stand in the world and are no robot's, by name.
     render
         How finely transport samples.
     seed
@@ -93,6 +95,7 @@ class Snapshot:
     seed: int = 0
     origin: str = "snapshot"
     skylight: Skylight | None = None
+    beacons: Mapping[str, Source] = field(default_factory=dict)
 
     @cached_property
     def shapes(self) -> Mapping[str, ShapeDocument]:
@@ -104,7 +107,16 @@ class Snapshot:
 
     @cached_property
     def sources(self) -> Mapping[str, PlacedSource]:
-        """The sources of all robots, by `robot.source`: the first of the light groups."""
+        """All spheres that shine, the first of the light groups: `robot.source`, then `beacons.name`."""
+        standing = {
+            f"beacons.{name}": PlacedSource(source, source_mount(source))
+            for name, source in self.beacons.items()
+        }
+        return {**self.carried_sources, **standing}
+
+    @cached_property
+    def carried_sources(self) -> Mapping[str, PlacedSource]:
+        """The sources of all robots, by `robot.source`."""
         return {
             f"{name}.{source_name}": PlacedSource(source, robot.pose @ source_mount(source))
             for name, robot in self.robots.items()
@@ -113,7 +125,7 @@ class Snapshot:
 
     @cached_property
     def emitters(self) -> Mapping[str, Emitter]:
-        """What each light group is, by name: `robot.source`, then `lamps.name`, `sun`, `sky`."""
+        """What each light group is, by name: `robot.source`, `beacons.name`, `lamps.name`, `sun`, `sky`."""
         known: dict[str, Emitter] = {name: placed.source for name, placed in self.sources.items()}
         known |= {f"lamps.{name}": lamp for name, lamp in self.lamps.items()}
         known |= {} if self.sun is None else {"sun": self.sun}
@@ -189,8 +201,8 @@ class Snapshot:
         robots = dict(self.robots)
         for name, drive in drives.items():
             robot_name, _, source_name = name.partition(".")
-            if name not in self.sources:
-                known = ", ".join(self.sources) or "none"
+            if name not in self.carried_sources:
+                known = ", ".join(self.carried_sources) or "none"
                 raise InputError(f"{self.origin}: there is no source {shown(name)}; known: {known}")
             rig = robots[robot_name].rig
             source = rig.sources[source_name].model_copy(update={"drive": self._drive(name, drive)})

@@ -25,6 +25,7 @@ from nir_render.scene.documents.ambient.lamps import IlluminanceDocument, Lamp
 from nir_render.scene.documents.ambient.sun import Sky, Skylight, Sun
 from nir_render.scene.documents.base import Document, Name, Orientation, Position, Positive, Time
 from nir_render.scene.documents.camera import Rig
+from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import expand_preset, preset_names
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import Diffuse, MaterialDocument
@@ -173,7 +174,10 @@ class RenderSettings(Document):
 
 
 class SceneDocument(Document):
-    """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom."""
+    """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom.
+
+    `beacons` are what others let shine: spheres as robots' sources are, where the scene puts them.
+    """
 
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}$")] = "scene"
@@ -188,6 +192,7 @@ class SceneDocument(Document):
     illuminance: IlluminanceDocument | None = None
     sun: Sun | None = None
     sky: Sky | None = None
+    beacons: dict[Name, Source] | None = None
     fog: Fog | None = None
 
     @model_validator(mode="before")
@@ -309,7 +314,7 @@ class SceneDocument(Document):
 
     def has_indirect_light(self) -> bool:
         """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""
-        sources = any(robot.rig.sources for robot in self.robots.values())
+        sources = bool(self.beacons) or any(robot.rig.sources for robot in self.robots.values())
         if not (sources or self.lamps or self.sun is not None):
             return False
         if self.lamps or self.sky is not None:
