@@ -15,7 +15,7 @@ from tests.paths import SCENES
 
 Array = NDArray[np.float64]
 
-# Of the measured sensor of docs/physics.md: 76 % at 525, 20 % at 850, 7.7 % at 940 nm; assumed between and beyond.
+# As measured of an IMX428: 76 % at 525, 20 % at 850, 7.7 % at 940 nm; assumed between and beyond.
 SILICON = [
     (300.0, 0.2), (400.0, 0.5), (525.0, 0.76), (600.0, 0.7), (700.0, 0.5), (800.0, 0.28), (850.0, 0.2), (940.0, 0.077),
     (1000.0, 0.03), (1100.0, 0.0),
