@@ -268,3 +268,18 @@ def test_the_compiler_is_the_one_that_was_chosen() -> None:
     used = backend()
     expected = f"LLVM {choose().version}" if used.variant.startswith("llvm") else ""
     assert used.compiler == expected
+
+
+def test_a_sky_is_in_the_key_by_its_kind_not_by_its_strength(scene: Scene) -> None:
+    """A beacon by its place: its flux, spectrum and drive are arithmetic too."""
+    sky = {"sky.cie": 12, "sky.irradiance": "0.01 W/m^2/nm"}
+    under_it = scene.with_(sky)
+    assert _key(under_it) != _key(scene)
+    assert _key(scene.with_({**sky, "sky.cie": 13})) != _key(under_it)
+    for stronger in ({"sky.irradiance": "0.02 W/m^2/nm"}, {"sky.clouds": 0.5}, {"sun.clouds": 0.1}):
+        assert _key(scene.with_({**sky, **stronger})) == _key(under_it)
+    beacon = {"beacons.one": {"preset": "tof_camera_940", "position": "[1, 1, 1] m"}}
+    with_it = scene.with_(beacon)
+    assert _key(with_it) != _key(scene)
+    assert _key(with_it.with_({"beacons.one.position": "[1, 1, 1.1] m"})) != _key(with_it)
+    assert _key(with_it.with_({"beacons.one.flux": "1 W"})) == _key(with_it)
