@@ -49,7 +49,7 @@ __all__ = [
 
 _HOMES = {
     "DirectTable": "light.light",
-    "Drive": "scene.documents.emitters",
+    "Drive": "scene.documents.times.drives",
     "Indirect": "light.light",
     "InputError": "errors",
     "LampTruth": "truth.lamps",

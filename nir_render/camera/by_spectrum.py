@@ -10,8 +10,9 @@ from nir_render.camera.optics.response import Response, response
 from nir_render.camera.timing.drive import drive_of
 from nir_render.errors import InputError
 from nir_render.light.light import Light
+from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.documents.emitters import Lamp, Sun
 from nir_render.scene.emission import Emitter, emission_units
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import Node
@@ -94,6 +95,8 @@ def _lit_units(emitter: Emitter) -> float:
 
 
 def _spectrum_key(emitter: Emitter) -> Hashable:
-    if isinstance(emitter, Sun):
-        return "sun"
-    return emitter.temperature_k if isinstance(emitter, Lamp) else emitter.spectrum
+    if isinstance(emitter, Sun | Skylight):
+        return "sun" if isinstance(emitter, Sun) else "sky"
+    if isinstance(emitter, Lamp):
+        return emitter.temperature_k if emitter.illuminant is None else (emitter.illuminant, emitter.infrared)
+    return emitter.spectrum

@@ -53,19 +53,23 @@ class Path:
 
 def may_move(snapshot: Snapshot, camera: str, group: str) -> bool:
     """Tell whether a source may move as a camera, `robot.camera`, sees it; the sun counts as still."""
-    carriers = (name.partition(".")[0] for name in (camera, group))
-    return group in snapshot.sources and any(snapshot.robots[one].velocity is not None for one in carriers)
+    if group not in snapshot.sources:
+        return False
+    return _velocity(snapshot, camera) is not None or _velocity(snapshot, group) is not None
 
 
 def path_of(
     snapshot: Snapshot, camera: str, group: str, table: DirectTable, row: int, offsets_s: Array
 ) -> Path:
     """Return where a row's disc is at times, shape (n,), from that of the snapshot on."""
-    eye, carrier = (snapshot.robots[name.partition(".")[0]] for name in (camera, group))
+    eye = snapshot.robots[camera.partition(".")[0]]
     here = snapshot.camera(camera).pose
     source_m = snapshot.sources[group].pose.position_m
     shown_m = here.rotation @ (table.distance_m[row] * table.direction[row]) + here.position_m
-    there_m = _carried(source_m, carrier.pose, carrier.velocity, offsets_s)
+    velocity = _velocity(snapshot, group)
+    # A beacon is no robot's, and rests.
+    at = eye.pose if velocity is None else snapshot.robots[group.partition(".")[0]].pose
+    there_m = _carried(source_m, at, velocity, offsets_s)
     if table.facet[row] >= 0:
         # A mirror stands halfway between a source and its image, across the line that joins them.
         apart_m = source_m - shown_m
@@ -78,6 +82,12 @@ def path_of(
     offset_m = np.einsum("nji,nj->ni", _turns(eye.velocity, offsets_s), there_m - lens_m)
     distance_m = np.linalg.norm(offset_m, axis=1)
     return Path((offset_m / distance_m[:, None]) @ here.rotation, distance_m)
+
+
+def _velocity(snapshot: Snapshot, name: str) -> Velocity | None:
+    """Return the velocity of the robot of a camera or source; None of what stands."""
+    robot = snapshot.robots.get(name.partition(".")[0])
+    return None if robot is None else robot.velocity
 
 
 def moved_beam(beam: Beam, direction: Array, distance_m: float, seen: NDArray[np.bool_] | None) -> Beam:

@@ -9,9 +9,11 @@ import numpy as np
 
 from nir_render.camera.render_noise import RenderNoise
 from nir_render.light.light import Light
+from nir_render.scene.emission import emission_spectrum, emission_units
 from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import Shot
 from nir_render.simulation.refresh import HELD_OUT, RefreshError
+from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.fingerprint import package_versions
 from nir_render.transport.indirect.sample_plan import MOST_SAMPLES
 
@@ -82,6 +84,41 @@ def sample_facts(light: Light) -> dict[str, Any]:
         "pixels_at_cap": at_cap,
         "pixels_below_need": light.short_pixels,
     }
+
+
+def ambient_facts(scene: Scene) -> dict[str, Any] | None:
+    """Return what lights a scene besides its robots, as it was rendered; null where nothing does.
+
+    Of a lamp whose table ends before 1100 nm, `infrared` is the interval of what it may send beyond, over
+    what was rendered. An illuminance counts direct light alone: materials hold values at 940 nm only, so that
+    what walls throw on a plane in visible light is not known.
+    """
+    document = scene.document
+    lamps: dict[str, Any] = {}
+    for name, lamp in document.shining_lamps.items():
+        beyond = lamp.infrared
+        interval = None
+        if beyond is not None:
+            interval = {"share": beyond.share, "least": beyond.least, "most": beyond.most}
+        lamps[name] = {"luminous_flux_lm": _rounded(lamp.luminous_flux_lm), "infrared": interval}
+    facts: dict[str, Any] = {"lamps": lamps} if lamps else {}
+    for name in ("sun", "sky"):
+        emitter = scene.emitters().get(name)
+        if emitter is not None:
+            units, spectrum = emission_units(emitter), emission_spectrum(emitter)
+            facts[name] = {
+                "irradiance_w_per_m2": _rounded(units),
+                "at_940_nm_w_per_m2_per_nm": _rounded(units * float(spectrum(BAND_M)) * 1e-9),
+            }
+    if document.illuminance is not None:
+        level_lx, written_lx = document.illuminance.level_lx, document.written_illuminance_lx
+        facts["illuminance"] = {
+            "level_lx": level_lx,
+            "factor_of_lamps": _rounded(level_lx / written_lx),
+            "interreflection": False,
+            "why_not": "materials hold values at 940 nm, none over 380 to 780 nm",
+        }
+    return facts or None
 
 
 def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from nir_render.light.light import Light
 from nir_render.run import folder as run_folder
 from nir_render.run.journal import Entry, Journal
 from nir_render.run.manifest import (
+    ambient_facts,
     enlarging_facts,
     noise_facts,
     noise_warning,
@@ -274,6 +275,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
         "seconds": {"render": round(seconds, 3)},
         "indirect": _indirect_facts(scene) | by_camera | refresh_facts(scene, writer.refresh),
         "render_noise": noise,
+        "ambient": ambient_facts(scene),
         "lights": {"rendered": writer.lights[0], "reused": writer.lights[1]},
     }
 

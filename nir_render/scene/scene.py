@@ -13,7 +13,8 @@ from nir_render.scene.bodies import shapes_at
 from nir_render.scene.checks import check
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
-from nir_render.scene.documents.emitters import Lamp, Source, Sun
+from nir_render.scene.documents.emitters import Source
+from nir_render.scene.emission import Emitter
 from nir_render.scene.explain import Places, explain
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
@@ -69,11 +70,14 @@ class Scene:
             for source_name, source in robot.rig.sources.items()
         }
 
-    def emitters(self) -> dict[str, Source | Lamp | Sun]:
-        """Return what each light group is, by name: `robot.source`, then `lamps.name`, then `sun`."""
-        known: dict[str, Source | Lamp | Sun] = {name: source for name, (_, source) in self.sources().items()}
-        known |= {f"lamps.{name}": lamp for name, lamp in self.document.lamps.items()}
-        return known if self.document.sun is None else known | {"sun": self.document.sun}
+    def emitters(self) -> dict[str, Emitter]:
+        """Return what each light group is: `robot.source`, `beacons.name`, `lamps.name`, `sun`, `sky`."""
+        known: dict[str, Emitter] = {name: source for name, (_, source) in self.sources().items()}
+        known |= {f"beacons.{name}": source for name, source in (self.document.beacons or {}).items()}
+        known |= {f"lamps.{name}": lamp for name, lamp in self.document.shining_lamps.items()}
+        known |= {} if self.document.sun is None else {"sun": self.document.sun}
+        skylight = self.document.skylight
+        return known if skylight is None else known | {"sky": skylight}
 
     def at(self, time_s: float) -> Snapshot:
         """Return the world of this scene at a time, robots where their motions have brought them.
@@ -92,12 +96,14 @@ class Scene:
             },
             standing=shapes_at(document.shapes, time_s),
             materials=document.materials,
-            lamps=document.lamps,
+            lamps=document.shining_lamps,
             sun=document.sun,
             fog=document.fog,
             render=document.render,
             seed=document.seed,
             origin=self.path,
+            skylight=document.skylight,
+            beacons=document.beacons or {},
         )
 
     def resolved_yaml(self) -> str:

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Air
 from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import SceneDocument
-from nir_render.scene.documents.emitters import Lamp, Source
+from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import PresetDocument, preset_names
 from nir_render.scene.documents.lens import Bandpass, Lens
 from nir_render.scene.documents.sensor import Sensor
@@ -18,6 +20,7 @@ _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     Camera,
     Rig,
     Lamp,
+    Air,
 )
 
 

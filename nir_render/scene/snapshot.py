@@ -8,27 +8,31 @@ it. Transport and camera know the world by snapshots alone.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from nir_render.errors import InputError, shown
 from nir_render.scene.bodies import body_shapes
+from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import RenderSettings, reflects_or_scatters
-from nir_render.scene.documents.emitters import Lamp, Source, Sun
+from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import MaterialDocument
 from nir_render.scene.documents.shapes import ShapeDocument
-from nir_render.scene.documents.times.drives import Drive
+from nir_render.scene.documents.times.drives import Drive, SourceDrive
 from nir_render.scene.emission import Emitter
 from nir_render.scene.explain import explain
 from nir_render.scene.motion import Velocity
 from nir_render.scene.pose import Pose, camera_mount, source_mount
 from nir_render.scene.text.units import LENGTH
+
+_SOURCE_DRIVE: TypeAdapter[Drive] = TypeAdapter(SourceDrive)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +72,10 @@ class Snapshot:
         Bodies that no robot carries, where they are, and what bodies are made of, by name.
     lamps, sun, fog
         What else shines, and what the air holds.
+    skylight
+        The sky under its sun, None where there is none.
+    beacons
+        Sources that stand in the world and are no robot's, by name.
     render
         How finely transport samples.
     seed
@@ -86,6 +94,8 @@ class Snapshot:
     render: RenderSettings
     seed: int = 0
     origin: str = "snapshot"
+    skylight: Skylight | None = None
+    beacons: Mapping[str, Source] = field(default_factory=dict)
 
     @cached_property
     def shapes(self) -> Mapping[str, ShapeDocument]:
@@ -97,7 +107,16 @@ class Snapshot:
 
     @cached_property
     def sources(self) -> Mapping[str, PlacedSource]:
-        """The sources of all robots, by `robot.source`: the first of the light groups."""
+        """All spheres that shine, the first of the light groups: `robot.source`, then `beacons.name`."""
+        standing = {
+            f"beacons.{name}": PlacedSource(source, source_mount(source))
+            for name, source in self.beacons.items()
+        }
+        return {**self.carried_sources, **standing}
+
+    @cached_property
+    def carried_sources(self) -> Mapping[str, PlacedSource]:
+        """The sources of all robots, by `robot.source`."""
         return {
             f"{name}.{source_name}": PlacedSource(source, robot.pose @ source_mount(source))
             for name, robot in self.robots.items()
@@ -106,10 +125,11 @@ class Snapshot:
 
     @cached_property
     def emitters(self) -> Mapping[str, Emitter]:
-        """What each light group is, by name: `robot.source`, then `lamps.name`, then `sun`."""
+        """What each light group is, by name: `robot.source`, `beacons.name`, `lamps.name`, `sun`, `sky`."""
         known: dict[str, Emitter] = {name: placed.source for name, placed in self.sources.items()}
         known |= {f"lamps.{name}": lamp for name, lamp in self.lamps.items()}
-        return known if self.sun is None else known | {"sun": self.sun}
+        known |= {} if self.sun is None else {"sun": self.sun}
+        return known if self.skylight is None else known | {"sky": self.skylight}
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -132,7 +152,9 @@ class Snapshot:
         """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""
         if not self.emitters:
             return False
-        return bool(self.lamps) or reflects_or_scatters(self.shapes, self.materials, self.fog)
+        if self.lamps or self.skylight is not None:
+            return True
+        return reflects_or_scatters(self.shapes, self.materials, self.fog)
 
     def moved(
         self,
@@ -179,8 +201,8 @@ class Snapshot:
         robots = dict(self.robots)
         for name, drive in drives.items():
             robot_name, _, source_name = name.partition(".")
-            if name not in self.sources:
-                known = ", ".join(self.sources) or "none"
+            if name not in self.carried_sources:
+                known = ", ".join(self.carried_sources) or "none"
                 raise InputError(f"{self.origin}: there is no source {shown(name)}; known: {known}")
             rig = robots[robot_name].rig
             source = rig.sources[source_name].model_copy(update={"drive": self._drive(name, drive)})
@@ -214,6 +236,6 @@ class Snapshot:
 
     def _drive(self, name: str, drive: Any) -> Drive:
         try:
-            return Drive.model_validate(drive)
+            return _SOURCE_DRIVE.validate_python(drive)
         except ValidationError as error:
             raise InputError(*explain(error, drive, f"{self.origin}: the drive of {name}")) from None

@@ -64,7 +64,7 @@ def _devices(world: Scene | Snapshot, camera: str) -> tuple[Camera, tuple[Source
     snapshot = world.at(0.0) if isinstance(world, Scene) else world
     device = snapshot.camera(camera).camera
     own = camera.partition(".")[0] + "."
-    everyone = {name: placed.source for name, placed in snapshot.sources.items()}
+    everyone = {name: placed.source for name, placed in snapshot.carried_sources.items()}
     others = [source for name, source in everyone.items() if not name.startswith(own)]
     sources = others or list(everyone.values())
     if not sources:
@@ -76,7 +76,9 @@ def _with_robot(known: Calibration, world: Scene | Snapshot) -> Calibration:
     """Return a calibration with what else the robot knows: where its own sources sit, that there is fog."""
     snapshot = world.at(0.0) if isinstance(world, Scene) else world
     own = known.camera.partition(".")[0] + "."
-    places = [each.source.position_m for name, each in snapshot.sources.items() if name.startswith(own)]
+    places = [
+        each.source.position_m for name, each in snapshot.carried_sources.items() if name.startswith(own)
+    ]
     sigma = dict(known.sigma)
     if snapshot.fog is not None and snapshot.fog.extinction_per_m > 0.0:
         sigma["extinction_per_m"] = FOG_SIGMA_PER_M

@@ -1,4 +1,4 @@
-"""Where lamps and the sun stand in a frame."""
+"""Where lamps, beacons and the sun stand in a frame."""
 
 from collections.abc import Iterator
 
@@ -22,7 +22,7 @@ _NEAREST_M = 0.01  # along the axis
 
 
 def lamp_truth(snapshot: Snapshot, camera: str, index: int) -> Iterator[LampTruth]:
-    """Yield the outline of each lamp that a camera sees from in front, then those of the sun and its images.
+    """Yield the outline of each lamp that a camera sees from in front, then of beacons, sun, their images.
 
     An outline is a polygon, concave where the lens bends it so; a lamp that reaches behind the camera is cut
     off there. What hides a lamp is not looked at.
@@ -40,9 +40,9 @@ def lamp_truth(snapshot: Snapshot, camera: str, index: int) -> Iterator[LampTrut
         seen = _in_front(pose.to_local(edges + np.array(lamp.center_m)))
         if len(seen):
             yield LampTruth(camera, index, f"lamps.{name}", _outline_px(lens, seen))
-    if snapshot.sun is not None:
-        for edge in _suns(snapshot, pose):
-            yield LampTruth(camera, index, "sun", _outline_px(lens, edge))
+    if snapshot.sun is not None or snapshot.beacons:
+        for name, edge in _discs(snapshot, pose):
+            yield LampTruth(camera, index, name, _outline_px(lens, edge))
 
 
 def _outline_px(lens: Intrinsics, points: NDArray[np.float64]) -> Outline:
@@ -72,15 +72,15 @@ def _in_front(outline_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([seen, start_m + steps * (end_m - start_m)])
 
 
-def _suns(snapshot: Snapshot, pose: Pose) -> list[NDArray[np.float64]]:
-    """Return directions around the sun's disc and around each of its images, in camera axes, shape (n, 3)."""
+def _discs(snapshot: Snapshot, pose: Pose) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield beacons, the sun and their images: name, directions around it in camera axes, shape (n, 3)."""
     lights, surfaces = small_lights(snapshot), facets(snapshot)
     azimuth_rad = 2.0 * np.pi * np.arange(_EDGE_POINTS) / _EDGE_POINTS
-    edges = []
+    strange = np.array([name not in snapshot.carried_sources for name in lights.name])
     for ways in (straight(lights, pose), ghosts(lights, surfaces, pose)):
-        suns = ways[lights.endless[ways.light]]
-        for facet, direction, radius_rad in zip(
-            suns.facet, suns.direction, suns.angular_radius_rad, strict=True
+        shown = ways[strange[ways.light]]
+        for light, facet, direction, radius_rad in zip(
+            shown.light, shown.facet, shown.direction, shown.angular_radius_rad, strict=True
         ):
             edge = cone_directions(direction, np.full(_EDGE_POINTS, cone_versine(radius_rad)), azimuth_rad)
             ahead = edge[edge[:, 2] > 0.01]
@@ -88,5 +88,4 @@ def _suns(snapshot: Snapshot, pose: Pose) -> list[NDArray[np.float64]]:
             if len(ahead) >= 3 and (
                 facet < 0 or crossing(surfaces, facet, start_m, edge @ pose.rotation.T)[1].any()
             ):
-                edges.append(ahead)
-    return edges
+                yield lights.name[light], ahead

@@ -21,7 +21,8 @@ from perception.types import RawFrame
 def truth_of(mean: MeanFrame, frame: RawFrame) -> Iterator[SourceTruth]:
     """Yield the truth about each source and ghost that is in the image.
 
-    It is there if its centre is, or some of its light. The sun is no source that anyone looks for.
+    It is there if its centre is, or some of its light. The sun is no source that anyone looks for, nor are
+    beacons.
     """
     light, camera, snapshot = mean.light, mean.camera, mean.rates.snapshot
     intrinsics = intrinsics_of(camera)
@@ -34,7 +35,7 @@ def truth_of(mean: MeanFrame, frame: RawFrame) -> Iterator[SourceTruth]:
         if not intrinsics.contains(u_px, v_px) and not (lit and np.isfinite([u_px, v_px]).all()):
             continue
         group, is_ghost = int(table.group[row]), bool(table.facet[row] >= 0)
-        if light.groups[group] == "sun":
+        if light.groups[group] not in snapshot.carried_sources:
             continue
         robot, _, source = light.groups[group].partition(".")
         direction, distance_m = table.direction[row], float(table.distance_m[row])

@@ -1,7 +1,8 @@
-"""Emission spectra: LEDs as Gaussians, lamps by Planck's law, scaled by what the eye sees of them."""
+"""Emission spectra: LEDs as Gaussians, lamps by Planck's law or by tables, scaled by what the eye sees."""
 
 import math
 from functools import lru_cache
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,13 @@ _EFFICACY_LM_PER_W = 683.0
 
 # What silicon sees: a lamp's flux counts over this range.
 SILICON_M = (300e-9, 1100e-9)
+
+# Tables of lamps in CIE 15:2018 (fluorescent: FL2 cool white, FL7 daylight, FL11 and FL12 three bands; high
+# pressure sodium HP1; white LEDs: B1 to B5 blue chip and phosphor, 2733 to 6598 K, V1 violet chip).
+CieLamp = Literal[
+    "FL2", "FL7", "FL11", "FL12", "HP1", "LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-V1"
+]  # fmt: skip
+CIE_END_M = 780e-9
 
 _FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
@@ -43,15 +51,44 @@ def incandescent_spectrum(temperature_k: float, name: str) -> Curve:
 
 
 @lru_cache(maxsize=64)
-def incandescent_flux_w(luminous_flux_lm: float, temperature_k: float) -> float:
-    """Return the radiant flux, over what silicon sees, of a lamp of a luminous flux.
+def table_of(lamp: CieLamp) -> Curve:
+    """Return the table of a lamp of CIE 15, 380 to 780 nm in steps of 5 nm, any scale."""
+    table = _colour().SDS_ILLUMINANTS[lamp]
+    return Curve(np.asarray(table.wavelengths) * 1e-9, np.asarray(table.values, dtype=np.float64), lamp)
 
-    Φ_v = 683 lm/W ∫ V(λ) Φ_λ dλ with the CIE 1924 photopic V(λ), which colour-science tabulates.
+
+def with_infrared(table: Curve, share: float) -> Curve:
+    """Return a table continued to 1100 nm, flat, by this share of the flux within it, of unit flux, in 1/m.
+
+    From 380 nm, where tables begin, down to 300 nm nothing is added.
     """
+    end_m, beyond_m = table.high_m, SILICON_M[1] - table.high_m
+    level = share * table.integral() / beyond_m
+    wavelength_m = np.concatenate([table.wavelength_m, [end_m * (1.0 + 1e-9), SILICON_M[1]]])
+    return Curve(wavelength_m, np.concatenate([table.value, [level, level]]), table.name).normalised()
+
+
+@lru_cache(maxsize=64)
+def incandescent_flux_w(luminous_flux_lm: float, temperature_k: float) -> float:
+    """Return the radiant flux, over what silicon sees, of an incandescent lamp of a luminous flux."""
+    return radiant_flux_w(luminous_flux_lm, incandescent_spectrum(temperature_k, "lamp"))
+
+
+def radiant_flux_w(luminous_flux_lm: float, spectrum: Curve) -> float:
+    """Return the radiant flux of light of a luminous flux and a spectrum of unit flux.
+
+    Φ_v = 683 lm/W ∫ V(λ) Φ_λ dλ with the CIE 1924 photopic V(λ), which colour-science tabulates. Where a
+    spectrum begins later or ends earlier, nothing is seen.
+    """
+    photopic = _colour().SDS_LEFS["CIE 1924 Photopic Standard Observer"]
+    wavelength_m, value = np.asarray(photopic.wavelengths) * 1e-9, np.asarray(photopic.values)
+    within = (wavelength_m >= spectrum.low_m) & (wavelength_m <= spectrum.high_m)
+    wavelength_m = wavelength_m[within]
+    seen = np.trapezoid(value[within] * spectrum(wavelength_m), wavelength_m)
+    return float(luminous_flux_lm / (_EFFICACY_LM_PER_W * seen))
+
+
+def _colour() -> Any:
     import colour  # takes a second to import; only scenes with lamps need it
 
-    photopic = colour.SDS_LEFS["CIE 1924 Photopic Standard Observer"]
-    wavelength_m = np.asarray(photopic.wavelengths) * 1e-9
-    spectrum = incandescent_spectrum(temperature_k, "lamp")
-    seen = np.trapezoid(np.asarray(photopic.values) * spectrum(wavelength_m), wavelength_m)
-    return float(luminous_flux_lm / (_EFFICACY_LM_PER_W * seen))
+    return colour

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from nir_render.camera.optics.lens import corner_directions
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.documents.emitters import Sun
 from nir_render.scene.documents.shapes import Mesh, ShapeDocument
 from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter
@@ -87,6 +87,8 @@ def geometry_key(site: Site) -> str:
                 (name, lamp.center_m, lamp.size_m, lamp.normal) for name, lamp in snapshot.lamps.items()
             ],
             "sun": None if snapshot.sun is None else snapshot.sun.direction,
+            # Not there where there is none, so that the random numbers of such scenes are what they were.
+            **({} if snapshot.skylight is None else {"sky": snapshot.skylight.sky.cie}),
             "sources": [
                 (name, placed.pose.position_m, placed.source.radius_m)
                 # A source that shines the same in all directions may turn as it likes.
@@ -154,7 +156,7 @@ def plan_key(site: Site, geometry: str, seed: int, made_by: Sequence[str]) -> st
 
 def _fully_lit(emitter: Emitter) -> Emitter:
     """Return an emitter as it is planned for: what blinks is fully lit."""
-    if isinstance(emitter, Sun) or emitter.drive.constant is not None:
+    if isinstance(emitter, Sun | Skylight) or emitter.drive.constant is not None:
         return emitter
     return emitter.model_copy(update={"drive": FULL_DRIVE})
 

@@ -88,7 +88,7 @@ def _fields(document: dict[str, Any]) -> set[str]:
     names = set(document)
     for key, value in document.items():
         if isinstance(value, dict) and key not in ("versions", "sha256"):
-            by_camera = all(isinstance(inner, dict) for inner in value.values())
+            by_camera = key != "ambient" and all(isinstance(inner, dict) for inner in value.values())
             names |= {one for inner in value.values() for one in inner} if by_camera else _fields(value)
     return names
 
@@ -96,9 +96,16 @@ def _fields(document: dict[str, Any]) -> set[str]:
 def test_every_field_of_a_manifest_is_explained(checkout: Path) -> None:
     """A run with a target for the noise, in blocks of 2 × 2: it has every field but that of a missing error."""
     wall = "{type: rectangle, center: '[3, 0, 0] m', size: '[4, 4] m', normal: [-1, 0, 0], material: white}"
+    ambient = {
+        "lamps.panel": "{preset: white_led, center: '[1, 0, 2.5] m'}",
+        "illuminance": "{level: 100 lx, at: '[1, 0, 0.8] m'}",
+        "sun": "{azimuth: 30 deg, elevation: 40 deg, irradiance: 0.01 W/m^2/nm}",
+        "sky": "{irradiance: 0.001 W/m^2/nm}",
+    }
     changes = ["clock.frames=1", "materials.white={type: diffuse, reflectance: 0.5}", f"shapes.wall={wall}"]
     sensor = "robots.r1.rig.cameras.front.sensor"
     changes += [f"{sensor}.columns=160", f"{sensor}.rows=120", f"{sensor}.pixel_pitch=30 um"]
+    changes += [f"{path}={value}" for path, value in ambient.items()]
     settings = [word for change in changes for word in ("--set", change)]
     done = nir_render("render", "scenes/one_source.yaml", "-o", "one", *settings, cwd=checkout)
     assert done.returncode == 0, done.stderr

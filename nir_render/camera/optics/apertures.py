@@ -57,7 +57,10 @@ def flare_aperture(
     image_px = lens.image_radius_px(direction, angular_radius_rad)
     radius_px = max(image_px + BLUR_SIGMAS * gaussian_fit(core_of(camera)).sigma_px, LEAST_RADIUS_PX)
     rows, columns = (
-        slice(max(math.ceil(middle_px - radius_px), 0), min(math.floor(middle_px + radius_px) + 1, count))
+        slice(
+            min(max(math.ceil(middle_px - radius_px), 0), count),
+            max(min(math.floor(middle_px + radius_px) + 1, count), 0),
+        )
         for middle_px, count in ((v_px, lens.height_px), (u_px, lens.width_px))
     )
     down, across = np.arange(rows.start, rows.stop) - v_px, np.arange(columns.start, columns.stop) - u_px

@@ -18,9 +18,10 @@ from scipy import constants
 from scipy.interpolate import PchipInterpolator
 
 from nir_render.camera.optics.lens import field_of, intrinsics_of
+from nir_render.scene.documents.ambient.lamps import Lamp
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.base import Orientation
 from nir_render.scene.documents.camera import Camera, GlobalShutter
-from nir_render.scene.documents.emitters import Lamp, Sun
 from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter, emission_spectrum
 from nir_render.spectra.curve import Curve
@@ -49,7 +50,7 @@ class Response:
 
 
 def response(camera: Camera, emitter: Emitter, node: Node = ONE_NODE) -> Response:
-    """Return how a camera responds to the light of a source, a lamp or the sun.
+    """Return how a camera responds to the light of a source, a lamp, the sun or the sky.
 
     Of several wavelength nodes each stands for the part of the spectrum that its hat function takes.
 
@@ -98,7 +99,14 @@ def _kind(emitter: Emitter) -> Emitter:
         return emitter.model_copy(update=update)
     if isinstance(emitter, Sun):
         return emitter.model_copy(
-            update={"azimuth_rad": 0.0, "elevation_rad": 1.0, "irradiance_w_per_m3": 1.0}
+            update={"azimuth_rad": 0.0, "clouds": None}
+            if emitter.air is not None
+            else {"azimuth_rad": 0.0, "elevation_rad": 1.0, "irradiance_w_per_m3": 1.0, "clouds": None}
+        )
+    if isinstance(emitter, Skylight):
+        sun = emitter.sun.model_copy(update={"azimuth_rad": 0.0, "clouds": None})
+        return emitter.model_copy(
+            update={"sky": emitter.sky.model_copy(update={"cie": 12, "clouds": 1.0}), "sun": sun}
         )
     update = {"position_m": (0.0, 0.0, 0.0), "radius_m": 1.0, "flux_w": 1.0}
     update |= {"orientation": Orientation(), "pattern": None, "drive": FULL_DRIVE}

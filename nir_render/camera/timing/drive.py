@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nir_render.scene.documents.emitters import Sun
-from nir_render.scene.documents.times.drives import FULL_DRIVE, BitString, Drive, Packets, SquareWave
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
+from nir_render.scene.documents.times.drives import FULL_DRIVE, BitString, Drive, Flicker, Packets, SquareWave
 from nir_render.scene.emission import Emitter
 from perception.messages.uart import encode
 
@@ -12,12 +12,12 @@ Array = NDArray[np.float64]
 
 
 def drive_of(emitter: Emitter) -> Drive:
-    """Return the drive of an emitter; the sun shines evenly."""
-    return FULL_DRIVE if isinstance(emitter, Sun) else emitter.drive
+    """Return the drive of an emitter; sun and sky shine evenly."""
+    return FULL_DRIVE if isinstance(emitter, Sun | Skylight) else emitter.drive
 
 
 def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array:
-    """Return the mean level of a drive, from 0 to 1, over stretches of time.
+    """Return the mean level of a drive over stretches of time: from 0 to 1, and to 2 of what flickers.
 
     Edges lie where the floats say, to their rounding; a stretch without edges has its level to the bit.
 
@@ -31,11 +31,13 @@ def mean_level(drive: Drive, start_s: ArrayLike, duration_s: ArrayLike) -> Array
     start, duration = np.broadcast_arrays(np.asarray(start_s, float), np.asarray(duration_s, float))
     if drive.square is not None:
         return _of_square(drive.square, start, duration)
+    if drive.flicker is not None:
+        return _of_flicker(drive.flicker, start, duration)
     if drive.bits is not None:
         return np.clip(_of_bits(drive.bits, start, duration), 0.0, 1.0)
     if drive.packets is not None:
         return _of_packets(drive.packets, start, duration)
-    assert drive.constant is not None  # the model admits no fifth form
+    assert drive.constant is not None  # the model admits no other form
     return np.full(start.shape, drive.constant)
 
 
@@ -48,6 +50,14 @@ def _of_square(square: SquareWave, start_s: Array, duration_s: Array) -> Array:
     lit -= np.clip(1.0 - begin, 0.0, rest)
     level = np.where(begin < square.duty, 1.0, 0.0)
     return np.divide(whole * square.duty + lit, length, out=level, where=length > 0.0)
+
+
+def _of_flicker(flicker: Flicker, start_s: Array, duration_s: Array) -> Array:
+    """Return the mean of a sine about 1: that at mid-stretch, weakened by sinc of the periods within."""
+    rate_hz = 2.0 * flicker.mains_hz
+    middle_s = start_s + 0.5 * duration_s - flicker.phase_s
+    swing = np.sinc(rate_hz * duration_s) * np.sin(2.0 * np.pi * rate_hz * middle_s)
+    return np.asarray(1.0 + flicker.modulation * swing)
 
 
 def _of_bits(bits: BitString, start_s: Array, duration_s: Array) -> Array:

@@ -40,6 +40,7 @@ _UNIT_SUFFIXES = (
     "_hz",
     "_rad",
     "_lm",
+    "_lx",
     "_nm",
     "_m",
     "_s",
@@ -248,6 +249,7 @@ Angle = Annotated[float, Unit(units.ANGLE)]
 Power = Annotated[float, Unit(units.POWER)]
 Temperature = Annotated[float, Unit(units.TEMPERATURE)]
 LuminousFlux = Annotated[float, Unit(units.LUMINOUS_FLUX)]
+Illuminance = Annotated[float, Unit(units.ILLUMINANCE)]
 Electrons = Annotated[float, Unit(units.ELECTRONS)]
 Counts = Annotated[float, Unit(units.COUNTS)]
 SystemGain = Annotated[float, Unit(units.SYSTEM_GAIN)]

@@ -3,9 +3,11 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import (
     Field,
     GetCoreSchemaHandler,
@@ -18,15 +20,19 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from nir_render.errors import shown
+from nir_render.geometry import rectangle_frame
+from nir_render.scene.documents.ambient.lamps import IlluminanceDocument, Lamp
+from nir_render.scene.documents.ambient.sun import Sky, Skylight, Sun
 from nir_render.scene.documents.base import Document, Name, Orientation, Position, Positive, Time
 from nir_render.scene.documents.camera import Rig
-from nir_render.scene.documents.emitters import Lamp, Sun
+from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import expand_preset, preset_names
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import Diffuse, MaterialDocument
 from nir_render.scene.documents.shapes import ShapeDocument
 from nir_render.scene.documents.times.clocks import Clock
 from nir_render.scene.documents.times.motion import Moving, Waypoint
+from nir_render.spectra.lambert import polygon_share
 
 __all__ = ["Clock", "Robot", "SceneDocument", "Waypoint"]
 
@@ -168,7 +174,10 @@ class RenderSettings(Document):
 
 
 class SceneDocument(Document):
-    """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom."""
+    """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom.
+
+    `beacons` are what others let shine: spheres as robots' sources are, where the scene puts them.
+    """
 
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}$")] = "scene"
@@ -180,7 +189,10 @@ class SceneDocument(Document):
     materials: dict[Name, MaterialDocument] = {}
     shapes: dict[Name, ShapeDocument] = {}
     lamps: dict[Name, Lamp] = {}
+    illuminance: IlluminanceDocument | None = None
     sun: Sun | None = None
+    sky: Sky | None = None
+    beacons: dict[Name, Source] | None = None
     fog: Fog | None = None
 
     @model_validator(mode="before")
@@ -229,6 +241,58 @@ class SceneDocument(Document):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _sky_has_its_sun(self) -> Self:
+        if self.sky is None:
+            return self
+        if self.sun is None or (self.sun.air is None and self.sky.irradiance_w_per_m3 is None):
+            raise ValueError(
+                "sky: its light follows from the sun's place and 'air'; write such as sun: {azimuth: 30 deg, "
+                "elevation: 40 deg, air: g173} (clouds: 0 hides its disc)"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _lamps_reach_the_plane(self) -> Self:
+        if self.illuminance is None:
+            return self
+        messengers = [name for name, lamp in self.lamps.items() if lamp.drive.mean is None]
+        if messengers:
+            raise ValueError(
+                f"illuminance: the lamp {messengers[0]!r} sends messages, which have no mean; leave "
+                "'illuminance' out and write its 'luminous_flux'"
+            )
+        if not self.written_illuminance_lx > 0.0:
+            raise ValueError(
+                "illuminance: no lamp shines on the plane; add one in front of it, or move or turn the plane"
+            )
+        return self
+
+    @cached_property
+    def written_illuminance_lx(self) -> float:
+        """What lamps, as they are written, bring to the plane of `illuminance` directly; 0 without one."""
+        plane = self.illuminance
+        return 0.0 if plane is None else sum(_brought_lx(lamp, plane) for lamp in self.lamps.values())
+
+    @property
+    def skylight(self) -> Skylight | None:
+        """The sky under its sun, None without one."""
+        if self.sky is None:
+            return None
+        assert self.sun is not None  # a sky without a sun has been refused
+        return Skylight.model_construct(sky=self.sky, sun=self.sun)
+
+    @cached_property
+    def shining_lamps(self) -> dict[str, Lamp]:
+        """The lamps, scaled to `illuminance` where there is one."""
+        if self.illuminance is None:
+            return self.lamps
+        factor = self.illuminance.level_lx / self.written_illuminance_lx
+        return {
+            name: lamp.model_copy(update={"luminous_flux_lm": factor * lamp.luminous_flux_lm})
+            for name, lamp in self.lamps.items()
+        }
+
     def cameras_of(self, selector: str) -> list[str]:
         """Return the cameras, `robot.camera`, that `r1` or `r1.front` selects; empty where there are none."""
         robot, _, camera = selector.partition(".")
@@ -250,14 +314,27 @@ class SceneDocument(Document):
 
     def has_indirect_light(self) -> bool:
         """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""
-        sources = any(robot.rig.sources for robot in self.robots.values())
+        sources = bool(self.beacons) or any(robot.rig.sources for robot in self.robots.values())
         if not (sources or self.lamps or self.sun is not None):
             return False
-        return bool(self.lamps) or reflects_or_scatters(self.all_shapes(), self.materials, self.fog)
+        if self.lamps or self.sky is not None:
+            return True
+        return reflects_or_scatters(self.all_shapes(), self.materials, self.fog)
 
     def frame_times_s(self) -> list[float]:
         """Return the start of each frame's exposure."""
         return [self.clock.start_s + index / self.clock.frame_rate_hz for index in range(self.clock.frames)]
+
+
+def _brought_lx(lamp: Lamp, plane: IlluminanceDocument) -> float:
+    half_u_m, half_v_m, normal = rectangle_frame(lamp.normal, lamp.size_m, 0.0).T
+    corners_m = np.array(lamp.center_m) + [
+        u * half_u_m + v * half_v_m for u, v in ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    ]
+    facing = np.array(plane.facing) / np.linalg.norm(plane.facing)
+    share = polygon_share(corners_m, normal, np.array(plane.at_m), facing)
+    assert lamp.drive.mean is not None  # messengers have been refused
+    return lamp.drive.mean * lamp.luminous_flux_lm / (lamp.size_m[0] * lamp.size_m[1]) * share
 
 
 def reflects_or_scatters(

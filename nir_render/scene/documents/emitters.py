@@ -1,4 +1,4 @@
-"""Models of what shines: sources, lamps, the sun; where to (patterns)."""
+"""Models of sources, and of where they shine to (patterns)."""
 
 import itertools
 import math
@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
-    AfterValidator,
-    Field,
     ValidationInfo,
     field_serializer,
     field_validator,
@@ -17,20 +15,12 @@ from pydantic import (
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import (
-    Angle,
-    Direction,
     Document,
     Length,
-    LuminousFlux,
     Orientation,
     Position,
     Positive,
     Power,
-    Size2,
-    SpectralIrradiance,
-    Temperature,
-    positive_extents,
-    usable_direction,
 )
 from nir_render.scene.documents.curves import (
     CurveDocument,
@@ -43,7 +33,7 @@ from nir_render.scene.documents.curves import (
     write_points,
 )
 from nir_render.scene.documents.files import PresetDocument, resolve_file
-from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
+from nir_render.scene.documents.times.drives import FULL_DRIVE, SourceDrive
 from nir_render.scene.text.units import ANGLE, FRACTION, format_vector, parse_vector
 
 _PATTERN_FORMS = ("points", "grid", "file")
@@ -167,7 +157,7 @@ class Source(PresetDocument):
     position_m: Position = (0.0, 0.0, 0.0)
     orientation: Orientation = Orientation()
     pattern: PatternDocument | None = None
-    drive: Drive = FULL_DRIVE
+    drive: SourceDrive = FULL_DRIVE
 
     @field_validator("spectrum")
     @classmethod
@@ -175,51 +165,6 @@ class Source(PresetDocument):
         if spectrum.constant is not None:
             raise ValueError("a spectrum needs a shape; write 'gaussian', 'points' or 'file'")
         return spectrum
-
-
-class Lamp(PresetDocument):
-    """A rectangular lamp that shines along `normal`, an incandescent body of `temperature`.
-
-    `drive` is what it sends over time.
-    """
-
-    preset_folder: ClassVar[str] = "lamps"
-
-    center_m: Position
-    size_m: Annotated[Size2, AfterValidator(positive_extents)]
-    normal: Direction = (0.0, 0.0, -1.0)
-    luminous_flux_lm: Annotated[LuminousFlux, Positive]
-    temperature_k: Annotated[Temperature, Field(ge=500, le=20000)]
-    drive: Drive = FULL_DRIVE
-
-    _direction = field_validator("normal")(usable_direction)
-
-
-class Sun(Document):
-    """The sun: `azimuth` from world x towards y, `elevation` above the horizon.
-
-    `irradiance` is its spectral irradiance across its direction, at 940 nm: 0.305 W/m²/nm by ASTM G173
-    (global), which has 3.05 W/m² from 935 to 945 nm. Over the rest of what silicon sees the spectrum is taken
-    as flat; assumed.
-    """
-
-    angular_radius_rad: ClassVar[float] = math.radians(0.2666)
-
-    example: ClassVar[str] = "{azimuth: 30 deg, elevation: 40 deg, irradiance: 0.305 W/m^2/nm}"
-
-    azimuth_rad: Angle
-    elevation_rad: Annotated[Angle, Field(gt=0, le=math.pi / 2)]
-    irradiance_w_per_m3: Annotated[SpectralIrradiance, Positive]
-
-    @property
-    def direction(self) -> Direction:
-        """Unit vector towards the sun's centre, in the world."""
-        flat = math.cos(self.elevation_rad)
-        return (
-            flat * math.cos(self.azimuth_rad),
-            flat * math.sin(self.azimuth_rad),
-            math.sin(self.elevation_rad),
-        )
 
 
 def _read_grid(path: Path) -> dict[str, Any]:

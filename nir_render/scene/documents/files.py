@@ -21,7 +21,9 @@ _ALTERNATIVES = (
     {"extinction", "visibility"},
     {"full_well", "saturation_capacity"},
     {"values", "file"},
-    {"constant", "square", "bits"},
+    {"constant", "square", "bits", "flicker"},
+    {"temperature", "illuminant"},
+    {"irradiance", "air"},
     {"auto_exposure", "bracket"},
 )
 

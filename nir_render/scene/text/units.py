@@ -36,6 +36,7 @@ ANGLE = Quantity("angle", "rad", "90 deg", 1e6)
 POWER = Quantity("power", "W", "0.2 W", 1e9)
 TEMPERATURE = Quantity("temperature", "K", "2856 K", 1e6)
 LUMINOUS_FLUX = Quantity("luminous flux", "lm", "4000 lm")
+ILLUMINANCE = Quantity("illuminance", "lx", "500 lx")
 ELECTRONS = Quantity("number of electrons", "e", "5500 e")
 COUNTS = Quantity("count", "DN", "64 DN")
 SYSTEM_GAIN = Quantity("system gain", "DN/e", "0.74 DN/e")
@@ -50,14 +51,14 @@ VISIBILITY = Quantity("length", "m", "50 m", 1e9)
 SPEED = Quantity("speed", "m/s", "0.1 m/s", 1e6)
 _OTHERS = (
     Quantity("mass", "kg", ""),
-    Quantity("illuminance", "lx", ""),
     Quantity("radiant intensity", "W/sr", ""),
     Quantity("irradiance", "W/m**2", ""),
     Quantity("energy", "J", ""),
 )
 _KNOWN = (
-    LENGTH, TIME, FREQUENCY, ANGLE, POWER, TEMPERATURE, LUMINOUS_FLUX, ELECTRONS, COUNTS, SYSTEM_GAIN,
-    DARK_CURRENT, FOCUS_SHIFT, PIXELS, BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, SPEED, *_OTHERS,
+    LENGTH, TIME, FREQUENCY, ANGLE, POWER, TEMPERATURE, LUMINOUS_FLUX, ILLUMINANCE, ELECTRONS, COUNTS,
+    SYSTEM_GAIN, DARK_CURRENT, FOCUS_SHIFT, PIXELS, BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, SPEED,
+    *_OTHERS,
 )  # fmt: skip
 
 _NUMBER = re.compile(

@@ -21,6 +21,7 @@ from nir_render.scene.documents.materials import Dielectric, Pane
 from nir_render.scene.documents.shapes import Box
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
+from nir_render.spectra.skies import CieSky, cie_sky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import guide
 from nir_render.transport.indirect.kernel.draws import lane_draws
@@ -258,13 +259,18 @@ def world_on_device(snapshot: Snapshot, power: NDArray[np.float64]) -> DeviceSce
     return DeviceScene(
         bodies=bodies,
         opaque=opaque,
-        lights=upload_lights(shining, power, patterns, np.array(axes)),
+        lights=upload_lights(shining, power, patterns, np.array(axes), _sky_of(snapshot)),
         surfaces=upload_surfaces(flat, _shape_columns(snapshot, (bodies, opaque), flat)),
         choice=upload_guide(
             guide(shining, flat, power, low_m, high_m, 0.0 if fog is None else fog.extinction_per_m)
         ),
         fog=None if fog is None else upload_fog(fog),
     )
+
+
+def _sky_of(snapshot: Snapshot) -> CieSky | None:
+    light = snapshot.skylight
+    return None if light is None else cie_sky(light.sky.cie, light.sun.direction)
 
 
 def _shape_columns(

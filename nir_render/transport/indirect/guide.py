@@ -14,7 +14,7 @@ from nir_render.camera.optics.response import response
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.emission import emission_units
 from nir_render.scene.snapshot import Snapshot
-from nir_render.transport.world.emitters import RECTANGLE, SPHERE, SUN, Emitters
+from nir_render.transport.world.emitters import RECTANGLE, SKY, SPHERE, SUN, Emitters
 from nir_render.transport.world.facets import Facets, reflectance
 
 Array = NDArray[np.float64]
@@ -97,7 +97,11 @@ def _unshadowed_irradiance(
     spread2_m2 = float(step_m @ step_m) / 12.0  # mean square distance within a cell from its middle
     facet = int(emitters.facet[row])
     kind = int(emitters.kind[row])
-    if kind == SUN:
+    if kind == SKY:
+        to_m = np.broadcast_to([0.0, 0.0, 1.0], places_m.shape)
+        irradiance = np.ones(len(places_m))
+        direction = to_m
+    elif kind == SUN:
         to_m = np.broadcast_to(emitters.normal[row], places_m.shape)
         irradiance = np.ones(len(places_m))
         direction = to_m
@@ -113,7 +117,7 @@ def _unshadowed_irradiance(
             slack_m = 0.5 * float(np.abs(emitters.normal[row]) @ step_m)
             cosine = (height_m + slack_m) / np.sqrt(distance2_m2 + spread2_m2)
             irradiance *= 4.0 * np.clip(cosine, 0.0, 1.0)
-    assert kind in (SPHERE, RECTANGLE, SUN)
+    assert kind in (SPHERE, RECTANGLE, SUN, SKY)
     return irradiance if facet < 0 else irradiance * _facet_share(facets, facet, places_m, direction, step_m)
 
 

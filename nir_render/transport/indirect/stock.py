@@ -89,6 +89,7 @@ def _refuse_what_only_groups_render(snapshot: Snapshot, camera: Camera) -> None:
     parts = [
         ("fog", snapshot.fog is not None),
         ("the sun", snapshot.sun is not None),
+        ("the sky", snapshot.skylight is not None),
         ("emission patterns", any(placed.source.pattern is not None for placed in snapshot.sources.values())),
         (f"a {camera.lens.model} lens", camera.lens.model != "rectilinear"),
         ("a principal point off the sensor's middle", (lens.cx_px, lens.cy_px) != middle_px),

@@ -13,7 +13,7 @@ from nir_render.transport.world.facets import Facets, reflectance
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-SPHERE, RECTANGLE, SUN = 0, 1, 2
+SPHERE, RECTANGLE, SUN, SKY = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,9 @@ class Emitters:
     group
         Light group, shape (n,).
     kind
-        SPHERE, RECTANGLE or SUN, shape (n,).
+        SPHERE, RECTANGLE, SUN or SKY, shape (n,).
     center_m
-        Centre, shape (n, 3); of an image, the mirrored centre. Zero for the sun.
+        Centre, shape (n, 3); of an image, the mirrored centre. Zero for sun and sky.
     half_u_m, half_v_m
         From the centre to the edges of a rectangle, shape (n, 3).
     normal
@@ -100,6 +100,9 @@ def _lights(snapshot: Snapshot) -> dict[str, NDArray[Any]]:
             rows["center_m"][row] = lamp.center_m
             rows["half_u_m"][row], rows["half_v_m"][row], rows["normal"][row] = frame.T
             rows["radiance"][row] = 1.0 / (np.pi * lamp.size_m[0] * lamp.size_m[1])  # one watt from one side
+        elif name == "sky":
+            rows["kind"][row] = SKY
+            rows["radiance"][row] = 1.0 / np.pi  # 1 W/m² on a horizontal plane, on the mean over it
         else:
             sun = snapshot.sun
             assert sun is not None  # the group is there because the sun is
@@ -112,7 +115,10 @@ def _lights(snapshot: Snapshot) -> dict[str, NDArray[Any]]:
 
 
 def _shown(rows: dict[str, NDArray[Any]], facets: Facets, facet: int) -> Index:
-    """Return the lights that stand before a facet, so that it can show them."""
+    """Return the lights that stand before a facet, so that it can show them.
+
+    Of the sky there are no images: it is large, and paths meet it by themselves.
+    """
     normal = facets.normal[facet]
     height_m = (rows["center_m"] - facets.center_m[facet]) @ normal
     reach_m = rows["radius_m"] + np.abs(rows["half_u_m"] @ normal) + np.abs(rows["half_v_m"] @ normal)
@@ -120,7 +126,7 @@ def _shown(rows: dict[str, NDArray[Any]], facets: Facets, facet: int) -> Index:
     height_m = np.where(sun, rows["normal"] @ normal, height_m)
     before = facets.two_sided[facet] | (height_m + reach_m > 0.0)
     reflects = float(reflectance(facets, facet, 0.0)) > 0.0
-    return np.flatnonzero(before & reflects)
+    return np.flatnonzero(before & reflects & (rows["kind"] != SKY))
 
 
 def _mirrored(rows: dict[str, NDArray[Any]], facets: Facets, facet: int) -> dict[str, NDArray[Any]]:

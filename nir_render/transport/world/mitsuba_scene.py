@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError
 from nir_render.geometry import perpendiculars, rectangle_frame
 from nir_render.scene.bodies import place_of_shape
-from nir_render.scene.documents.emitters import Sun
+from nir_render.scene.documents.ambient.sun import Sun
 from nir_render.scene.documents.materials import (
     Dielectric,
     Diffuse,

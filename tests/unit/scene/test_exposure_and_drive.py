@@ -76,7 +76,7 @@ def test_one_form_replaces_another(scene: Scene) -> None:
         (-0.1, "greater than or equal to 0"),
         (
             {"constant": 1, "square": {"frequency": "1 kHz"}},
-            "wanted one of 'constant', 'square', 'bits' and 'packets'",
+            "wanted one of 'constant', 'square', 'flicker', 'bits' and 'packets'",
         ),
         ({}, "wanted one of .* 'packets', not none"),
         ([1, 0], "is no drive; wanted 0.5"),

@@ -120,6 +120,10 @@ AFTERWARDS: list[dict[str, Any]] = [
     {"lamps.one.luminous_flux": "300 lm"},
     {"lamps.one.temperature": "3000 K"},
     {"sun.irradiance": "0.1 W/m^2/nm"},
+    {"sun.clouds": 0.5},
+    {"lamps.one.illuminant": "LED-B3", "lamps.one.infrared": {"share": 0.01, "least": 0, "most": 0.02}},
+    {"lamps.one.drive": {"flicker": {"mains": "50 Hz", "modulation": 0.3}}},
+    {"illuminance": {"level": "500 lx", "at": "[2, 0, 0.8] m"}},
     {"materials.spare.reflectance": 0.2},
     {f"{CAMERA}.exposure": "2 ms"},
     {f"{CAMERA}.auto_exposure": {"target": 0.7, "shortest": "20 us", "longest": "2 ms"}},
@@ -264,3 +268,18 @@ def test_the_compiler_is_the_one_that_was_chosen() -> None:
     used = backend()
     expected = f"LLVM {choose().version}" if used.variant.startswith("llvm") else ""
     assert used.compiler == expected
+
+
+def test_a_sky_is_in_the_key_by_its_kind_not_by_its_strength(scene: Scene) -> None:
+    """A beacon by its place: its flux, spectrum and drive are arithmetic too."""
+    sky = {"sky.cie": 12, "sky.irradiance": "0.01 W/m^2/nm"}
+    under_it = scene.with_(sky)
+    assert _key(under_it) != _key(scene)
+    assert _key(scene.with_({**sky, "sky.cie": 13})) != _key(under_it)
+    for stronger in ({"sky.irradiance": "0.02 W/m^2/nm"}, {"sky.clouds": 0.5}, {"sun.clouds": 0.1}):
+        assert _key(scene.with_({**sky, **stronger})) == _key(under_it)
+    beacon = {"beacons.one": {"preset": "tof_camera_940", "position": "[1, 1, 1] m"}}
+    with_it = scene.with_(beacon)
+    assert _key(with_it) != _key(scene)
+    assert _key(with_it.with_({"beacons.one.position": "[1, 1, 1.1] m"})) != _key(with_it)
+    assert _key(with_it.with_({"beacons.one.flux": "1 W"})) == _key(with_it)

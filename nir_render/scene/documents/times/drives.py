@@ -1,17 +1,17 @@
-"""Models of what an emitter sends over time: a level, a square wave, bits, packets of a language."""
+"""Models of what an emitter sends over time: a level, a square wave, flicker, bits, packets of a language."""
 
 import itertools
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import Document, Fraction, Frequency, Positive, Time
 from nir_render.scene.documents.curves import one_form
 from perception.messages.uart import FRAME_BITS, RATE_HZ, REPEATS, word_of
 
-_DRIVE_FORMS = ("constant", "square", "bits", "packets")
+_DRIVE_FORMS = ("constant", "square", "flicker", "bits", "packets")
 _DRIVE_EXAMPLE = (
     "0.5, {square: {frequency: 1 kHz, duty: 0.5}}, {bits: {pattern: '0101101111', rate: 10 Hz}} "
     "or {packets: {sends: [{at: 1 s, command: forward}]}}"
@@ -27,6 +27,19 @@ class SquareWave(Document):
 
     frequency_hz: Annotated[Frequency, Positive]
     duty: Level = 0.5
+    phase_s: Time = 0.0
+
+
+class Flicker(Document):
+    """Light of a lamp on the mains, at twice their frequency: 1 + modulation · sin(4π · mains · (t − phase)).
+
+    Its mean is 1: a lamp's flux is rated so. `modulation` is (highest − lowest)/(highest + lowest).
+    """
+
+    example: ClassVar[str] = "{mains: 50 Hz, modulation: 0.1}"
+
+    mains_hz: Annotated[Frequency, Positive]
+    modulation: Level
     phase_s: Time = 0.0
 
 
@@ -143,10 +156,14 @@ class Packets(Document):
 
 
 class Drive(Document):
-    """What an emitter sends over time, as a share of full power: a number, a square wave, bits or packets."""
+    """What an emitter sends over time, as a share of full power: a number, a square wave, bits or packets.
+
+    Lamps may flicker too.
+    """
 
     constant: Level | None = None
     square: SquareWave | None = None
+    flicker: Flicker | None = None
     bits: BitString | None = None
     packets: Packets | None = None
 
@@ -163,5 +180,21 @@ class Drive(Document):
         one_form(data, _DRIVE_FORMS)
         return data
 
+    @property
+    def mean(self) -> float | None:
+        """The mean level over all time; None of what sends messages."""
+        if self.square is not None:
+            return self.square.duty
+        return 1.0 if self.flicker is not None else self.constant
+
 
 FULL_DRIVE = Drive(constant=1.0)
+
+
+def _no_flicker(drive: Drive) -> Drive:
+    if drive.flicker is not None:
+        raise ValueError("lamps on the mains flicker; a robot's source does not: write 'square' for a share")
+    return drive
+
+
+SourceDrive = Annotated[Drive, AfterValidator(_no_flicker)]

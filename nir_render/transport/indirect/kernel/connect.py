@@ -10,11 +10,12 @@ from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel.rectangle import RectangleInView
 from nir_render.transport.indirect.kernel.tables import Choice, Lights, Surfaces, along_table
 from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, UInt, Vector
-from nir_render.transport.world.emitters import RECTANGLE, SUN
+from nir_render.transport.world.emitters import RECTANGLE, SKY, SUN
 from nir_render.transport.world.facets import MIRROR, PANE
 
 # Shadow rays to facets and lamps end this share of their way before it: what float32 rounds, with room.
 SHORTER = 1e-4
+_ENDLESS = 1e15
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +73,11 @@ def aim_at_light(lights: Lights, row: UInt, place: Point, u: Float, v: Float, ac
             dr.select(kind == SUN, new, old)
             for new, old in zip(sampled, (direction, reach, density), strict=True)
         )
+    if lights.sky_table is not None:
+        towards = lights.sky_table.aim(u, v)
+        direction = dr.select(kind == SKY, towards, direction)
+        reach = dr.select(kind == SKY, _ENDLESS, reach)
+        density = dr.select(kind == SKY, lights.sky_table.density(towards), density)
     return Aim(direction, reach, density, radiance)
 
 
@@ -89,6 +95,8 @@ def aim_density(lights: Lights, row: UInt, place: Point, direction: Vector, acti
     if lights.sun >= 0:
         versine = dr.gather(mi.Float, lights.versine, row, active)
         density = dr.select(kind == SUN, dr.rcp(2.0 * dr.pi * versine), density)
+    if lights.sky_table is not None:
+        density = dr.select(kind == SKY, lights.sky_table.density(direction), density)
     return density
 
 
@@ -101,8 +109,13 @@ def meets_sun(lights: Lights, direction: Vector) -> Mask:
 
 def pattern_factor(lights: Lights, light: UInt, leaving: Vector, active: Mask) -> Float:
     """Return the radiance of a light, not an image, in a direction that leaves it, over its mean."""
-    if not lights.pattern_polars:
-        return mi.Float(1)
+    factor = _of_pattern(lights, light, leaving, active) if lights.pattern_polars else mi.Float(1)
+    if lights.sky_table is None:
+        return factor
+    return dr.select(light == lights.sky, lights.sky_table.relative(-leaving), factor)
+
+
+def _of_pattern(lights: Lights, light: UInt, leaving: Vector, active: Mask) -> Float:
     first = dr.gather(mi.Int32, lights.pattern_first, light, active)
     patterned = active & (first >= 0)
     azimuths = dr.gather(mi.UInt32, lights.pattern_azimuths, light, patterned)
@@ -234,7 +247,7 @@ def _aim_at_sun(lights: Lights, row: UInt, u: Float, v: Float, active: Mask) -> 
     versine = whole * u
     axis = dr.gather(mi.Vector3f, lights.normal, row, active)
     direction = _around(axis, dr.safe_sqrt(versine * (2.0 - versine)), versine, v)
-    return direction, mi.Float(1e15), dr.rcp(2.0 * dr.pi * whole)
+    return direction, mi.Float(_ENDLESS), dr.rcp(2.0 * dr.pi * whole)
 
 
 def _around(axis: Vector, sine: Float, versine: Float, turn: Float) -> Vector:

@@ -19,7 +19,7 @@ from nir_render.transport.indirect.kernel.fog import (
 )
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import AddLight, Float, Mask, PathState, Point, Random, UInt
-from nir_render.transport.world.emitters import SUN
+from nir_render.transport.world.emitters import SKY, SUN
 
 # Up to so many lights fog weighs each of them for each stretch; with more, the guide proposes so many.
 _WEIGHED_LIGHTS = 16
@@ -54,8 +54,9 @@ def scatter_on_stretch(
     fog = scene.fog
     assert fog is not None  # only called in fog
     lost = dr.select(active, absorbed_share(fog.extinction * (end - begin)), 0.0)
-    # The last stretch but one may scatter, and the last may not: all its light has been asked for before.
-    turns = active & (state.depth + 2 < max_depth)
+    # The last stretch but one may scatter, and the last may not: all its light has been asked for before, but
+    # for the sky's, which turned paths meet by themselves: fog throws it mostly onwards.
+    turns = active & (state.depth + (2 if scene.lights.sky < 0 else 1) < max_depth)
     active = active & (state.depth + 1 < max_depth)
     row, chance = _light_for_stretch(scene, state, begin, end, active, number)
     distance, density = _place_on_stretch(scene, row, state, begin, end, number(draws.FOG_PLACE), active)
@@ -127,6 +128,9 @@ def _brought_to_stretch(
         turn = 0.5 * dr.squared_norm(to_sun - state.direction)
         of_sun = phase_function(fog, turn) * absorbed_share(fog.extinction * (end - begin)) / fog.extinction
         weight = dr.select(kind == SUN, of_sun, weight)
+    if lights.sky >= 0:
+        kind = dr.gather(mi.UInt32, lights.kind, row, active)
+        weight = dr.select(kind == SKY, 0.0, weight)
     return weight * dr.gather(mi.Float, lights.power, row, active)
 
 

@@ -10,7 +10,7 @@ from nir_render.transport.indirect.kernel.fog import draw_angle, phase_function,
 from nir_render.transport.indirect.kernel.fog_scatter import weighs_all
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import Float, Mask, Point, UInt, Vector
-from nir_render.transport.world.emitters import SUN
+from nir_render.transport.world.emitters import SKY, SUN
 
 _BRIGHTEST_PER_SR = 10.0  # how bright a halo counts, at most, in front of a path that turns
 
@@ -64,6 +64,9 @@ class Halos:
         spread = dr.gather(mi.Float, self.lights.spread, row, self.active)
         weight = dr.gather(mi.Float, self.lights.power, row, self.active)
         weight = weight * dr.exp(-self.fog.extinction * distance) / dr.maximum(distance, spread)
+        if self.lights.sky >= 0:  # it has no halo
+            kind = dr.gather(mi.UInt32, self.lights.kind, row, self.active)
+            weight = dr.select(kind == SKY, 0.0, weight)
         turn = 0.5 * dr.squared_norm(axis - self.heading)
         ahead = phase_function(self.fog, turn) + dr.minimum(
             self._density(axis, self.heading), _BRIGHTEST_PER_SR

@@ -204,6 +204,9 @@ def _add_met_light(
         leaves = state.active & ~si.is_valid() & connect.meets_sun(scene.lights, state.direction)
         light = dr.select(leaves, scene.lights.sun, light)
         shines = shines | leaves
+    if scene.lights.sky >= 0:  # behind the sun's disc too
+        sky = dr.full(mi.UInt32, scene.lights.sky, dr.width(light))
+        _add_unasked_light(scene, state, weight, sky, state.active & ~si.is_valid(), add)
     front = (dr.dot(state.direction, si.n) < 0.0) | ~met  # lamps shine from one side, suns from everywhere
     _add_unasked_light(scene, state, weight, mi.UInt32(light), shines & front, add)
     return light
@@ -226,11 +229,15 @@ def _add_unasked_light(
         normal = dr.gather(mi.Vector3f, scene.surfaces.normal, mi.UInt32(state.way), mirrored)
         towards = dr.select(mirrored, towards - 2.0 * dr.dot(towards, normal) * normal, towards)
     asked = active & state.scattered & (state.way != _OTHERWISE) & (row >= 0)
+    if lights.sky >= 0:  # fog does not ask for it
+        asked = asked & ((light != lights.sky) | (state.density > 0.0))
     known = mi.UInt32(dr.maximum(row, 0))
     density = connect.aim_density(lights, known, state.place, towards, asked)
     density = density * connect.light_chance(scene.choice, lights, state.cell, known, asked)
     share = dr.select(asked, _power_heuristic(state.density, density), 1.0)
     small = dr.gather(mi.UInt32, lights.kind, light, active) != RECTANGLE
+    if scene.lights.sky >= 0:
+        small = small & (light != scene.lights.sky)
     in_table = small & ~state.scattered & (state.way != _OTHERWISE)
     share = dr.select(in_table, 0.0, share)
     radiance = dr.gather(mi.Float, lights.radiance, light, active)

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.spectra.skies import CieSky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import Guide
+from nir_render.transport.indirect.kernel.sky import SkyTable, upload_sky
 from nir_render.transport.indirect.kernel.types import Float, Int, Mask, MitsubaScene, Point, UInt, Vector
-from nir_render.transport.world.emitters import RECTANGLE, SPHERE, SUN, Emitters
+from nir_render.transport.world.emitters import RECTANGLE, SKY, SPHERE, SUN, Emitters
 from nir_render.transport.world.facets import PANE, Facets
 from nir_render.transport.world.medium import Medium
 from nir_render.transport.world.pattern import Pattern
@@ -43,6 +45,8 @@ class Lights:
     pattern_axes: Float  # world from the source's own axes, 9 numbers for each light
     pattern_polars: int
     sun: int  # row of the sun, −1 for none
+    sky: int  # row of the sky, −1 for none
+    sky_table: SkyTable | None
     has_spheres: bool
     has_rectangles: bool
     has_images: bool
@@ -112,7 +116,11 @@ class DeviceScene:
 
 
 def upload_lights(
-    emitters: Emitters, power: NDArray[np.float64], patterns: list[Pattern | None], axes: NDArray[np.float64]
+    emitters: Emitters,
+    power: NDArray[np.float64],
+    patterns: list[Pattern | None],
+    axes: NDArray[np.float64],
+    sky: CieSky | None = None,
 ) -> Lights:
     """Bring emitters to the device.
 
@@ -124,6 +132,8 @@ def upload_lights(
         The emission pattern of each light, None for the same in all directions.
     axes
         World from the source's own axes, shape (lights, 3, 3).
+    sky
+        How bright the sky is over directions, None where there is none.
     """
     values, first, azimuths = [np.ones(1)], [], []
     for pattern in patterns:
@@ -133,6 +143,7 @@ def upload_lights(
             values.append(pattern.values.ravel())
     polars = max([2, *(pattern.values.shape[0] for pattern in patterns if pattern is not None)])
     suns = np.flatnonzero((emitters.kind == SUN) & (emitters.facet < 0))
+    skies = np.flatnonzero(emitters.kind == SKY)
     half_m = np.linalg.norm(emitters.half_u_m + emitters.half_v_m, axis=1)
     return Lights(
         count=dr.opaque(mi.UInt32, len(emitters.kind)),
@@ -157,6 +168,8 @@ def upload_lights(
         pattern_axes=_real(axes),
         pattern_polars=0 if all(pattern is None for pattern in patterns) else polars,
         sun=int(suns[0]) if suns.size else -1,
+        sky=int(skies[0]) if skies.size else -1,
+        sky_table=None if sky is None else upload_sky(sky),
         has_spheres=bool((emitters.kind == SPHERE).any()),
         has_rectangles=bool((emitters.kind == RECTANGLE).any()),
         has_images=bool((emitters.facet >= 0).any()),

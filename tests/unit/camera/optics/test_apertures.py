@@ -87,3 +87,9 @@ def test_what_blocks_count_in_a_sum_is_how_they_are_enlarged() -> None:
     np.testing.assert_array_equal(of_patch.toarray() > 0.0, [[True, False], [True, False]])
     of_blocks, of_patch = aperture_weights([], per_pixel, scale, how)
     assert (of_blocks.shape, of_patch.shape) == ((0, 48), (0, 2))
+
+
+def test_what_stands_straight_beside_the_camera_has_none(camera: Camera) -> None:
+    """At 90° off the axis, to its rounding, the projection is 10¹⁶ pixels away."""
+    for direction in ([1.0, 0.0, 1e-17], [0.0, -1.0, 3e-17], [-1.0, 0.0, 0.0]):
+        assert flare_aperture(camera, np.array(direction), 0.0047) is None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nir_render.camera.timing.drive import drive_of, mean_level
-from nir_render.scene.documents.emitters import Sun
+from nir_render.scene.documents.ambient.sun import Sun
 from nir_render.scene.documents.times.drives import Drive
 from perception.messages.uart import encode
 

@@ -1,0 +1,1 @@
+"""Models of what shines besides the robots: lamps, the sun, the sky."""
