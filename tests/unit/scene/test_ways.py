@@ -105,6 +105,20 @@ def test_recorded_trajectories_are_read_and_interpolated(tmp_path: Path, kind: s
     assert again.document == scene.document
 
 
+def test_a_recording_that_counts_from_1970_starts_when_the_scene_says(tmp_path: Path) -> None:
+    """Half a second after its start it is a quarter of the way through its 2 s, to 0.24 µs of its clock."""
+    rows = [(1.7e9 + row[0], *row[1:]) for row in ROWS]
+    (tmp_path / "way.tum").write_text("\n".join(" ".join(map(repr, map(float, row))) for row in rows))
+    path = {"type": "recorded", "file": "way.tum"}
+    scene = _scene({"path": {**path, "start": "3 s"}}, tmp_path)
+    np.testing.assert_allclose(
+        robot_pose(scene.document.robots["r2"], 3.5).position_m, [0.25, 0.5, 0.0], atol=1e-6
+    )
+    for given, told in (({}, "times since 1970"), ({"start": "0 s", "delay": "1 s"}, "'delay' or 'start'")):
+        with pytest.raises(InputError, match=told):
+            _scene({"path": {**path, **given}}, tmp_path)
+
+
 @pytest.mark.parametrize(
     ("robot", "told"),
     [
@@ -126,6 +140,10 @@ def test_recorded_trajectories_are_read_and_interpolated(tmp_path: Path, kind: s
                 ]
             },
             "motion.1.speed: '1 m' is a length",
+        ),
+        (
+            {"motion": [{"time": "0 s"}, {"speed": "1 m/s", "position": "[1, 0, 0] m"}]},
+            "motion.1.speed: of the waypoint before it",
         ),
         (
             {
