@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from nir_render.errors import InputError, shown
@@ -54,8 +54,7 @@ def parse_pose(record: Mapping[str, Any]) -> PoseTruth:
         problems.append(f"quaternion_xyzw is {shown(record['quaternion_xyzw'])}; wanted one of length 1")
     if problems:
         raise InputError(*problems)
-    values = {field.name: record[field.name] for field in fields(PoseTruth)}
-    return PoseTruth(**{name: tuple(value) if name in _LENGTHS else value for name, value in values.items()})
+    return PoseTruth(record["robot"], record["time_s"], *(tuple(record[name]) for name in _LENGTHS))
 
 
 def _is_number(value: Any) -> bool:

@@ -1,5 +1,6 @@
 """The blink timeline: how bright each track was, which bits were sent, and what was read."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 import matplotlib as mpl
@@ -14,7 +15,8 @@ from nir_render.report.time.plots import COLOURS
 from perception.messages.uart import Bits, encode
 from perception.types import Message, Signal
 
-_MOST_SHOWN = 8
+_MOST_SHOWN = 16
+_FEW = 8
 _LOW, _HIGH = -0.3, 1.7
 
 
@@ -40,12 +42,14 @@ def blink_plot(
     -------
     None where no track has a signal.
     """
-    shown = sorted(signals, key=lambda signal: -signal.time_s.size)[:_MOST_SHOWN]
-    shown = sorted((signal for signal in shown if signal.time_s.size), key=lambda signal: signal.track)
+    spoke = Counter(message.track for message in messages)
+    there = [signal for signal in signals if signal.time_s.size]
+    there.sort(key=lambda signal: (-spoke[signal.track], -signal.time_s.size, signal.track))
+    shown = sorted(there[:_MOST_SHOWN], key=lambda signal: signal.track)
     if not shown:
         return None
     with mpl.rc_context(MATPLOTLIB):
-        figure = sheet(0.9 + 1.25 * len(shown))
+        figure = sheet(0.9 + (1.25 if len(shown) <= _FEW else 0.95) * len(shown))
         strips = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
         for axes, signal in zip(strips, shown, strict=True):
             lane = _followed(signal.track, lanes)
@@ -72,7 +76,9 @@ def blink_plot(
             axes.set_yticks([0.0, 1.0], ["dark", "lit"])
             follows = "nobody" if lane is None else lane.label
             axes.set_title(f"track {signal.track}: {follows}", fontsize=8, loc="left", color=FAINT, pad=2)
-        strips[-1].set_xlabel("time, s")
+        more = len(there) - len(shown)
+        left_out = f" ({more} tracks that said less, or lived for less, are not shown)" if more else ""
+        strips[-1].set_xlabel(f"time, s{left_out}")
         return Drawing(svg_of(figure), f"{name}: brightness of each track over time, bits sent and bits read")
 
 

@@ -96,6 +96,8 @@ def test_a_tracker_and_a_decoder_of_ones_own_take_their_places(rendered: Path, t
     assert {line["track"] for line in _lines(folder / "tracks.robust.jsonl")} == {7}
     (message,) = _lines(folder / "messages.robust.jsonl")
     assert (message["robot"], message["track"], message["command"]) == ("r1", 7, "stop")
+    # A decoder of one's own is asked when the track has ended: with the last of the sets.
+    assert message["told_s"] == _lines(folder / "tracks.robust.jsonl")[-1]["time_s"]
 
 
 def test_a_tracker_that_fails_is_named_and_nothing_is_written(rendered: Path, tmp_path: Path) -> None:

@@ -78,10 +78,13 @@ def test_the_section_has_all_its_plots_and_the_film_moves() -> None:
                     np.array([0.05, 0.05, 0.05, np.inf]))  # fmt: skip
     section = time_section(result, Said({"robust": [signal]}, {}))
     assert section is not None
-    assert section.above is not None
-    assert section.lives is not None
-    assert list(section.errors) == list(section.blinks) == ["robust"]
-    assert section.numbers.rows[0][4] == "1"  # switches
+    (view,) = section.views
+    assert view.observer == "r1"
+    assert view.above is not None
+    assert view.lives is not None
+    assert list(view.errors) == list(view.blinks) == ["robust"]
+    assert section.tracks.rows[0][4] == "1"  # switches
+    assert section.messages is None
     film = film_gif(KEYS, scored.moments, "robust", lambda key: frame(*key), {"r1.front": CAMERA})
     assert film is not None
     assert film.startswith(b"GIF")
