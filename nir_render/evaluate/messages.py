@@ -64,9 +64,11 @@ class Reception:
 class MessageEvaluation:
     """What became of each packet, the messages that nobody sent, and the numbers of `summary.json`.
 
-    `by_observer` has the numbers for each observer by itself, by estimator.
+    `sent` are all packets, also those that were not in view; `by_observer` has the numbers for each observer
+    by itself, by estimator.
     """
 
+    sent: tuple[SentTruth, ...]
     receptions: tuple[Reception, ...]
     wrong: Mapping[str, tuple[Message, ...]]
     summary: Mapping[str, Mapping[str, Any]]
@@ -126,6 +128,7 @@ def evaluate_messages(
             judged[name][robot] = found
     packets = Counter(robot for robot, _ in in_view)
     return MessageEvaluation(
+        tuple(sent),
         tuple(
             Reception(
                 robot,

@@ -71,6 +71,11 @@ def render_run(
     started = time.perf_counter()
     times = frame_times(scene, scene.document.seed).values()
     total = sum(int((~one.dropped).sum()) for one in times)
+    if total == 0:
+        raise InputError(
+            "every frame of every camera is dropped: there is nothing to render; lower clock.dropped of a "
+            "camera, or take more frames"
+        )
     if calibrations is None:
         calibrations = calibrations_of(scene)
     cache = LightCache() if cache is None else cache

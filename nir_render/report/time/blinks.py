@@ -7,11 +7,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
-from nir_render.evaluate.messages import Reception
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.style import BAD, FAINT, GOOD, MATPLOTLIB, TRUTH
 from nir_render.report.time.lanes import Lane
 from nir_render.report.time.plots import COLOURS
+from nir_render.truth.sent import SentTruth
 from perception.messages.uart import Bits, encode
 from perception.types import Message, Signal
 
@@ -24,7 +24,8 @@ def blink_plot(
     signals: Sequence[Signal],
     messages: Sequence[Message],
     lanes: Sequence[Lane],
-    receptions: Sequence[Reception],
+    sent: Sequence[SentTruth],
+    wrong: Sequence[Message] | None,
     name: str,
 ) -> Drawing | None:
     """Draw one strip a track: its levels, the bits of its messages, and those that its source sent.
@@ -35,8 +36,10 @@ def blink_plot(
         Of one observer, by one estimator.
     lanes
         Whom that estimator's tracks followed.
-    receptions
-        The packets that the observer could see.
+    sent
+        All packets, of whomever.
+    wrong
+        Which of the messages nobody sent; None where nobody knows what was sent.
 
     Returns
     -------
@@ -54,16 +57,11 @@ def blink_plot(
         for axes, signal in zip(strips, shown, strict=True):
             lane = _followed(signal.track, lanes)
             _draw_level(axes, signal)
-            for reception in receptions:
-                packet = reception.sent
+            for packet in sent:
                 if lane is not None and lane.name == (packet.robot, packet.source, None):
                     _draw_bits(axes, encode(packet.word), packet.start_s, packet.end_s, 1.38, TRUTH)
             for message in (each for each in messages if each.track == signal.track):
-                right = any(
-                    reception.heard.get(name) is message or reception.heard.get(name) == message
-                    for reception in receptions
-                )
-                colour = (GOOD if right else BAD) if receptions else FAINT
+                colour = FAINT if wrong is None else BAD if message in wrong else GOOD
                 bits = encode(message.word, max(message.frames, 1))
                 _draw_bits(axes, bits, message.start_s, message.end_s, 1.12, colour)
                 text = f"{message.command} ({message.word})"

@@ -77,13 +77,14 @@ def _view(observer: str, result: Evaluation, said: Said, names: Sequence[str]) -
     moments = () if result.over_time is None else result.over_time.moments
     lanes = {name: lanes_of(moments, observer, name) for name in names}
     there = any(lanes.values())
-    receptions = () if result.heard is None else result.heard.receptions
+    heard = result.heard
     blinks = {
         name: blink_plot(
             [signal for signal in said.signals.get(name, ()) if signal.robot == observer],
             [message for message in said.messages.get(name, ()) if message.robot == observer],
             lanes[name],
-            [reception for reception in receptions if reception.observer == observer],
+            () if heard is None else heard.sent,
+            None if heard is None else heard.wrong.get(name, ()),
             name,
         )
         for name in names

@@ -61,6 +61,16 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_run_that_loses_every_frame_is_refused(tmp_path: Path) -> None:
+    rig = {"preset": "infra_swarm", "cameras": {"front": {"clock": {"dropped": 0.999}}}}
+    scene = parse_scene(
+        {"format": 1, "name": "lost", "observe": ["r1.front"], "robots": {"r1": {"rig": rig}}}
+    )
+    with pytest.raises(InputError, match="every frame of every camera is dropped"):
+        render_run(scene, tmp_path / "run", overwrite=False, progress=lambda *_: None)
+    assert not (tmp_path / "run").exists()
+
+
 def _perceived(rendered: Path, tmp_path: Path, own: OwnParts) -> tuple[Path, Any]:
     folder = tmp_path / "run"
     shutil.copytree(rendered, folder)
