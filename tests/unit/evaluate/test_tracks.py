@@ -92,13 +92,18 @@ def test_two_observers_are_two_sequences() -> None:
     assert own["r1"]["track_hota"] == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("gone_s", "sources"), [(1.0, 1), (1.1, 2)])
+@pytest.mark.parametrize(("gone_s", "sources"), [(1.0, 1), (1.01, 2)])
 def test_who_was_gone_for_more_than_a_second_is_a_new_one(gone_s: float, sources: int) -> None:
-    """Hidden from 0.2 s on; while hidden for long it is neither missed, nor a track of it a false alarm."""
-    back = round((0.2 + gone_s) / STEP_S)
-    rows = [_source(k, "r2", AHEAD, visible_fraction=0.0 if 2 < k < back else 1.0) for k in range(back + 3)]
-    tracks = [_track(k, 1, (AHEAD, 0, 0)) for k in range(back + 3)]
-    numbers = _scored(rows, tracks, back + 3).summary["robust"]
+    """Three sets in view, one hidden, three in view; hidden for long it is not missed, nor its track false."""
+    times_s = [0.0, 0.1, 0.2, 0.7, 0.2 + gone_s, 0.3 + gone_s, 0.4 + gone_s]
+    sets = [("r1", time_s, [("r1.front", k)]) for k, time_s in enumerate(times_s)]
+    rows = [
+        truth(index=k, time_s=time_s, visible_fraction=0.0 if k == 3 else 1.0)
+        for k, time_s in enumerate(times_s)
+    ]
+    tracks = [dataclasses.replace(_track(0, 1, (AHEAD, 0, 0)), time_s=time_s) for time_s in times_s]
+    found = evaluate_tracks(sets, rows, {"r1.front": calibration()}, {"robust": tracks})
+    numbers = found.summary["robust"]
     assert numbers["track_sources"] == sources
     assert numbers["track_false_alarms_per_set"] == numbers["track_misses"] == 0
     assert numbers["track_idf1"] == pytest.approx(1.0 if sources == 1 else 2 * 3 / (6 + 6))
@@ -148,8 +153,10 @@ def test_velocity_is_that_of_the_source_over_ground_in_body_axes() -> None:
 
 
 def test_a_covariance_that_is_none_is_left_out() -> None:
-    """Two negative eigenvalues make a determinant above 0, but no covariance."""
-    bad = np.diag([-0.04, -0.04, 0.04, 0.01, 0.01, 0.01])
+    """A correlation of 1.5 between x and y, and between ẋ and ẏ: variances above 0, but no covariance."""
+    bad = np.diag([0.04, 0.04, 0.04, 0.01, 0.01, 0.01])
+    bad[0, 1] = bad[1, 0] = 1.5 * 0.04
+    bad[3, 4] = bad[4, 3] = 1.5 * 0.01
     tracks = [_track(0, 1, (2.2, 0, 0)), dataclasses.replace(_track(1, 1, (2.2, 0, 0)), covariance=bad)]
     numbers = _scored([_source(k, "r2", AHEAD) for k in range(2)], tracks, 2).summary["robust"]
     assert numbers["track_nees"] == pytest.approx(1 / 3)
