@@ -16,14 +16,11 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A track at one time, and whom it follows: true place and velocity over ground, in body axes.
-
-    `velocity_body_m_per_s`, shape (3,), is NaN where it is not known.
-    """
+    """A track at one time, of which robot it follows a source, and where that truly is in body axes, (3,)."""
 
     track: Track
+    robot: str
     position_body_m: Values
-    velocity_body_m_per_s: Values
 
 
 class TrueWays:
@@ -34,53 +31,64 @@ class TrueWays:
         for pose in poses:
             of_robot[pose.robot].append(pose)
         self._of_robot = {robot: sorted(own, key=lambda pose: pose.time_s) for robot, own in of_robot.items()}
-        self._times_s = {
-            robot: np.array([pose.time_s for pose in own]) for robot, own in self._of_robot.items()
-        }
 
-    def source_velocity_body_m_per_s(
-        self, observer: str, robot: str, position_body_m: Values, time_s: float
-    ) -> Values:
-        """Return how a robot's source moves over ground, in the observer's body axes, shape (3,).
+    def velocities_body_m_per_s(self, followed: Sequence[Followed]) -> Values:
+        """Return how sources move over ground, in body axes of who follows them, shape (n, 3).
 
-        It goes as its robot does and turns with it: v + ω × r. NaN where one of the two is not known then.
+        A source goes as its robot does and turns with it: v + ω × r. NaN where one of the two is not known.
         """
-        there, seen_from = self._at(robot, time_s), self._at(observer, time_s)
-        if there is None or seen_from is None:
-            return np.full(3, np.nan)
-        arm_m = seen_from.rotation @ position_body_m + seen_from.position_m - there.position_m
-        turning = np.cross(there.angular_velocity_rad_per_s, arm_m)
-        return np.asarray(seen_from.rotation.T @ (there.velocity_m_per_s + turning))
+        time_s = np.array([one.track.time_s for one in followed])
+        there = self._ways([one.robot for one in followed], time_s)
+        seen_from = self._ways([one.track.robot for one in followed], time_s)
+        place_m = np.array([one.position_body_m for one in followed]).reshape(-1, 3)
+        arm_m = np.einsum("nij,nj->ni", seen_from.rotation, place_m) + seen_from.position_m - there.position_m
+        velocity = there.velocity_m_per_s + np.cross(there.angular_velocity_rad_per_s, arm_m)
+        return np.asarray(np.einsum("nji,nj->ni", seen_from.rotation, velocity))
 
-    def _at(self, robot: str, time_s: float) -> "_Way | None":
-        from scipy.spatial.transform import Rotation, Slerp
-
-        own = self._of_robot.get(robot, [])
-        if not own or not own[0].time_s <= time_s <= own[-1].time_s:
-            return None
-        times_s = self._times_s[robot]
-        k = min(int(np.searchsorted(times_s, time_s, side="right")), len(own) - 1)
-        pair = own[max(k - 1, 0)], own[k]
-        between_s = pair[1].time_s - pair[0].time_s
-        part = (time_s - pair[0].time_s) / between_s if between_s > 0.0 else 0.0
-        turned = Rotation.from_quat([pose.quaternion_xyzw for pose in pair])
-        rotation = Slerp([0.0, 1.0], turned)(part).as_matrix()
-        position_m, velocity, angular = (
-            (1.0 - part) * np.array(getattr(pair[0], name)) + part * np.array(getattr(pair[1], name))
-            for name in ("position_m", "velocity_m_per_s", "angular_velocity_rad_per_s")
-        )
-        return _Way(position_m, rotation, velocity, angular)
+    def _ways(self, robots: Sequence[str], time_s: Values) -> "_Ways":
+        """Return poses and velocities of robots at times, one each; NaN where none is known."""
+        n = len(robots)
+        ways = _Ways(*(np.full((n, *shape), np.nan) for shape in ((3,), (3, 3), (3,), (3,))))
+        names = np.array(robots)
+        for robot in dict.fromkeys(robots):
+            own = self._of_robot.get(robot, [])
+            known_s = np.array([pose.time_s for pose in own])
+            where = np.flatnonzero(names == robot)
+            if own:
+                within = (time_s[where] >= known_s[0]) & (time_s[where] <= known_s[-1])
+                where = where[within]
+            if own and where.size:
+                _fill(ways, where, own, known_s, time_s[where])
+        return ways
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class _Ways:
+    """Poses and velocities in the world, n of them."""
+
     position_m: Values
     rotation: Values
     velocity_m_per_s: Values
     angular_velocity_rad_per_s: Values
 
 
-def error_numbers(followed: Sequence[Followed]) -> dict[str, float | None]:
+def _fill(
+    ways: _Ways, where: NDArray[np.int64], own: Sequence[PoseTruth], known_s: Values, time_s: Values
+) -> None:
+    """Interpolate what is known of one robot into the rows that are its own."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    for name in ("position_m", "velocity_m_per_s", "angular_velocity_rad_per_s"):
+        columns = np.array([getattr(pose, name) for pose in own]).T
+        getattr(ways, name)[where] = np.stack(
+            [np.interp(time_s, known_s, column) for column in columns], axis=1
+        )
+    turned = Rotation.from_quat([pose.quaternion_xyzw for pose in own])
+    single = len(own) == 1
+    ways.rotation[where] = turned.as_matrix() if single else Slerp(known_s, turned)(time_s).as_matrix()
+
+
+def error_numbers(followed: Sequence[Followed], ways: TrueWays) -> dict[str, float | None]:
     """Return the errors of tracks, over all instants; None where there are none.
 
     A NEES is the mean of eᵀ P⁻¹ e over its dimensions, of the covariances that can be inverted: 1 where
@@ -89,7 +97,7 @@ def error_numbers(followed: Sequence[Followed]) -> dict[str, float | None]:
     said_m = np.array([one.track.position_body_m for one in followed]).reshape(-1, 3)
     there_m = np.array([one.position_body_m for one in followed]).reshape(-1, 3)
     said_m_per_s = np.array([one.track.velocity_body_m_per_s for one in followed]).reshape(-1, 3)
-    there_m_per_s = np.array([one.velocity_body_m_per_s for one in followed]).reshape(-1, 3)
+    there_m_per_s = ways.velocities_body_m_per_s(followed)
     covariance = np.array([one.track.covariance for one in followed]).reshape(-1, 6, 6)
     off = np.concatenate([said_m - there_m, said_m_per_s - there_m_per_s], axis=1)
     range_m = np.linalg.norm(said_m, axis=1) - np.linalg.norm(there_m, axis=1)

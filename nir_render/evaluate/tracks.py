@@ -91,12 +91,13 @@ def evaluate_tracks(
     ways = TrueWays(poses)
     observers = list(dict.fromkeys(moment.robot for moment in moments))
     own = {robot: [moment for moment in moments if moment.robot == robot] for robot in observers}
+    by_observer = {name: {robot: _numbers(own[robot], name, ways) for robot in observers} for name in tracks}
     in_turn = [moment for robot in observers for moment in own[robot]]
-    return TrackEvaluation(
-        moments,
-        {name: _numbers(in_turn, name, ways) for name in tracks},
-        {name: {robot: _numbers(own[robot], name, ways) for robot in observers} for name in tracks},
-    )
+    together = {
+        name: numbers[observers[0]] if len(observers) == 1 else _numbers(in_turn, name, ways)
+        for name, numbers in by_observer.items()
+    }
+    return TrackEvaluation(moments, together, by_observer)
 
 
 def _in_sets(tracks: Iterable[Track], sets: Sequence[TimedSet], name: str) -> dict[int, list[Track]]:
@@ -166,11 +167,7 @@ def _numbers(moments: Sequence[Moment], name: str, ways: TrueWays) -> dict[str, 
             elif follows not in apart:
                 kept.append(track)
                 if follows is not None and track.ghost != "yes":
-                    there_m = by_name[follows].position_body_m
-                    velocity = ways.source_velocity_body_m_per_s(
-                        moment.robot, follows[0], there_m, moment.time_s
-                    )
-                    followed.append(Followed(track, there_m, velocity))
+                    followed.append(Followed(track, follows[0], by_name[follows].position_body_m))
         # What calls itself a mirror image, and is none, is like nobody.
         real = np.array([track.ghost != "yes" for track in kept], dtype=bool)
         apart_m = np.where(real[None, :], _apart_m(counted, kept), np.inf)
@@ -198,7 +195,7 @@ def _numbers(moments: Sequence[Moment], name: str, ways: TrueWays) -> dict[str, 
         "track_misses": scores.misses,
         "track_false_alarms_per_set": scores.false_alarms / len(moments) if moments else None,
         "track_gospa_m": _or_none(float(np.mean(gospas_m)) if gospas_m else math.nan),
-        **error_numbers(followed),
+        **error_numbers(followed, ways),
         "track_ghosts_told": told,
         "track_ghosts_not_told": not_told,
     }

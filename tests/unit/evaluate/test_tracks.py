@@ -162,6 +162,17 @@ def test_a_covariance_that_is_none_is_left_out() -> None:
     assert numbers["track_nees"] == pytest.approx(1 / 3)
 
 
+def test_who_says_nothing_has_no_errors() -> None:
+    """Ten sources missed; without tracks there is no error, and without sets no score."""
+    numbers = _scored([_source(k, robot, AHEAD) for k in range(5) for robot in ("r2", "r3")], []).summary[
+        "robust"
+    ]
+    assert (numbers["track_misses"], numbers["track_hota"], numbers["track_mota"]) == (10, 0.0, 0.0)
+    assert numbers["track_position_rmse_m"] is numbers["track_range_bias_m"] is numbers["track_nees"] is None
+    assert numbers["track_gospa_m"] == pytest.approx(1.0)
+    assert _scored([], [], 0).summary["robust"]["track_hota"] is None
+
+
 def test_tracks_that_stand_nowhere_or_twice_are_refused() -> None:
     rows = [_source(k, "r2", AHEAD) for k in range(5)]
     with pytest.raises(
