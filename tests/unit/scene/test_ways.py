@@ -85,6 +85,23 @@ def test_a_smooth_way_meets_its_waypoints_at_rest_where_it_holds() -> None:
     assert halfway.linear_m_per_s[1] == pytest.approx(1.5, rel=1e-5)
 
 
+def test_a_smooth_turn_comes_to_rest_too() -> None:
+    """A quarter turn in 2 s between two rests: yaw 90° (3 x² − 2 x³), its rate 0 at both ends, 67.5°/s midway."""
+    quarter = [
+        {"time": "1 s", "position": "[1, 0, 0] m"},
+        {"time": "3 s", "position": "[1, 0, 0] m", "orientation": {"yaw": "90 deg"}},
+    ]
+    robot = _scene({"between": "smooth", "motion": quarter}).document.robots["r2"]
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        ahead = robot_pose(robot, 1.0 + 2.0 * share).rotation @ AHEAD
+        yaw_deg = np.degrees(np.arctan2(ahead[1], ahead[0]))
+        assert yaw_deg == pytest.approx(90.0 * (3.0 * share**2 - 2.0 * share**3), abs=1e-4)
+    for time_s, rate_deg in ((1.001, 0.135), (2.0, 67.5), (2.999, 0.135)):
+        velocity = robot_velocity(robot, time_s)
+        assert velocity is not None
+        assert np.degrees(velocity.angular_rad_per_s[2]) == pytest.approx(rate_deg, rel=2e-3)
+
+
 ROWS = [(0.0, 0, 0, 0, 0, 0, 0, 1), (2.0, 1, 2, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5))]
 
 
