@@ -67,9 +67,11 @@ def time_table(summary: Mapping[str, Any]) -> Table | None:
         "track_switches": ("switches", "{}"),
         "tracks": ("tracks", "{}"),
         "track_position_rmse_m": ("place RMSE\nm", "{:.4f}"),
+        "track_state_nees": ("NEES\n(honest: 1)", "{:.2f}"),
         "message_sent": ("packets\nsent", "{}"),
         "message_received": ("re-\nceived", "{}"),
         "message_wrong": ("wrong", "{}"),
+        "message_latency_median_s": ("latency\ns", "{:.2f}"),
     }
     return _filled(Table(title="Over time: tracks and messages", title_justify="left"), columns, followed)
 

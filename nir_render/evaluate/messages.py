@@ -1,26 +1,54 @@
-"""What a stack heard, against what was sent: packets received, wrong and false, and bits.
+"""What a stack heard, against what was sent: packets received, missed and wrong, how late, and bits.
 
 A packet counts for an observer that could see its source all the while: countable or dark in all sets but a
-few. A message belongs to the source that its track followed while it was sent.
+few. A message belongs to the source that its track followed while it was sent, or, where it says that another
+track may have said it instead, to that one's.
 """
 
+from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.evaluate.tracks import Moment, SourceName
+from nir_render.errors import InputError, shown
+from nir_render.evaluate.presence import SourceName
+from nir_render.evaluate.tracks import Moment
 from nir_render.truth.sent import SentTruth
-from perception.messages.uart import encode
+from perception import parse_message
+from perception.messages.uart import FRAME_BITS, REPEATS, encode
 from perception.types import Message, Signal
 
 SEEN = 0.95
 """The share of the sets during a packet in which its source must have been in view."""
 
-_SAME_START_S = 0.5
+_SLACK = 0.5 / REPEATS
+"""So much of a packet, half a frame, may a message begin before it, or end after it."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """A message, and the time of the set of frames with which it was said; None where nobody wrote that."""
+
+    message: Message
+    told_s: float | None = None
+
+
+def parse_told(record: Mapping[str, Any]) -> Told:
+    """Return what a line of `messages.NAME.jsonl` says, and its `told_s`, if it has one.
+
+    Raises
+    ------
+    RecordingError, InputError
+        A field is missing, of the wrong type or out of bounds.
+    """
+    told_s = record.get("told_s") if isinstance(record, Mapping) else None
+    if told_s is not None and (not isinstance(told_s, int | float) or isinstance(told_s, bool)):
+        raise InputError(f"told_s is {shown(told_s)}; wanted a number or null")
+    return Told(parse_message(record), told_s)
 
 
 @dataclass(frozen=True)
@@ -34,17 +62,37 @@ class Reception:
 
 @dataclass(frozen=True)
 class MessageEvaluation:
-    """What became of each packet, the messages that nobody sent, and the numbers of `summary.json`."""
+    """What became of each packet, the messages that nobody sent, and the numbers of `summary.json`.
 
+    `sent` are all packets, also those that were not in view; `by_observer` has the numbers for each observer
+    by itself, by estimator.
+    """
+
+    sent: tuple[SentTruth, ...]
     receptions: tuple[Reception, ...]
     wrong: Mapping[str, tuple[Message, ...]]
     summary: Mapping[str, Mapping[str, Any]]
+    by_observer: Mapping[str, Mapping[str, Mapping[str, Any]]]
+
+
+@dataclass
+class _Judged:
+    """What one estimator's messages to one observer are: the packets, by number, and what is left."""
+
+    heard: dict[int, Told] = field(default_factory=dict)
+    repeated: int = 0
+    ambiguous: int = 0
+    of_ghosts: int = 0
+    misattributed: int = 0
+    wrong: list[Message] = field(default_factory=list)
+    bits: int = 0
+    bit_errors: int = 0
 
 
 def evaluate_messages(
     moments: Sequence[Moment],
     sent: Sequence[SentTruth],
-    messages: Mapping[str, Sequence[Message]],
+    messages: Mapping[str, Sequence[Told]],
     signals: Mapping[str, Sequence[Signal]],
 ) -> MessageEvaluation:
     """Score the messages of each estimator.
@@ -59,130 +107,187 @@ def evaluate_messages(
         By estimator.
     """
     observers = list(dict.fromkeys(moment.robot for moment in moments))
+    in_order = sorted(moments, key=lambda moment: moment.time_s)
+    own = {robot: [moment for moment in in_order if moment.robot == robot] for robot in observers}
     in_view = [
-        (observer, packet)
-        for observer in observers
-        for packet in sent
-        if packet.robot != observer and _seen(moments, observer, packet)
+        (robot, packet)
+        for robot in observers
+        for packet in _seen_by(own[robot], [packet for packet in sent if packet.robot != robot])
     ]
-    heard: list[dict[str, Message]] = [{} for _ in in_view]
-    wrong: dict[str, tuple[Message, ...]] = {}
+    judged: dict[str, dict[str, _Judged]] = {}
     for name, said in messages.items():
-        followed = _followed(moments, name)
-        left = []
-        for message in said:
-            source = _source_of(message, followed)
-            meant = [
-                k
-                for k, (observer, packet) in enumerate(in_view)
-                if observer == message.robot
-                and (packet.robot, packet.source) == (source or (None, None))[:2]
-                and abs(packet.start_s - message.start_s) < _SAME_START_S
-                and packet.word == message.word
-            ]
-            if meant:
-                heard[meant[0]].setdefault(name, message)
-            elif not _partly_seen(message, source, sent):
-                left.append(message)
-        wrong[name] = tuple(left)
-    receptions = tuple(
-        Reception(observer, packet, found) for (observer, packet), found in zip(in_view, heard, strict=True)
+        judged[name] = {}
+        for robot in observers:
+            ways = _Ways(own[robot], name)
+            found = _judged(
+                [told for told in said if told.message.robot == robot], robot, in_view, sent, ways
+            )
+            heard_of = [signal for signal in signals.get(name, ()) if signal.robot == robot]
+            seen = [packet for observer, packet in in_view if observer == robot]
+            found.bits, found.bit_errors = _bits(seen, heard_of, ways)
+            judged[name][robot] = found
+    packets = Counter(robot for robot, _ in in_view)
+    return MessageEvaluation(
+        tuple(sent),
+        tuple(
+            Reception(
+                robot,
+                packet,
+                {
+                    name: of_name[robot].heard[k].message
+                    for name, of_name in judged.items()
+                    if k in of_name[robot].heard
+                },
+            )
+            for k, (robot, packet) in enumerate(in_view)
+        ),
+        {
+            name: tuple(message for each in of_name.values() for message in each.wrong)
+            for name, of_name in judged.items()
+        },
+        {name: _numbers(of_name.values(), in_view) for name, of_name in judged.items()},
+        {
+            name: {robot: _numbers([each], in_view, packets[robot]) for robot, each in of_name.items()}
+            for name, of_name in judged.items()
+        },
     )
-    summary = {
-        name: _numbers(name, receptions, wrong[name], moments, signals.get(name, ())) for name in messages
-    }
-    return MessageEvaluation(receptions, wrong, summary)
 
 
-def _seen(moments: Sequence[Moment], observer: str, packet: SentTruth) -> bool:
-    """Tell whether an observer could see a packet from beginning to end."""
-    during = [
-        moment
-        for moment in moments
-        if moment.robot == observer and packet.start_s <= moment.time_s <= packet.end_s
-    ]
-    if not during or moments[0].time_s > packet.start_s or moments[-1].time_s < packet.end_s:
-        return False
-    name = (packet.robot, packet.source, None)
-    there = sum(any(one.name == name and one.life is not None for one in moment.present) for moment in during)
-    return there >= SEEN * len(during)
+def _seen_by(moments: Sequence[Moment], sent: Iterable[SentTruth]) -> list[SentTruth]:
+    """Return the packets that an observer could see from beginning to end."""
+    times_s = [moment.time_s for moment in moments]
+    there: dict[SourceName, list[int]] = defaultdict(list)
+    for k, moment in enumerate(moments):
+        for one in moment.present:
+            if one.life is not None:
+                there[one.name].append(k)
+    seen = []
+    for packet in sent:
+        first, last = bisect_left(times_s, packet.start_s), bisect_right(times_s, packet.end_s)
+        if first == last or times_s[0] > packet.start_s or times_s[-1] < packet.end_s:
+            continue
+        own = there[packet.robot, packet.source, None]
+        if bisect_left(own, last) - bisect_left(own, first) >= SEEN * (last - first):
+            seen.append(packet)
+    return seen
 
 
-def _followed(
-    moments: Sequence[Moment], name: str
-) -> dict[tuple[str, int], list[tuple[float, SourceName | None]]]:
-    """Return whom each track followed when, by observer and number."""
-    followed: dict[tuple[str, int], list[tuple[float, SourceName | None]]] = defaultdict(list)
-    for moment in moments:
-        for track, source in moment.tracks.get(name, ()):
-            followed[moment.robot, track.track].append((moment.time_s, source))
-    return followed
+class _Ways:
+    """Whom the tracks of one estimator followed, as one observer saw it."""
+
+    def __init__(self, moments: Sequence[Moment], name: str) -> None:
+        self._times_s: dict[int, list[float]] = defaultdict(list)
+        self._names: dict[int, list[SourceName | None]] = defaultdict(list)
+        for moment in moments:
+            for track, source in moment.tracks.get(name, ()):
+                self._times_s[track.track].append(moment.time_s)
+                self._names[track.track].append(source)
+
+    def source_of(self, track: int, start_s: float, end_s: float) -> SourceName | None:
+        """Return whom a track followed for most of a time in which it followed anybody."""
+        times_s = self._times_s.get(track, [])
+        during = self._names.get(track, [])[bisect_left(times_s, start_s) : bisect_right(times_s, end_s)]
+        known = Counter(source for source in during if source is not None)
+        return known.most_common(1)[0][0] if known else None
 
 
-def _source_of(
-    message: Message, followed: Mapping[tuple[str, int], Sequence[tuple[float, SourceName | None]]]
-) -> SourceName | None:
-    """Return whom the track of a message followed for most of the time."""
-    during = [
-        source
-        for time_s, source in followed.get((message.robot, message.track), ())
-        if source is not None and message.start_s <= time_s <= message.end_s
-    ]
-    return Counter(during).most_common(1)[0][0] if during else None
+def _judged(
+    said: Sequence[Told],
+    robot: str,
+    in_view: Sequence[tuple[str, SentTruth]],
+    sent: Sequence[SentTruth],
+    ways: _Ways,
+) -> _Judged:
+    """Tell of each message to an observer which packet it is of, or what is wrong with it."""
+    found = _Judged()
+    for told in said:
+        message = told.message
+        tracks = [message.track] + ([] if message.ambiguous_with is None else [message.ambiguous_with])
+        found.ambiguous += len(tracks) > 1
+        sources = {ways.source_of(track, message.start_s, message.end_s) for track in tracks} - {None}
+        meant = [
+            k
+            for k, (observer, packet) in enumerate(in_view)
+            if observer == robot
+            and (packet.robot, packet.source, None) in sources
+            and _is_of(message, packet)
+        ]
+        if meant:
+            found.repeated += meant[0] in found.heard
+            found.heard.setdefault(meant[0], told)
+            continue
+        right = [packet for packet in sent if _is_of(message, packet) and packet.robot != robot]
+        if any((packet.robot, packet.source, None) in sources for packet in right):
+            continue  # not all of it was in view: neither received nor wrong
+        if any(
+            (packet.robot, packet.source) == source[:2] for packet in right for source in sources if source
+        ):
+            found.of_ghosts += 1
+            continue
+        found.misattributed += bool(right)
+        found.wrong.append(message)
+    return found
 
 
-def _partly_seen(message: Message, source: SourceName | None, sent: Sequence[SentTruth]) -> bool:
-    """Tell whether a message is right about a packet that does not count, as not all of it was in view."""
-    return source is not None and any(
-        (packet.robot, packet.source, packet.word) == (*source[:2], message.word)
-        and abs(packet.start_s - message.start_s) < _SAME_START_S
-        for packet in sent
+def _is_of(message: Message, packet: SentTruth) -> bool:
+    """Tell whether a message, of all five frames or of some, lies in a packet and has its word."""
+    slack_s = _SLACK * (packet.end_s - packet.start_s)
+    return (
+        message.word == packet.word
+        and message.start_s > packet.start_s - slack_s
+        and message.end_s < packet.end_s + slack_s
     )
 
 
 def _numbers(
-    name: str,
-    receptions: Sequence[Reception],
-    wrong: Sequence[Message],
-    moments: Sequence[Moment],
-    signals: Sequence[Signal],
+    judged: Iterable[_Judged], in_view: Sequence[tuple[str, SentTruth]], packets: int | None = None
 ) -> dict[str, Any]:
-    received = sum(name in reception.heard for reception in receptions)
-    bits, errors = _bits(name, receptions, moments, signals)
+    """Return the numbers of observers together; `packets` is how many they could see, all by default."""
+    each = list(judged)
+    late_s = [
+        told.told_s - in_view[k][1].end_s
+        for one in each
+        for k, told in one.heard.items()
+        if told.told_s is not None
+    ]
+    sent, received = len(in_view) if packets is None else packets, sum(len(one.heard) for one in each)
+    bits = sum(one.bits for one in each)
     return {
-        "message_sent": len(receptions),
+        "message_sent": sent,
         "message_received": received,
-        "message_wrong": len(wrong),
+        "message_missed": sent - received,
+        "message_wrong": sum(len(one.wrong) for one in each),
+        "message_misattributed": sum(one.misattributed for one in each),
+        "message_repeated": sum(one.repeated for one in each),
+        "message_ambiguous": sum(one.ambiguous for one in each),
+        "message_of_ghosts": sum(one.of_ghosts for one in each),
+        "message_latency_median_s": float(np.median(late_s)) if late_s else None,
+        "message_latency_max_s": max(late_s, default=None),
         "message_bits": bits,
-        "message_bit_error_rate": errors / bits if bits else None,
+        "message_bit_error_rate": sum(one.bit_errors for one in each) / bits if bits else None,
     }
 
 
-def _bits(
-    name: str, receptions: Sequence[Reception], moments: Sequence[Moment], signals: Sequence[Signal]
-) -> tuple[int, int]:
-    """Return how many bits of the packets were sampled, and how many are wrong if each is decided by itself.
+def _bits(sent: Sequence[SentTruth], signals: Sequence[Signal], ways: _Ways) -> tuple[int, int]:
+    """Return how many bits of packets were sampled, and how many are wrong if each is decided by itself.
 
-    A bit is the mean of the track's levels within it, against half; start and rate are the true ones.
+    A bit is the mean of the levels within it, against half, of a track that followed its source during the
+    packet; start and rate are the true ones.
     """
-    followed = _followed(moments, name)
-    of_source: dict[tuple[str, SourceName], list[Signal]] = defaultdict(list)
-    for signal in signals:
-        names = [who for _, who in followed.get((signal.robot, signal.track), ()) if who is not None]
-        if names:
-            of_source[signal.robot, Counter(names).most_common(1)[0][0]].append(signal)
     bits = errors = 0
-    for reception in receptions:
-        packet = reception.sent
-        sent = encode(packet.word)
-        for signal in of_source[reception.observer, (packet.robot, packet.source, None)]:
-            decided, known = _decided(signal, packet, len(sent))
-            bits += int(known.sum())
-            errors += int((decided[known] != sent[known]).sum())
+    for packet in sent:
+        coded = encode(packet.word)
+        source = (packet.robot, packet.source, None)
+        for signal in signals:
+            if ways.source_of(signal.track, packet.start_s, packet.end_s) == source:
+                decided, known = _decided(signal, packet)
+                bits += int(known.sum())
+                errors += int((decided[known] != coded[known]).sum())
     return bits, errors
 
 
-def _decided(signal: Signal, packet: SentTruth, count: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _decided(signal: Signal, packet: SentTruth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    count = FRAME_BITS * REPEATS
     bit_s = (packet.end_s - packet.start_s) / count
     place = (signal.time_s - packet.start_s) / bit_s
     half = 0.5 * signal.exposure_s / bit_s

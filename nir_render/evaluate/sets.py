@@ -16,7 +16,7 @@ from perception.types import Calibration, Detection, FrameKey, Measurement, Mirr
 
 Values = NDArray[np.float64]
 
-_SAME_PLACE_M = 0.05
+SAME_PLACE_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def _sources(
                 other.truth.source,
                 other.truth.ghost_of,
             )
-            if same and float(np.linalg.norm(position_m - other.position_body_m)) < _SAME_PLACE_M:
+            if same and float(np.linalg.norm(position_m - other.position_body_m)) < SAME_PLACE_M:
                 joined[k] = replace(other, rows=(*other.rows, row), countable=counts or other.countable)
                 break
         else:

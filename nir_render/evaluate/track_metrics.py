@@ -58,7 +58,9 @@ class TrackScores:
 
 
 def track_scores(instants: Sequence[Instant]) -> TrackScores:
-    """Score a tracker over the instants of one observer.
+    """Score a tracker over the instants of one observer, or those of several, one after the other.
+
+    Several have no identity in common. An instant of another between two of one would break its runs.
 
     Raises
     ------

@@ -8,16 +8,18 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from nir_render.errors import InputError
-from nir_render.evaluate.messages import evaluate_messages
+from nir_render.evaluate.messages import MessageEvaluation, evaluate_messages, parse_told
 from nir_render.evaluate.metrics import Evaluation, evaluate
 from nir_render.evaluate.sets import evaluate_sets
-from nir_render.evaluate.tracks import evaluate_tracks
+from nir_render.evaluate.tracks import TrackEvaluation, evaluate_tracks
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds, parse_lines
 from nir_render.run.perceive import unknown_camera
 from nir_render.truth.lamps import LampTruth, parse_lamp
+from nir_render.truth.poses import parse_pose
 from nir_render.truth.sent import parse_sent
 from nir_render.truth.sources import SourceTruth, parse_truth
 from perception import (
@@ -28,7 +30,6 @@ from perception import (
     frame_sets,
     parse_detection,
     parse_measurement,
-    parse_message,
     parse_mirror,
     parse_signal,
     parse_track,
@@ -162,27 +163,36 @@ def _with_tracks(
         (robot_of(each[0].camera), set_time_s(each), [(frame.camera, frame.index) for frame in each])
         for each in frame_sets(recording.records)
     ]
-    over_time = evaluate_tracks(sets, truth, recording.calibrations, tracks)
-    summaries = [over_time.summary]
+    poses_path = folder / run_folder.POSES
+    poses = parse_lines(poses_path, parse_pose) if poses_path.is_file() else []
+    over_time = evaluate_tracks(sets, truth, recording.calibrations, tracks, poses)
+    scored: list[TrackEvaluation | MessageEvaluation] = [over_time]
     heard = None
     if (folder / run_folder.SENT).is_file():
         heard = evaluate_messages(
             over_time.moments,
             parse_lines(folder / run_folder.SENT, parse_sent),
-            run_folder.lines_of(folder, "messages", names, parse_message),
+            run_folder.lines_of(folder, "messages", names, parse_told),
             run_folder.lines_of(folder, "signals", names, parse_signal),
         )
-        summaries.append(heard.summary)
+        scored.append(heard)
     summary = dict(result.summary)
     summary["estimators"] = {
-        name: {
-            key: value
-            for part in (numbers, *(each.get(name, {}) for each in summaries))
-            for key, value in part.items()
-        }
-        for name, numbers in summary["estimators"].items()
+        name: {**numbers, **_together(name, scored)} for name, numbers in summary["estimators"].items()
     }
     return replace(result, summary=summary, over_time=over_time, heard=heard)
+
+
+def _together(name: str, scored: Sequence[TrackEvaluation | MessageEvaluation]) -> dict[str, Any]:
+    """Return an estimator's numbers over time; where several robots observe, those of each beside them."""
+    numbers: dict[str, Any] = {
+        key: value for each in scored for key, value in each.summary.get(name, {}).items()
+    }
+    by_observer: dict[str, dict[str, Any]] = {}
+    for each in scored:
+        for robot, own in each.by_observer.get(name, {}).items():
+            by_observer.setdefault(robot, {}).update(own)
+    return {**numbers, "observers": by_observer} if len(by_observer) > 1 else numbers
 
 
 def _preview(recording: Recording, keys: Sequence[FrameKey], result: Evaluation) -> bytes:

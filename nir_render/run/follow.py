@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -26,6 +26,7 @@ from perception import (
 from perception.messages.own import DecoderError, OwnDecoder, OwnReader, load_decoder
 from perception.rig.frame_sets import robot_of
 from perception.track.own import TrackerError, load_tracker
+from perception.types import Message
 
 Line = dict[str, Any]
 
@@ -87,6 +88,7 @@ class Follower:
         self._calibrations = calibrations
         self._odometry = odometry
         self._pipelines: dict[str, Pipeline] = {}
+        self._latest_s: dict[str, float] = {}
         self._lines: dict[str, list[Line]] = {
             kind: [] for kind in ("measurements", "mirrors", "fog", "tracks", "messages")
         }
@@ -99,7 +101,8 @@ class Follower:
         heard = self._pipelines[robot].follow(frames, detections, self._known(robot, begin_s))
         self._note_set(robot, begin_s, heard.measurements)
         self._lines["tracks"] += map(track_record, heard.tracks)
-        self._lines["messages"] += map(message_record, heard.messages)
+        self._latest_s[robot] = heard.time_s
+        self._note_messages(heard.messages, heard.time_s)
 
     def _known(self, robot: str, time_s: float) -> Sequence[Odometry]:
         """Return what a robot knows of its motion around a time."""
@@ -120,8 +123,11 @@ class Follower:
 
     def finish(self) -> None:
         """Read what was said to the end."""
-        for pipeline in self._pipelines.values():
-            self._lines["messages"] += map(message_record, pipeline.finish())
+        for robot, pipeline in self._pipelines.items():
+            self._note_messages(pipeline.finish(), self._latest_s[robot])
+
+    def _note_messages(self, messages: Iterable[Message], told_s: float) -> None:
+        self._lines["messages"] += [{**message_record(message), "told_s": told_s} for message in messages]
 
     def write(self, folder: Path) -> None:
         """Write the files of an estimator: of tracks and what they say only where there were any."""

@@ -32,7 +32,7 @@ from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Begun, Shot, simulate
 from nir_render.simulation.frame_times import frame_times
-from nir_render.simulation.odometry import observers_astir, odometry_of, pose_records
+from nir_render.simulation.odometry import observers_astir, odometry_of, true_poses
 from nir_render.simulation.sent import sent_packets
 from nir_render.transport.cache import LightCache
 from nir_render.transport.cache_key import digest as digest_of
@@ -72,6 +72,11 @@ def render_run(
     started = time.perf_counter()
     times = frame_times(scene, scene.document.seed).values()
     total = sum(int((~one.dropped).sum()) for one in times)
+    if total == 0:
+        raise InputError(
+            "every frame of every camera is dropped: there is nothing to render; lower clock.dropped of a "
+            "camera, or take more frames"
+        )
     if calibrations is None:
         calibrations = calibrations_of(scene)
     cache = LightCache() if cache is None else cache
@@ -118,7 +123,7 @@ def _digest(scene: Scene, keep_light: bool) -> str:
 def _write_times(scene: Scene, folder: Path) -> None:
     """Write what is true over time, poses and packets, and what robots believe of their motion."""
     if any(robot.moves for robot in scene.document.robots.values()):
-        run_folder.write_lines(folder / run_folder.POSES, pose_records(scene))
+        run_folder.write_lines(folder / run_folder.POSES, (pose.record() for pose in true_poses(scene)))
     believed = [
         line for robot in observers_astir(scene) for line in odometry_of(scene, robot, scene.document.seed)
     ]

@@ -90,6 +90,13 @@ def _exposures_beyond_the_clock(document: SceneDocument) -> list[str]:
         robot, camera_name = name.split(".")
         place = f"robots.{robot}.rig.cameras.{camera_name}"
         shortest_s = _shortest_period_s(camera, document.clock.frame_rate_hz)
+        if shortest_s <= 0.0 and camera.clock is not None:
+            problems.append(
+                f"{place}.clock.jitter: {1e3 * camera.clock.jitter_s:.4g} ms could take a frame before "
+                f"the one before it: {JITTER_SIGMAS:g} of them either way, at "
+                f"{document.clock.frame_rate_hz:g} Hz; lower it, or clock.frame_rate"
+            )
+            continue
         period_s, period = (1.0 + _SLACK) * shortest_s, f"{1e3 * shortest_s:.4g} ms"
         rows, auto = camera.sensor.rows, camera.auto_exposure
         read_out_s = rows * camera.shutter.row_delay_s

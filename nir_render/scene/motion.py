@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot
 from nir_render.scene.documents.times.motion import Between, Circle, Moving, Recorded, Waypoint
-from nir_render.scene.documents.times.recorded import trajectory_of
+from nir_render.scene.documents.times.recorded import scene_times_s, trajectory_of
 from nir_render.scene.pose import Pose, rotation_of
 from nir_render.scene.splines import Spline, along, spline_of
 
@@ -154,7 +154,7 @@ def _knots_of_rows(path: Recorded, data: bytes) -> _Knots:
     from scipy.spatial.transform import Rotation
 
     rows = np.frombuffer(data).reshape(-1, 8)
-    times_s, positions_m = rows[:, 0] + path.delay_s, rows[:, 1:4]
+    times_s, positions_m = scene_times_s(rows[:, 0], path.delay_s, path.start_s), rows[:, 1:4]
     rotations = np.asarray(Rotation.from_quat(rows[:, 4:]).as_matrix())
     smooth = path.between == "smooth" and len(rows) > 1
     splines = (spline_of(times_s, positions_m, rotations, rests=False),) if smooth else ()

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_STILL = 1e-6
+"""Of an interval, how long one of no turn is: as small a share of the rate is left at an end."""
+
 
 @dataclass(frozen=True, eq=False)
 class Spline:
@@ -24,7 +27,8 @@ class Spline:
 
     def rotations(self, times_s: Array) -> Array:
         """Return rotation matrices at times, shape (n,), shape (n, 3, 3)."""
-        return np.asarray(self._rotations(np.clip(times_s, self.begin_s, self.end_s)).as_matrix())
+        since_s = np.clip(times_s, self.begin_s, self.end_s) - self.begin_s
+        return np.asarray(self._rotations(since_s).as_matrix())
 
 
 def spline_of(times_s: Array, positions_m: Array, rotations: Array, *, rests: bool) -> Spline:
@@ -32,7 +36,8 @@ def spline_of(times_s: Array, positions_m: Array, rotations: Array, *, rests: bo
 
     Positions are twice continuously differentiable; `rests` makes the velocity 0 at both ends, else the
     acceleration is (a natural spline). Orientations have continuous angular acceleration (scipy's
-    RotationSpline).
+    RotationSpline), and come to rest likewise: it begins and ends at the mean rate of its first and last
+    interval, so one of no turn, far shorter than the others, is set before and after them.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -43,11 +48,16 @@ def spline_of(times_s: Array, positions_m: Array, rotations: Array, *, rests: bo
         end_s = float(times_s[0])
     else:
         end_s = float(times_s[-1])
+    since_s, turned = times_s - times_s[0], rotations
+    if rests:
+        still_s = _STILL * np.diff(times_s)
+        since_s = np.concatenate([[-still_s[0]], since_s, [since_s[-1] + still_s[-1]]])
+        turned = np.concatenate([rotations[:1], rotations, rotations[-1:]])
     return Spline(
         float(times_s[0]),
         end_s,
         CubicSpline(times_s, positions_m, bc_type="clamped" if rests else "natural"),
-        RotationSpline(times_s, Rotation.from_matrix(rotations)),
+        RotationSpline(since_s, Rotation.from_matrix(turned)),
     )
 
 

@@ -1,7 +1,7 @@
 """Where robots are at each frame, and where they take themselves to be: dead reckoning with its errors."""
 
+import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,13 @@ from nir_render.randomness import generator
 from nir_render.scene.documents.times.clocks import OdometryNoise
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.scene import Scene
+from nir_render.simulation.frame_times import frame_span_s
+from nir_render.truth.poses import PoseTruth
 from perception.types import Odometry
 
 Array = NDArray[np.float64]
+
+_SLACK = 1e-6  # of a period, by which a frame on the scene's clock may seem off it
 
 
 def observers_astir(scene: Scene) -> list[str]:
@@ -23,12 +27,27 @@ def observers_astir(scene: Scene) -> list[str]:
 
 
 def pose_times_s(scene: Scene) -> Array:
-    """Return when poses are told of: at each frame of the scene's clock, and one period after the last."""
-    times_s = scene.document.frame_times_s()
-    return np.array([*times_s, times_s[-1] + 1.0 / scene.document.clock.frame_rate_hz])
+    """Return when poses are told of: at each frame of the scene's clock, and one period after the last.
+
+    Where a camera's own clock takes frames before or after that, it goes on at this pace until it is past
+    them: who moves must be known wherever it looks.
+    """
+    clock = scene.document.clock
+    planned_s = np.array(scene.document.frame_times_s())
+    earliest, latest = 0, clock.frames
+    for name in scene.cameras():
+        first_s, last_s = frame_span_s(scene.camera(name)[1].clock, planned_s)
+        earliest = min(earliest, math.floor((first_s - clock.start_s) * clock.frame_rate_hz + _SLACK))
+        latest = max(latest, math.ceil((last_s - clock.start_s) * clock.frame_rate_hz + 1.0 - _SLACK))
+    before, after = np.arange(earliest, 0), np.arange(clock.frames + 1, latest + 1)
+    beyond_s = planned_s[-1] + 1.0 / clock.frame_rate_hz
+    return np.concatenate([
+        clock.start_s + before / clock.frame_rate_hz, planned_s, [beyond_s],
+        clock.start_s + after / clock.frame_rate_hz,
+    ])  # fmt: skip
 
 
-def pose_records(scene: Scene) -> Iterator[dict[str, Any]]:
+def true_poses(scene: Scene) -> Iterator[PoseTruth]:
     """Yield the true pose and velocity of every robot in the world, by time: lines of `poses.jsonl`."""
     from scipy.spatial.transform import Rotation
 
@@ -36,17 +55,15 @@ def pose_records(scene: Scene) -> Iterator[dict[str, Any]]:
         for name, robot in scene.document.robots.items():
             pose, velocity = robot_pose(robot, float(time_s)), robot_velocity(robot, float(time_s))
             still = np.zeros(3)
-            yield {
-                "format": 1,
-                "robot": name,
-                "time_s": float(time_s),
-                "position_m": pose.position_m.tolist(),
-                "quaternion_xyzw": Rotation.from_matrix(pose.rotation).as_quat(canonical=True).tolist(),
-                "velocity_m_per_s": (still if velocity is None else velocity.linear_m_per_s).tolist(),
-                "angular_velocity_rad_per_s": (
-                    still if velocity is None else velocity.angular_rad_per_s
-                ).tolist(),
-            }
+            quaternion = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
+            yield PoseTruth(
+                name,
+                float(time_s),
+                tuple(pose.position_m.tolist()),
+                tuple(quaternion.tolist()),
+                tuple((still if velocity is None else velocity.linear_m_per_s).tolist()),
+                tuple((still if velocity is None else velocity.angular_rad_per_s).tolist()),
+            )
 
 
 def odometry_of(scene: Scene, robot: str, seed: int) -> list[Odometry]:

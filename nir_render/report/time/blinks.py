@@ -1,20 +1,22 @@
 """The blink timeline: how bright each track was, which bits were sent, and what was read."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
-from nir_render.evaluate.messages import Reception
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.style import BAD, FAINT, GOOD, MATPLOTLIB, TRUTH
 from nir_render.report.time.lanes import Lane
 from nir_render.report.time.plots import COLOURS
+from nir_render.truth.sent import SentTruth
 from perception.messages.uart import Bits, encode
 from perception.types import Message, Signal
 
-_MOST_SHOWN = 8
+_MOST_SHOWN = 16
+_FEW = 8
 _LOW, _HIGH = -0.3, 1.7
 
 
@@ -22,7 +24,8 @@ def blink_plot(
     signals: Sequence[Signal],
     messages: Sequence[Message],
     lanes: Sequence[Lane],
-    receptions: Sequence[Reception],
+    sent: Sequence[SentTruth],
+    wrong: Sequence[Message] | None,
     name: str,
 ) -> Drawing | None:
     """Draw one strip a track: its levels, the bits of its messages, and those that its source sent.
@@ -33,33 +36,32 @@ def blink_plot(
         Of one observer, by one estimator.
     lanes
         Whom that estimator's tracks followed.
-    receptions
-        The packets that the observer could see.
+    sent
+        All packets, of whomever.
+    wrong
+        Which of the messages nobody sent; None where nobody knows what was sent.
 
     Returns
     -------
     None where no track has a signal.
     """
-    shown = sorted(signals, key=lambda signal: -signal.time_s.size)[:_MOST_SHOWN]
-    shown = sorted((signal for signal in shown if signal.time_s.size), key=lambda signal: signal.track)
+    spoke = Counter(message.track for message in messages)
+    there = [signal for signal in signals if signal.time_s.size]
+    there.sort(key=lambda signal: (-spoke[signal.track], -signal.time_s.size, signal.track))
+    shown = sorted(there[:_MOST_SHOWN], key=lambda signal: signal.track)
     if not shown:
         return None
     with mpl.rc_context(MATPLOTLIB):
-        figure = sheet(0.9 + 1.25 * len(shown))
+        figure = sheet(0.9 + (1.25 if len(shown) <= _FEW else 0.95) * len(shown))
         strips = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
         for axes, signal in zip(strips, shown, strict=True):
             lane = _followed(signal.track, lanes)
             _draw_level(axes, signal)
-            for reception in receptions:
-                packet = reception.sent
+            for packet in sent:
                 if lane is not None and lane.name == (packet.robot, packet.source, None):
                     _draw_bits(axes, encode(packet.word), packet.start_s, packet.end_s, 1.38, TRUTH)
             for message in (each for each in messages if each.track == signal.track):
-                right = any(
-                    reception.heard.get(name) is message or reception.heard.get(name) == message
-                    for reception in receptions
-                )
-                colour = (GOOD if right else BAD) if receptions else FAINT
+                colour = FAINT if wrong is None else BAD if message in wrong else GOOD
                 bits = encode(message.word, max(message.frames, 1))
                 _draw_bits(axes, bits, message.start_s, message.end_s, 1.12, colour)
                 text = f"{message.command} ({message.word})"
@@ -72,7 +74,9 @@ def blink_plot(
             axes.set_yticks([0.0, 1.0], ["dark", "lit"])
             follows = "nobody" if lane is None else lane.label
             axes.set_title(f"track {signal.track}: {follows}", fontsize=8, loc="left", color=FAINT, pad=2)
-        strips[-1].set_xlabel("time, s")
+        more = len(there) - len(shown)
+        left_out = f" ({more} tracks that said less, or lived for less, are not shown)" if more else ""
+        strips[-1].set_xlabel(f"time, s{left_out}")
         return Drawing(svg_of(figure), f"{name}: brightness of each track over time, bits sent and bits read")
 
 

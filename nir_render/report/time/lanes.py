@@ -1,6 +1,7 @@
 """One source over time, as one estimator's tracks followed it: what the plots of this room draw."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -8,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.evaluate.tracks import Moment, SourceName
+from nir_render.evaluate.presence import SourceName
+from nir_render.evaluate.tracks import Moment
 from perception.types import Track
 
 Values = NDArray[np.float64]
@@ -53,6 +55,10 @@ class Lane:
         across = np.linalg.norm(np.cross(self.said_m, self.place_m), axis=1)
         return np.asarray(np.degrees(np.arctan2(across, (self.said_m * self.place_m).sum(axis=1))))
 
+    def of_track(self, number: int) -> Values:
+        """Return the places that one track said, shape (n, 3), NaN where it did not follow."""
+        return np.where((self.track == number)[:, None], self.said_m, np.nan)
+
     def switches(self) -> list[int]:
         """Return the instants in which another track follows it than the last one that did."""
         found = np.flatnonzero(self.track >= 0)
@@ -60,14 +66,16 @@ class Lane:
 
 
 def lanes_of(moments: Sequence[Moment], observer: str, name: str) -> list[Lane]:
-    """Return the sources that an observer ever has to count, those most seen first."""
+    """Return the sources that an observer ever has to count, by name."""
     own = [moment for moment in moments if moment.robot == observer]
-    seen: dict[SourceName, int] = {}
-    for moment in own:
-        for one in moment.present:
-            seen[one.name] = seen.get(one.name, 0) + (one.life is not None)
-    names = sorted((source for source, count in seen.items() if count), key=lambda source: -seen[source])
-    return [_lane(own, source, name) for source in names]
+    names = {one.name for moment in own for one in moment.present if one.life is not None}
+    return [_lane(own, source, name) for source in sorted(names, key=_in_order)]
+
+
+def _in_order(source: SourceName) -> list[tuple[str, int]]:
+    """Return what sorts names as a person would: r2 before r10."""
+    parts = re.findall(r"(\D*)(\d*)", f"{source[0]}.{source[1]}")
+    return [(text, int(digits or -1)) for text, digits in parts]
 
 
 def spans(time_s: Values, where: Flags) -> list[tuple[float, float]]:

@@ -5,15 +5,16 @@ from collections.abc import Mapping, Sequence
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
 
 from nir_render.report.drawing import Drawing, legend, sheet, short, svg_of
-from nir_render.report.style import BAD, FAINT, INK, LINE, MATPLOTLIB, TRUTH, look
+from nir_render.report.style import BAD, FAINT, INK, LINE, MATPLOTLIB, PANEL, TRUTH, look
 from nir_render.report.time.lanes import Flags, Lane, Values, spans
 
 COLOURS = ("#70e000", "#ff9f1c", "#f72585", "#b392f0", "#ffd166", "#5e9bff", "#4dd6c1", "#ff8fab")
 """Of tracks, or of sources, in turn."""
 
-_MOST_LANES = 8
+_MOST_COLOURED = 4
 
 
 def above_plot(lanes: Mapping[str, Sequence[Lane]], observer: str) -> Drawing:
@@ -26,17 +27,22 @@ def above_plot(lanes: Mapping[str, Sequence[Lane]], observer: str) -> Drawing:
         for k, lane in enumerate(some):
             x, y = _page(_where(lane.place_m, lane.counts))
             axes.plot(x, y, color=TRUTH, linewidth=5.0, alpha=0.45, label="truth" if k == 0 else None)
-            last = int(np.flatnonzero(lane.counts)[-1])
-            at = (float(x[last]), float(y[last]))
-            axes.annotate(lane.label, at, (9, 9), textcoords="offset points", fontsize=8, color=TRUTH)
+            top = int(np.nanargmax(y))
+            text = axes.annotate(
+                _label(lane, some), (float(x[top]), float(y[top])), (0, 7), textcoords="offset points",
+                fontsize=8, color=TRUTH, ha="center", zorder=5,
+            )  # fmt: skip
+            text.set_path_effects([withStroke(linewidth=2.5, foreground=PANEL)])
         for name, own in lanes.items():
             colour = look(name, names).colour
-            for k, lane in enumerate(own):
-                x, y = _page(_where(lane.said_m, lane.track >= 0))
-                axes.plot(x, y, color=colour, linewidth=1.1, label=name if k == 0 else None)
-                x, y = _page(_where(lane.said_m, (lane.track >= 0) & ~lane.seen))
-                label = f"{name}: predicted, not seen" if k == 0 else None
-                axes.plot(x, y, ".", color=colour, markersize=3.0, alpha=0.8, label=label)
+            labels = iter((name,))
+            for lane in own:
+                for number in dict.fromkeys(lane.track[lane.track >= 0].tolist()):
+                    x, y = _page(lane.of_track(number))
+                    axes.plot(x, y, color=colour, linewidth=1.1, label=next(labels, None))
+                    x, y = _page(_where(lane.of_track(number), ~lane.seen))
+                    axes.plot(x, y, ".", color=colour, markersize=3.0, alpha=0.8)
+            axes.plot([], [], ".", color=colour, markersize=3.0, label=f"{name}: predicted, not seen")
         axes.plot(0.0, 0.0, "^", color=INK, markersize=9, label=f"{observer}, looking up the page")
         axes.margins(0.12)
         axes.set_aspect("equal", adjustable="datalim")
@@ -47,28 +53,17 @@ def above_plot(lanes: Mapping[str, Sequence[Lane]], observer: str) -> Drawing:
 
 
 def error_plot(lanes: Sequence[Lane], name: str) -> Drawing:
-    """Draw the errors of range and bearing over time, a colour a source, in bands of the claimed σ."""
+    """Draw the errors of range and bearing over time, and the claimed σ.
+
+    A colour and a band a source, where they are few; of many, each in grey and the RMS of all.
+    """
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(5.6)
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
-        errors: list[Values] = []
-        angles: list[Values] = []
-        for k, lane in enumerate(lanes[:_MOST_LANES]):
-            colour = COLOURS[k % len(COLOURS)]
-            sigma_m = lane.range_sigma_m
-            above.fill_between(
-                lane.time_s, -sigma_m, sigma_m, color=colour, alpha=0.10, linewidth=0,
-                label="claimed ±1 σ" if k == 0 else None,
-            )  # fmt: skip
-            held = lane.counts & (lane.track >= 0)
-            errors.append(_where(lane.range_error_m, held))
-            angles.append(_where(lane.bearing_error_deg, held))
-            above.plot(lane.time_s, errors[-1], color=colour, linewidth=1.1, label=lane.label)
-            below.plot(lane.time_s, angles[-1], color=colour, linewidth=1.1)
-            below.plot(
-                lane.time_s, lane.bearing_sigma_deg, color=colour, linewidth=0.9, linestyle=":",
-                label="claimed σ" if k == 0 else None,
-            )  # fmt: skip
+        held = [lane.counts & (lane.track >= 0) for lane in lanes]
+        errors = [_where(lane.range_error_m, where) for lane, where in zip(lanes, held, strict=True)]
+        angles = [_where(lane.bearing_error_deg, where) for lane, where in zip(lanes, held, strict=True)]
+        (_few if len(lanes) <= _MOST_COLOURED else _many)(lanes, held, (above, below), (errors, angles))
         above.axhline(0.0, color=FAINT, linewidth=0.7)
         reach_m = _reach(errors)
         above.set_ylim(-reach_m, reach_m)
@@ -76,9 +71,67 @@ def error_plot(lanes: Sequence[Lane], name: str) -> Drawing:
         above.set_ylabel("range error, m")
         below.set_ylabel("bearing error, °")
         below.set_xlabel("time, s")
-        legend(above)
-        legend(below)
+        handles, labels = above.get_legend_handles_labels()
+        shown = [short(label, 60) for label in labels]
+        figure.legend(handles, shown, loc="outside upper right", ncols=6, fontsize=8)
         return Drawing(svg_of(figure), f"{name}: errors of range and bearing of each source over time")
+
+
+_Both = tuple[Axes, Axes]
+
+
+def _few(lanes: Sequence[Lane], held: Sequence[Flags], axes: _Both, errors: tuple[list[Values], ...]) -> None:
+    for k, lane in enumerate(lanes):
+        colour = COLOURS[k % len(COLOURS)]
+        sigma_m, sigma_deg = (
+            _where(sigma, held[k]) for sigma in (lane.range_sigma_m, lane.bearing_sigma_deg)
+        )
+        axes[0].fill_between(lane.time_s, -sigma_m, sigma_m, color=colour, alpha=0.12, linewidth=0)
+        axes[0].plot(lane.time_s, errors[0][k], color=colour, linewidth=1.1, label=_label(lane, lanes))
+        axes[1].plot(lane.time_s, errors[1][k], color=colour, linewidth=1.1)
+        axes[1].plot(lane.time_s, sigma_deg, color=colour, linewidth=0.9, linestyle=":")
+    axes[0].fill_between([], [], color=FAINT, alpha=0.3, linewidth=0, label="claimed ±1 σ")
+    axes[0].plot([], [], color=FAINT, linewidth=0.9, linestyle=":", label="claimed σ of bearing")
+
+
+def _many(
+    lanes: Sequence[Lane], held: Sequence[Flags], axes: _Both, errors: tuple[list[Values], ...]
+) -> None:
+    claimed = (
+        [_where(lane.range_sigma_m, where) for lane, where in zip(lanes, held, strict=True)],
+        [_where(lane.bearing_sigma_deg, where) for lane, where in zip(lanes, held, strict=True)],
+    )
+    time_s = lanes[0].time_s
+    for part, off, sigma in zip(axes, errors, claimed, strict=True):
+        for values in off:
+            part.plot(time_s, values, color=FAINT, linewidth=0.6, alpha=0.45)
+        reach = _rms_of_all(sigma)
+        part.fill_between(
+            time_s, -reach, reach, color=TRUTH, alpha=0.22, linewidth=0,
+            label="±σ claimed, RMS of all sources",
+        )  # fmt: skip
+        part.plot(time_s, _rms_of_all(off), color=INK, linewidth=1.3, label="error, RMS of all sources")
+    axes[0].plot([], [], color=FAINT, linewidth=0.6, label=f"each of {len(lanes)} sources")
+
+
+def _rms_of_all(values: Sequence[Values]) -> Values:
+    """Return the root mean square over sources at each time, NaN where there is none."""
+    rows = np.array(values)
+    known = np.isfinite(rows)
+    count = known.sum(axis=0)
+    mean = np.divide(
+        (np.where(known, rows, 0.0) ** 2).sum(axis=0),
+        count,
+        out=np.full(rows.shape[1], np.nan),
+        where=count > 0,
+    )
+    return np.asarray(np.sqrt(mean))
+
+
+def _label(lane: Lane, others: Sequence[Lane]) -> str:
+    """Return what a source is called: its robot alone where that has no other."""
+    alone = sum(other.name[0] == lane.name[0] for other in others) == 1
+    return lane.name[0] if alone and lane.name[2] is None else lane.label
 
 
 def life_plot(lanes: Mapping[str, Sequence[Lane]]) -> Drawing:

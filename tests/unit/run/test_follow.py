@@ -61,6 +61,16 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_run_that_loses_every_frame_is_refused(tmp_path: Path) -> None:
+    rig = {"preset": "infra_swarm", "cameras": {"front": {"clock": {"dropped": 0.999}}}}
+    scene = parse_scene(
+        {"format": 1, "name": "lost", "observe": ["r1.front"], "robots": {"r1": {"rig": rig}}}
+    )
+    with pytest.raises(InputError, match="every frame of every camera is dropped"):
+        render_run(scene, tmp_path / "run", overwrite=False, progress=lambda *_: None)
+    assert not (tmp_path / "run").exists()
+
+
 def _perceived(rendered: Path, tmp_path: Path, own: OwnParts) -> tuple[Path, Any]:
     folder = tmp_path / "run"
     shutil.copytree(rendered, folder)
@@ -96,6 +106,8 @@ def test_a_tracker_and_a_decoder_of_ones_own_take_their_places(rendered: Path, t
     assert {line["track"] for line in _lines(folder / "tracks.robust.jsonl")} == {7}
     (message,) = _lines(folder / "messages.robust.jsonl")
     assert (message["robot"], message["track"], message["command"]) == ("r1", 7, "stop")
+    # A decoder of one's own is asked when the track has ended: with the last of the sets.
+    assert message["told_s"] == _lines(folder / "tracks.robust.jsonl")[-1]["time_s"]
 
 
 def test_a_tracker_that_fails_is_named_and_nothing_is_written(rendered: Path, tmp_path: Path) -> None:

@@ -85,6 +85,23 @@ def test_a_smooth_way_meets_its_waypoints_at_rest_where_it_holds() -> None:
     assert halfway.linear_m_per_s[1] == pytest.approx(1.5, rel=1e-5)
 
 
+def test_a_smooth_turn_comes_to_rest_too() -> None:
+    """A quarter turn in 2 s between two rests: yaw 90° (3 x² − 2 x³), its rate 0 at both ends, 67.5°/s midway."""
+    quarter = [
+        {"time": "1 s", "position": "[1, 0, 0] m"},
+        {"time": "3 s", "position": "[1, 0, 0] m", "orientation": {"yaw": "90 deg"}},
+    ]
+    robot = _scene({"between": "smooth", "motion": quarter}).document.robots["r2"]
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        ahead = robot_pose(robot, 1.0 + 2.0 * share).rotation @ AHEAD
+        yaw_deg = np.degrees(np.arctan2(ahead[1], ahead[0]))
+        assert yaw_deg == pytest.approx(90.0 * (3.0 * share**2 - 2.0 * share**3), abs=1e-4)
+    for time_s, rate_deg in ((1.001, 0.135), (2.0, 67.5), (2.999, 0.135)):
+        velocity = robot_velocity(robot, time_s)
+        assert velocity is not None
+        assert np.degrees(velocity.angular_rad_per_s[2]) == pytest.approx(rate_deg, rel=2e-3)
+
+
 ROWS = [(0.0, 0, 0, 0, 0, 0, 0, 1), (2.0, 1, 2, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5))]
 
 
@@ -103,6 +120,20 @@ def test_recorded_trajectories_are_read_and_interpolated(tmp_path: Path, kind: s
     np.testing.assert_allclose(robot_pose(scene.document.robots["r2"], 9.0).position_m, [1, 2, 0])
     again = parse_scene(yaml.safe_load(scene.resolved_yaml()))
     assert again.document == scene.document
+
+
+def test_a_recording_that_counts_from_1970_starts_when_the_scene_says(tmp_path: Path) -> None:
+    """Half a second after its start it is a quarter of the way through its 2 s, to 0.24 µs of its clock."""
+    rows = [(1.7e9 + row[0], *row[1:]) for row in ROWS]
+    (tmp_path / "way.tum").write_text("\n".join(" ".join(map(repr, map(float, row))) for row in rows))
+    path = {"type": "recorded", "file": "way.tum"}
+    scene = _scene({"path": {**path, "start": "3 s"}}, tmp_path)
+    np.testing.assert_allclose(
+        robot_pose(scene.document.robots["r2"], 3.5).position_m, [0.25, 0.5, 0.0], atol=1e-6
+    )
+    for given, told in (({}, "times since 1970"), ({"start": "0 s", "delay": "1 s"}, "'delay' or 'start'")):
+        with pytest.raises(InputError, match=told):
+            _scene({"path": {**path, **given}}, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +157,10 @@ def test_recorded_trajectories_are_read_and_interpolated(tmp_path: Path, kind: s
                 ]
             },
             "motion.1.speed: '1 m' is a length",
+        ),
+        (
+            {"motion": [{"time": "0 s"}, {"speed": "1 m/s", "position": "[1, 0, 0] m"}]},
+            "motion.1.speed: of the waypoint before it",
         ),
         (
             {

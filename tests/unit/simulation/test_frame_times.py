@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from nir_render.errors import InputError
 from nir_render.scene.scene import Scene, parse_scene
 from nir_render.simulation.clock import simulate
 from nir_render.simulation.frame_times import frame_times
@@ -40,6 +41,12 @@ def test_jitter_and_losses_are_as_wide_as_they_say() -> None:
     fewer = frame_times(_scene({"jitter": "0.1 ms", "dropped": 0.05}, 10), 1)["r1.front"]
     np.testing.assert_array_equal(fewer.time_s, times.time_s[:10])
     np.testing.assert_array_equal(fewer.dropped, times.dropped[:10])
+
+
+def test_jitter_that_could_turn_frames_round_is_refused() -> None:
+    """Two neighbours, 10 ms apart, are off by up to 3 σ towards each other: from 1.67 ms on they may meet."""
+    with pytest.raises(InputError, match=r"clock.jitter: 2 ms could take a frame before the one before it"):
+        _scene({"jitter": "2 ms"})
 
 
 def test_lost_frames_leave_gaps_and_stamps_are_true_times() -> None:

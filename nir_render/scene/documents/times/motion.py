@@ -20,7 +20,7 @@ from nir_render.scene.documents.base import (
     typed,
 )
 from nir_render.scene.documents.files import resolve_file
-from nir_render.scene.documents.times.recorded import trajectory_of
+from nir_render.scene.documents.times.recorded import scene_times_s, trajectory_of
 from nir_render.scene.text.units import (
     LENGTH,
     SPEED,
@@ -85,7 +85,8 @@ class Recorded(Document):
     """A trajectory from a file: CSV with the header `time_s,x_m,y_m,z_m,qx,qy,qz,qw`, or TUM's text.
 
     Between its rows positions lie on straight lines and orientations on the shortest turn (`straight`), or
-    both on cubic splines (`smooth`). Its times are the scene's, `delay` later.
+    both on cubic splines (`smooth`). Its times are the scene's, `delay` later; with `start` its first row is
+    at that time, whenever it was recorded.
     """
 
     example: ClassVar[str] = "{type: recorded, file: path.tum}"
@@ -94,6 +95,19 @@ class Recorded(Document):
     file: str
     between: Between = "straight"
     delay_s: Time = 0.0
+    start_s: Time | None = None
+
+    @model_validator(mode="after")
+    def _in_reach(self) -> Self:
+        first_s, *_ = scene_times_s(trajectory_of(self.file)[:, 0], self.delay_s, self.start_s)
+        if self.start_s is not None and self.delay_s:
+            raise ValueError("write either 'delay' or 'start', not both")
+        if abs(first_s) > TIME.most:
+            raise ValueError(
+                f"its first row is at {first_s:g} s, beyond the {TIME.most:g} s that are taken: times since "
+                "1970? Write such as 'start: 0 s', when in the scene it begins"
+            )
+        return self
 
     @field_validator("file")
     @classmethod
@@ -163,8 +177,12 @@ def _with_times(ways: list[Any]) -> list[Any]:
             raise ValueError(f"{place}: write either 'time' or 'speed', not both")
         if not isinstance(before, Mapping):
             raise ValueError(f"{place}: the first waypoint has none before it; give it a time, such as '0 s'")
-        left_s = parse_quantity(before.get("time"), TIME) + parse_quantity(before.get("hold", "0 s"), TIME)
-        ends = [parse_vector(one.get("position"), LENGTH, 3) for one in (before, way)]
+        try:
+            left_s = parse_quantity(before.get("time"), TIME)
+            left_s += parse_quantity("0 s" if before.get("hold") is None else before["hold"], TIME)
+            ends = [parse_vector(one.get("position"), LENGTH, 3) for one in (before, way)]
+        except ValueError as error:
+            raise ValueError(f"{place}: of the waypoint before it, or its own: {error}") from None
         arrival_s = left_s + math.dist(*ends) / _speed(way["speed"], place)
         others = {key: value for key, value in way.items() if key != "speed"}
         ways[index] = {"time": format_quantity(arrival_s, TIME), **others}

@@ -26,6 +26,11 @@ def trajectory_of(file: str) -> NDArray[np.float64]:
     return _read(file, state.st_mtime_ns, state.st_size)
 
 
+def scene_times_s(times_s: NDArray[np.float64], delay_s: float, start_s: float | None) -> NDArray[np.float64]:
+    """Return a trajectory's times in the scene: `delay_s` later, or the first of them at `start_s`."""
+    return times_s + delay_s if start_s is None else times_s - times_s[0] + start_s
+
+
 @lru_cache(maxsize=64)
 def _read(file: str, _changed_ns: int, size: int) -> NDArray[np.float64]:
     path = Path(file)
@@ -72,7 +77,7 @@ def _sound(numbered: list[tuple[int, list[float]]], name: str) -> NDArray[np.flo
         "its time is not after that of the row before": np.diff(rows[:, 0], prepend=-np.inf) <= 0.0,
         "its quaternion is not of length 1": np.abs(lengths - 1.0) > _UNIT_LENGTH,
         f"it lies beyond {LENGTH.most:g} m": (np.abs(rows[:, 1:4]) > LENGTH.most).any(axis=1),
-        f"its time is beyond {TIME.most:g} s": np.abs(rows[:, 0]) > TIME.most,
+        f"its time is more than {TIME.most:g} s after the first row's": rows[:, 0] - rows[0, 0] > TIME.most,
     }
     for problem, where in wrong.items():
         if where.any():

@@ -7,10 +7,13 @@ import pytest
 
 from nir_render.evaluate.metrics import evaluate
 from nir_render.evaluate.tracks import TrackEvaluation, evaluate_tracks
+from nir_render.report.style import BAD, FAINT, GOOD, TRUTH
+from nir_render.report.time.blinks import blink_plot
 from nir_render.report.time.film import film_gif, places_px
 from nir_render.report.time.lanes import Lane, lanes_of, spans
 from nir_render.report.time.section import Said, time_section
-from perception.types import Signal, Track
+from nir_render.truth.sent import SentTruth
+from perception.types import Message, Signal, Track
 from tests.unit.report.cases import calibration, frame, truth
 
 CAMERA = calibration()
@@ -68,6 +71,21 @@ def test_tracks_stand_where_the_lens_puts_them() -> None:
     assert place == pytest.approx([159.5 + 24.0, 119.5 - 48.0])
 
 
+@pytest.mark.parametrize(("wrong", "colour"), [(None, FAINT), ((), GOOD), ("all", BAD)])
+def test_what_was_read_has_the_colour_of_its_verdict(wrong: object, colour: str) -> None:
+    """What was sent is drawn also where the packet was not in view from beginning to end."""
+    at = np.linspace(0.0, 6.0, 60)
+    signal = Signal("r1", 7, at, np.full(60, 1e-3), np.ones(60), np.full(60, 0.05), np.full(60, 0.05))
+    message = Message("r1", 7, 0.2, 5.7, 10, "aggregate", 0.9999, 5)
+    sent = [SentTruth("r2", "top", 0.2, 5.7, 0, "stop")]
+    lanes = lanes_of(_scored().moments, "r1", "robust")
+    drawing = blink_plot([signal], [message], lanes, sent, [message] if wrong == "all" else wrong, "robust")  # type: ignore[arg-type]
+    assert drawing is not None
+    told = {shade for shade in (GOOD, BAD) if f"fill: {shade}" in drawing.svg}
+    assert told == {colour} - {FAINT}
+    assert f"fill: {TRUTH}" in drawing.svg
+
+
 def test_the_section_has_all_its_plots_and_the_film_moves() -> None:
     scored = _scored()
     result = evaluate(KEYS, [], {"r1.front": CAMERA}, {"robust": []})
@@ -78,10 +96,13 @@ def test_the_section_has_all_its_plots_and_the_film_moves() -> None:
                     np.array([0.05, 0.05, 0.05, np.inf]))  # fmt: skip
     section = time_section(result, Said({"robust": [signal]}, {}))
     assert section is not None
-    assert section.above is not None
-    assert section.lives is not None
-    assert list(section.errors) == list(section.blinks) == ["robust"]
-    assert section.numbers.rows[0][4] == "1"  # switches
+    (view,) = section.views
+    assert view.observer == "r1"
+    assert view.above is not None
+    assert view.lives is not None
+    assert list(view.errors) == list(view.blinks) == ["robust"]
+    assert section.tracks.rows[0][4] == "1"  # switches
+    assert section.messages is None
     film = film_gif(KEYS, scored.moments, "robust", lambda key: frame(*key), {"r1.front": CAMERA})
     assert film is not None
     assert film.startswith(b"GIF")
