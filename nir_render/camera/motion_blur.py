@@ -171,7 +171,7 @@ def _off_middle_s(drive: Drive, starts_s: Array, stretch_s: float) -> Array:
     parts_s = part_s * (np.arange(_PARTS) - 0.5 * (_PARTS - 1))
     levels = mean_level(drive, starts_s[:, None] + part_s * np.arange(_PARTS), part_s)
     lit = levels.sum(axis=1)
-    return np.divide(levels @ parts_s, lit, out=np.zeros_like(lit), where=lit > 0.0)
+    return np.asarray(np.divide(levels @ parts_s, lit, out=np.zeros_like(lit), where=lit > 0.0))
 
 
 def _carried(point_m: Array, pose: Pose, velocity: Velocity | None, offsets_s: Array) -> Array:
