@@ -6,11 +6,14 @@ Five robots, four of which drive, seen by the four cameras of the fifth, 1280 ×
 `--hall` between a floor and a wall whose light is interpolated (`render.indirect.error`). `--frames` counts
 all cameras' frames, of 1200 for 10 s; `whole_s` scales what was measured up to these, and adds what is done
 once (`once`: a first run of a frame per camera). Each number of frames runs in a process of its own, for its
-peak memory; a run of twice the frames tells whether that grows. `-P` keeps this folder off Python's path.
+peak memory. `growth_mib_per_1000_frames` is that of the memory held while rendering twice the frames, from
+the second quarter of them to the last: what comes once, as the first near robot, is not told from what goes
+on below some hundred frames. `-P` keeps this folder off Python's path.
 """
 
 import argparse
 import json
+import math
 import multiprocessing
 import resource
 import statistics
@@ -55,6 +58,27 @@ def document(sets: int, hall: bool) -> dict[str, Any]:
     return scene
 
 
+class _Held:
+    """The memory that the process holds after each frame, in MiB; none where the system does not tell."""
+
+    def __init__(self) -> None:
+        self.after_mib: list[float] = []
+
+    def note(self, _done: int, _of: int) -> None:
+        """Note it after a frame."""
+        pages = Path("/proc/self/statm")
+        if pages.exists():
+            self.after_mib.append(int(pages.read_text().split()[1]) * resource.getpagesize() / 2**20)
+
+    def growth_mib_per_1000(self) -> float:
+        """Return how much more is held in the last quarter of the frames than in the second, for 1000."""
+        quarter = len(self.after_mib) // 4
+        if quarter == 0:
+            return math.nan
+        second, last = self.after_mib[quarter : 2 * quarter], self.after_mib[-quarter:]
+        return 1000.0 * (statistics.mean(last) - statistics.mean(second)) / (2 * quarter)
+
+
 def spent(sets: int, hall: bool) -> dict[str, float]:
     """Return the seconds of each stage of a run, its peak memory, and what exposing one frame takes."""
     import nir_render as nr
@@ -64,11 +88,11 @@ def spent(sets: int, hall: bool) -> dict[str, float]:
     from nir_render.scene.scene import parse_scene
 
     scene = parse_scene(document(sets, hall))
-    seconds = {}
+    seconds, held = {}, _Held()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "run"
         stages: dict[str, Callable[[], object]] = {
-            "render_s": lambda: render_run(scene, folder, overwrite=False, progress=_silent),
+            "render_s": lambda: render_run(scene, folder, overwrite=False, progress=held.note),
             "perceive_s": lambda: perceive_run(
                 folder, estimators=chosen_estimators(["robust"]), progress=_silent
             ),
@@ -86,7 +110,8 @@ def spent(sets: int, hall: bool) -> dict[str, float]:
         started = time.perf_counter()
         nr.expose(light, scene, index=index)
         times_ms.append(1e3 * (time.perf_counter() - started))
-    return seconds | {"expose_ms": statistics.median(times_ms)}
+    growth_mib = held.growth_mib_per_1000()
+    return seconds | {"expose_ms": statistics.median(times_ms), "growth_mib_per_1000_frames": growth_mib}
 
 
 def _silent(_done: int, _of: int) -> None:
@@ -118,6 +143,7 @@ def main() -> None:
                 "frames": CAMERAS * sets,
                 "per_frame_ms": {name[:-2]: round(1e3 * value, 2) for name, value in per_frame_s.items()},
                 "whole_s": round(sum(once[name] + FRAMES * per_frame_s[name] for name in stages), 1),
+                "growth_mib_per_1000_frames": told["frames_2n"]["growth_mib_per_1000_frames"],
                 **told,
             }
         )

@@ -291,7 +291,7 @@ def _drawn_out(rates: Rates, exposure_s: float, time_s: float) -> dict[int, Wind
             continue
         drive = rates.drives[_drive_of_window(rates, row)]
         length_px = length_px if np.isfinite(length_px) else 0.0
-        chosen = instants(camera, drive, time_s, exposure_s, length_px)
+        chosen = instants(camera, drive, time_s, exposure_s, length_px, int(rates.centre_row[row]))
         if not chosen.weight_s.any():
             continue
         path = path_of(snapshot, light.camera, group, table, row, chosen.offset_s)

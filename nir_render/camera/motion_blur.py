@@ -3,7 +3,8 @@
 Over an exposure the pose of each robot goes on at the velocity that it has in the middle: straight on, and
 turning evenly. So the place of a source in the camera's axes is known at each instant, and what it brings is
 an integral over the exposure of images of known place and size, weighted with the drive: by Gauss's rule
-where the drive does not change, else a sum over short stretches of time, the mean of the drive in each exact.
+where the drive does not change, else a sum over short stretches of time, with the mean of the drive in each
+exact, and the flare where it is at the mean time of that light.
 What is hidden, and what a mirror or the fog leaves, is as at mid-exposure. The flare of a ghost moves as its
 source's image does in a mirror that stands still.
 
@@ -37,6 +38,7 @@ STILL_PX = 0.01
 
 _LEAST_STRETCHES, _MOST_STRETCHES = 8, 256
 _STRETCH_PX = 0.2
+_PARTS = 64
 _NODE_PX, _MOST_NODES = 0.75, 64
 
 
@@ -146,12 +148,16 @@ class Instants:
     weight_s: Array
 
 
-def instants(camera: Camera, drive: Drive, time_s: float, exposure_s: float, length_px: float) -> Instants:
+def instants(
+    camera: Camera, drive: Drive, time_s: float, exposure_s: float, length_px: float, row: int
+) -> Instants:
     """Return the instants of an exposure in which a flare goes so far, row 0 beginning at a time.
 
     Where the drive does not change in it they are those of Gauss and Legendre, enough for a path over a point
-    spread of 0.5 px and more; else the middles of even stretches, with the exact mean of the drive in each.
-    What parasitic light adds while a row waits to be read counts to the last one.
+    spread of 0.5 px and more; else one in each of even stretches, with the exact mean of the drive there: the
+    mean time of the light that a row of pixels, the flare's, collects in it. Its middle would be an eighth of
+    the stretch off where the drive changes in it. What parasitic light adds while a row waits to be read
+    counts to the last one.
     """
     count = min(max(_LEAST_STRETCHES, math.ceil(length_px / _STRETCH_PX)), _MOST_STRETCHES)
     stretch_s = exposure_s / count
@@ -161,10 +167,21 @@ def instants(camera: Camera, drive: Drive, time_s: float, exposure_s: float, len
         nodes, weights = legendre(min(2 + math.ceil(length_px / _NODE_PX), _MOST_NODES))
         offset_s, weight_s = 0.5 * exposure_s * nodes, 0.5 * exposure_s * weights[:, None] * levels[0]
     else:
-        offset_s, weight_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5), stretch_s * levels
+        middles_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
+        offset_s = middles_s + _off_middle_s(drive, starts_s[:, row], stretch_s)
+        weight_s = stretch_s * levels
     waiting = row_profile(camera, drive, time_s, exposure_s) - on_fractions(camera, drive, time_s, exposure_s)
     weight_s[-1] += exposure_s * waiting
     return Instants(offset_s, weight_s)
+
+
+def _off_middle_s(drive: Drive, starts_s: Array, stretch_s: float) -> Array:
+    """Return how long after its middle the mean time of a stretch's light is, shape (n,); 0 in the dark."""
+    part_s = stretch_s / _PARTS
+    parts_s = part_s * (np.arange(_PARTS) - 0.5 * (_PARTS - 1))
+    levels = mean_level(drive, starts_s[:, None] + part_s * np.arange(_PARTS), part_s)
+    lit = levels.sum(axis=1)
+    return np.asarray(np.divide(levels @ parts_s, lit, out=np.zeros_like(lit), where=lit > 0.0))
 
 
 def _carried(point_m: Array, pose: Pose, velocity: Velocity | None, offsets_s: Array) -> Array:

@@ -1,7 +1,7 @@
 """A scene: the document of a scene file, checked, and the world that it describes at any time."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,15 @@ class Scene:
     """A scene, read and checked.
 
     `document` holds everything in SI units; `raw` is the document as written, with includes and overrides
-    but before presets; `folder` is where file names in it count from; `path` names it in errors.
+    but before presets; `folder` is where file names in it count from; `path` names it in errors. `kept` is
+    the world at the time that was asked for last: cameras look at one time by turns.
     """
 
     document: SceneDocument
     raw: Mapping[str, Any]
     folder: Path
     path: str
+    kept: dict[float, Snapshot] = field(init=False, default_factory=dict, repr=False)
 
     def with_(self, overrides: Mapping[str, Any]) -> "Scene":
         """Return a copy changed at dotted paths.
@@ -87,6 +89,14 @@ class Scene:
         >>> list(world.robots), world.groups
         (['r1', 'r2'], ('r1.top', 'r2.top'))
         """
+        world = self.kept.get(time_s)
+        if world is None:
+            world = self._at(time_s)
+            self.kept.clear()
+            self.kept[time_s] = world
+        return world
+
+    def _at(self, time_s: float) -> Snapshot:
         document = self.document
         return Snapshot(
             time_s=time_s,

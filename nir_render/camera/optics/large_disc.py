@@ -34,6 +34,7 @@ _TAIL_SIGMAS = 8.0
 _LEAST_REACH_PX = 40  # of the kernel that spreads the inside, where the core reaches less far
 _TILE_PX = 96
 _CHUNK = 1 << 22
+_BAND_ROWS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +86,8 @@ def image_of_large_disc(lens: Intrinsics, core: Core, disc: Disc) -> tuple[Array
     if not split.cut:
         inside *= (disc.total - power.sum()) / inside.sum()
     seen = np.all((places_px > -0.5 - reach_px) & (places_px < _size(lens) - 0.5 + reach_px), axis=1)
+    if not (seen.any() or inside.any()):  # of what shines in nearly from the side
+        return np.empty((0, 0)), 0, 0
     image = np.zeros((lens.height_px, lens.width_px))
     if core.gaussian_px is None:
         _add_waves(image, core, places_px[seen], power[seen])
@@ -151,7 +154,14 @@ def _edge(lens: Intrinsics, disc: Disc, split: _Split) -> tuple[Array, Array]:
 
 def _inside(lens: Intrinsics, disc: Disc, split: _Split) -> Array:
     """Return what the inside gives per pixel, at the middles of the split's rows and columns."""
-    u_px, v_px = (np.arange(float(first), float(last)) for first, last in (split.columns, split.rows))
+    tops = range(*split.rows, _BAND_ROWS)
+    bands = [(top, min(top + _BAND_ROWS, split.rows[1])) for top in tops]
+    return np.concatenate([_band(lens, disc, split, rows) for rows in bands])
+
+
+def _band(lens: Intrinsics, disc: Disc, split: _Split, rows: tuple[int, int]) -> Array:
+    """Return `_inside` of the rows from the first to before the last: all at once take 100 MiB."""
+    u_px, v_px = (np.arange(float(first), float(last)) for first, last in (split.columns, rows))
     direction = lens.unproject(np.stack(np.meshgrid(u_px, v_px), axis=-1))
     chord = np.linalg.norm(direction - disc.direction, axis=-1)
     angle_rad = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))

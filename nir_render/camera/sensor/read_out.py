@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from nir_render.camera.sensor.well import bloom_into, read_from_well
 from nir_render.randomness import RandomKey
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.sensor import Sensor
+from perception.compiled import compiled
 
 Floats = NDArray[np.float32]
 
@@ -106,16 +108,43 @@ def _charge(
     block: int,
 ) -> Floats:
     """Return the electrons that light and heat release in the pixels of a block of rows."""
-    mean = np.minimum(expected_e, _BRIGHTEST_E).astype(np.float32)
-    if pattern.response is not None:
-        mean *= pattern.response[part]
-    mean += np.float32(sensor.dark_rate_e_per_s * exposure_s)
-    if pattern.hot_e_per_s is not None:
-        mean += pattern.hot_e_per_s[part] * np.float32(exposure_s)
-    flat = mean.ravel()
-    large = key.words("shot", block, flat.size + flat.size % 2)
-    small = key.words("few", block, flat.size) if flat.min(initial=0.0) < EXPANSION_MEAN else None
-    return poisson(flat, large, small).reshape(mean.shape)
+    mean = _mean_charge(
+        expected_e.ravel(),
+        _flat(pattern.response, part),
+        _flat(pattern.hot_e_per_s, part),
+        np.float32(sensor.dark_rate_e_per_s * exposure_s),
+        np.float32(exposure_s),
+    )
+    some_large, some_small = mean.max(initial=0.0) >= EXPANSION_MEAN, mean.min(initial=0.0) < EXPANSION_MEAN
+    large = key.words("shot", block, mean.size + mean.size % 2) if some_large else None
+    small = key.words("few", block, mean.size) if some_small else None
+    return poisson(mean, large, small).reshape(expected_e.shape)
+
+
+def _flat(pattern: Floats | None, part: slice) -> Floats:
+    """Return a part of a pattern in one row; an empty one where all pixels are alike."""
+    return np.empty(0, dtype=np.float32) if pattern is None else pattern[part].ravel()
+
+
+@compiled
+def _mean_charge(
+    expected_e: NDArray[Any],
+    response: Floats,
+    hot_e_per_s: Floats,
+    dark_e: np.float32,
+    exposure_s: np.float32,
+) -> Floats:
+    """Return the electrons of pixels of a response, their own dark current added, shape (n,)."""
+    mean_e = np.empty(len(expected_e), dtype=np.float32)
+    for pixel in range(len(expected_e)):
+        released_e = np.float32(min(expected_e[pixel], _BRIGHTEST_E))
+        if len(response) > 0:
+            released_e *= response[pixel]
+        released_e += dark_e
+        if len(hot_e_per_s) > 0:
+            released_e += hot_e_per_s[pixel] * exposure_s
+        mean_e[pixel] = released_e
+    return mean_e
 
 
 def _digitised(
@@ -128,18 +157,41 @@ def _digitised(
     block: int,
 ) -> NDArray[np.uint16]:
     """Return the counts of the charge of a block of rows."""
-    signal = read_from_well(charge_e, sensor)
-    if sensor.read_noise_e > 0.0:
-        noise = normal(key.words("read", block, signal.size + signal.size % 2))[: signal.size]
-        noise *= np.float32(sensor.read_noise_e)
-        signal += noise.reshape(signal.shape)
-    if pattern.offset_e is not None:
-        signal += pattern.offset_e[part]
-    signal *= np.float32(sensor.system_gain_dn_per_e * gain)
-    signal += np.float32(sensor.black_level_dn)
-    np.rint(signal, out=signal)
-    np.clip(signal, 0, sensor.full_scale_dn, out=signal)
-    return signal.astype(np.uint16)
+    signal_e = read_from_well(charge_e, sensor).ravel()
+    noisy = sensor.read_noise_e > 0.0
+    words = key.words("read", block, signal_e.size + signal_e.size % 2) if noisy else np.empty(0, np.uint32)
+    return _converted(
+        signal_e,
+        normal(words),
+        np.float32(sensor.read_noise_e),
+        _flat(pattern.offset_e, part),
+        np.float32(sensor.system_gain_dn_per_e * gain),
+        np.float32(sensor.black_level_dn),
+        np.float32(sensor.full_scale_dn),
+    ).reshape(charge_e.shape)
+
+
+@compiled
+def _converted(
+    signal_e: Floats,
+    noise: Floats,
+    read_noise_e: np.float32,
+    offset_e: Floats,
+    gain_dn_per_e: np.float32,
+    black_level_dn: np.float32,
+    full_scale_dn: np.float32,
+) -> NDArray[np.uint16]:
+    """Return the counts of what is read of the wells, with noise and offsets if there are any, shape (n,)."""
+    counts_dn = np.empty(len(signal_e), dtype=np.uint16)
+    for pixel in range(len(signal_e)):
+        read_e = signal_e[pixel]
+        if len(noise) > 0:
+            read_e += noise[pixel] * read_noise_e
+        if len(offset_e) > 0:
+            read_e += offset_e[pixel]
+        read_dn = np.rint(read_e * gain_dn_per_e + black_level_dn)
+        counts_dn[pixel] = np.uint16(min(max(read_dn, np.float32(0.0)), full_scale_dn))
+    return counts_dn
 
 
 def quantise(electrons: NDArray[np.float64], sensor: Sensor) -> NDArray[np.uint16]:

@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
+
 Floats = NDArray[np.float32]
 Words = NDArray[np.uint32]
 
 # From this mean on the expansion holds: it shifts 1.1e-5 of the probability, and less beyond.
 EXPANSION_MEAN = 16.0
-_FEW = 0.25
 _SOME = 0.2
+_TOGETHER = 64  # pixels that are counted side by side, as vectors
 _RARE = 1.0 - 2.0**-12
+# Short of 1 by far more than float32 rounds off a uniform variate or an exponential function.
+_SURE = np.float32(1.0 - 2.0**-20)
+_UNIT = np.float32(2.0**-32)
 
 
 def normal(words: Words) -> Floats:
@@ -96,41 +101,63 @@ def small_poisson(mean: Floats, words: Words) -> Floats:
     In float32, which misplaces 1e-6 of the probability; the uppermost 2⁻¹² of the words, where that would
     show, in float64. Nothing rarer than 2⁻³³ happens.
     """
-    uniform = words.astype(np.float32)
-    uniform *= np.float32(2.0**-32)
-    rare = np.flatnonzero(words >= np.uint32(_RARE * 2.0**32))
-    drawn = _counted(mean, np.minimum(uniform, np.float32(_RARE), out=uniform))
-    drawn[rare] = _counted(mean[rare].astype(np.float64), (words[rare] + 0.5) * 2.0**-32)
-    return drawn.astype(np.float32)
+    drawn = np.zeros(len(mean), dtype=np.float32)
+    unsure = _not_surely_dark(mean, words)
+    rate, word = mean[unsure], words[unsure]
+    uniform = np.minimum(word.astype(np.float32) * _UNIT, np.float32(_RARE))
+    drawn[unsure] = _counted(rate, np.exp(-rate), uniform, np.float32(1.0))
+    rare = unsure[word >= np.uint32(_RARE * 2.0**32)]
+    rate_of_rare = mean[rare].astype(np.float64)
+    drawn[rare] = _counted(
+        rate_of_rare, np.exp(-rate_of_rare), (words[rare] + 0.5) * 2.0**-32, np.float64(1.0)
+    )
+    return drawn
 
 
-def _counted(rate: NDArray[Any], uniform: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the smallest counts whose cumulated probability reaches the uniform variates, shape (n,)."""
-    probability = np.exp(-rate)
-    total = probability.copy()
-    drawn = np.zeros(rate.shape, dtype=np.uint8)
-    left: NDArray[np.int64] | None = None  # of the few that are not done; all until then
-    count = 0
-    while True:
-        above = uniform > total
-        remaining = int(np.count_nonzero(above))
-        if remaining == 0:
-            return drawn
-        if left is not None or remaining < _FEW * len(uniform):
-            keep = np.flatnonzero(above)
-            left = keep if left is None else left[keep]
-            uniform, rate, probability, total = uniform[keep], rate[keep], probability[keep], total[keep]
-        count += 1
-        if left is None:
-            drawn += above.view(np.uint8)
-        else:
-            drawn[left] = count
-        probability *= rate
-        probability *= rate.dtype.type(1.0 / count)
-        total += probability
+@compiled
+def _not_surely_dark(mean: Floats, words: Words) -> NDArray[np.int64]:
+    """Return the places whose uniform variate is not below 1 − λ, which is below the chance e^−λ of none."""
+    places = np.empty(len(mean), dtype=np.int64)
+    found = 0
+    for place in range(len(mean)):
+        places[found] = place
+        found += not np.float32(words[place]) * _UNIT < _SURE - mean[place]
+    return places[:found]
 
 
-def poisson(mean: Floats, large: Words, small: Words | None) -> Floats:
+@compiled
+def _counted(
+    rate: NDArray[Any], none: NDArray[Any], uniform: NDArray[Any], one: np.floating[Any]
+) -> NDArray[Any]:
+    """Return the smallest counts whose cumulated probability reaches the uniform variates, shape (n,).
+
+    `none` is the probability of 0; all are of the type of `one`, and so is what is reckoned with.
+    """
+    drawn = np.empty_like(rate)
+    probability, total = np.empty(_TOGETHER, dtype=rate.dtype), np.empty(_TOGETHER, dtype=rate.dtype)
+    counts = np.empty(_TOGETHER, dtype=np.int32)
+    for first in range(0, len(rate), _TOGETHER):
+        rates, uniforms = rate[first : first + _TOGETHER], uniform[first : first + _TOGETHER]
+        size = len(rates)
+        for place in range(size):
+            probability[place] = total[place] = none[first + place]
+            counts[place] = 0
+        count, left = one, np.int32(1)
+        while left > 0:
+            inverse, left = one / count, np.int32(0)
+            for place in range(size):
+                more = np.int32(uniforms[place] > total[place])
+                left += more
+                counts[place] += more
+                probability[place] = probability[place] * rates[place] * inverse
+                total[place] += probability[place]
+            count += one
+        for place in range(size):
+            drawn[first + place] = counts[place]
+    return drawn
+
+
+def poisson(mean: Floats, large: Words | None, small: Words | None) -> Floats:
     """Return Poisson variates, float32, shape (n,).
 
     Parameters
@@ -138,14 +165,15 @@ def poisson(mean: Floats, large: Words, small: Words | None) -> Floats:
     mean
         Not negative, shape (n,).
     large, small
-        Random words, shape (n + n % 2,) and (n,); `small` may be None where no mean is below
-        `EXPANSION_MEAN`.
+        Random words, shape (n + n % 2,) and (n,): `large` may be None where all means are below
+        `EXPANSION_MEAN`, `small` where none is.
     """
     if small is None:
+        assert large is not None
         return large_poisson(mean, normal(large)[: len(mean)])
-    low = mean < EXPANSION_MEAN
-    if low.all():
+    if large is None:
         return small_poisson(mean, small)
+    low = mean < EXPANSION_MEAN
     high = np.flatnonzero(~low)
     if len(high) < _SOME * len(mean):  # a frame's flares: the others need no normal variates
         drawn = np.empty(len(mean), dtype=np.float32)

@@ -13,11 +13,13 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 import perception
+from nir_render import camera
 from perception.compiled import _with_constants
 from perception.types import RawFrame
 from tests.unit.perception.simulation import calibration, random
 
 MODULES = [info.name for info in pkgutil.walk_packages(perception.__path__, "perception.")]
+CAMERA_MODULES = [info.name for info in pkgutil.walk_packages(camera.__path__, f"{camera.__name__}.")]
 
 DETECT = """
 import json
@@ -62,8 +64,8 @@ def test_after_warming_up_no_frame_waits_for_the_compiler() -> None:
     perception.warm_up()
     known = sum(len(function.signatures) for function in _functions())
     counts = np.frombuffer(random(72).poisson(80.0, (96, 128)).astype(np.uint16).tobytes(), np.uint16)
-    camera = calibration(width_px=128, height_px=96, cx_px=60.0, cy_px=50.0)
-    plain = replace(camera, psf_sigma_px=1, prnu=0, response_angle_rad=[0, 1.1], response_relative=[1, 1])  # type: ignore[arg-type]
+    rich = calibration(width_px=128, height_px=96, cx_px=60.0, cy_px=50.0)
+    plain = replace(rich, psf_sigma_px=1, prnu=0, response_angle_rad=[0, 1.1], response_relative=[1, 1])  # type: ignore[arg-type]
     for data in (
         counts.reshape(96, 128),
         counts.reshape(96, 128)[::-1],
@@ -73,8 +75,8 @@ def test_after_warming_up_no_frame_waits_for_the_compiler() -> None:
         brighter[40:44, 60:64] += 900
         brighter.setflags(write=False)
         for shown in (data, brighter):
-            for one in (camera, plain):
-                perception.detect(RawFrame(camera.camera, 0, 0.0, 1e-3, shown, 64.0), one)
+            for one in (rich, plain):
+                perception.detect(RawFrame(rich.camera, 0, 0.0, 1e-3, shown, 64.0), one)
     assert sum(len(function.signatures) for function in _functions()) == known
 
 
@@ -91,7 +93,7 @@ def test_constants_of_other_files_tell_compiled_functions_apart() -> None:
     assert contents[0] == contents[1] != contents[2]
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", [*MODULES, *CAMERA_MODULES])
 def test_compiled_functions_call_those_of_their_own_file(name: str) -> None:
     """What is kept of a function on disk does not know when another file changes."""
     functions = [
