@@ -258,14 +258,13 @@ def _show_estimate(
 
 def _show_evaluation(result: "Evaluation", folder: Path, as_json: bool) -> None:
     from nir_render.command.console import print_json
-    from nir_render.command.tables import print_table, range_table, summary_table, time_table
+    from nir_render.command.tables import print_table, range_table, summary_table, time_tables
 
     if as_json:
         print_json(result.summary)
         return
     print_table(range_table(result))
     print_table(summary_table(result.summary))
-    over_time = time_table(result.summary)
-    if over_time is not None:
-        print_table(over_time)
+    for table in time_tables(result.summary):
+        print_table(table)
     typer.echo(f"{folder}: frames, truth, detections, summary.json, preview.png")

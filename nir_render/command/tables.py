@@ -57,23 +57,30 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
     return _filled(table, columns, summary["estimators"])
 
 
-def time_table(summary: Mapping[str, Any]) -> Table | None:
-    """Return a table of tracks and messages; None where there are none."""
+def time_tables(summary: Mapping[str, Any]) -> list[Table]:
+    """Return a table of tracks where there are any, and one of messages where packets were sent."""
     followed = {name: numbers for name, numbers in summary["estimators"].items() if "track_hota" in numbers}
-    if not followed:
-        return None
-    columns = {
+    tracks = {
         "track_hota": ("HOTA", "{:.3f}"),
+        "track_idf1": ("IDF1", "{:.3f}"),
         "track_switches": ("switches", "{}"),
         "tracks": ("tracks", "{}"),
         "track_position_rmse_m": ("place RMSE\nm", "{:.4f}"),
         "track_state_nees": ("NEES\n(honest: 1)", "{:.2f}"),
-        "message_sent": ("packets\nsent", "{}"),
-        "message_received": ("re-\nceived", "{}"),
+    }
+    messages = {
+        "message_sent": ("sent", "{}"),
+        "message_received": ("received", "{}"),
         "message_wrong": ("wrong", "{}"),
+        "message_missed": ("missed", "{}"),
         "message_latency_median_s": ("latency\ns", "{:.2f}"),
     }
-    return _filled(Table(title="Over time: tracks and messages", title_justify="left"), columns, followed)
+    tables = []
+    if followed:
+        tables.append(_filled(Table(title="Over time: tracks", title_justify="left"), tracks, followed))
+    if any(numbers.get("message_sent") for numbers in followed.values()):
+        tables.append(_filled(Table(title="Messages", title_justify="left"), messages, followed))
+    return tables
 
 
 def _filled(
