@@ -14,11 +14,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import perception
 from perception.messages.decoder import Decoder, decode
-from perception.messages.lattice import ROWS, Clocks, Lattice, add_samples
+from perception.messages.lattice import Clocks, Lattice
 from perception.messages.pair import decode_pair
 from perception.messages.paper import decode_paper
-from perception.messages.samples import likelihood_of_levels, usable_samples
+from perception.messages.samples import ROWS, add_samples, usable_samples
 from perception.messages.settings import DecoderSettings
 from perception.types import Signal
 from tests.unit.perception.messages.signals import (
@@ -47,7 +48,7 @@ def most_likely(signal: Signal, sent: Sent, settings: DecoderSettings, told: boo
     origin_s = float(samples.time_s[0]) - 10 * clocks.step_s
     size = int((samples.time_s[-1] - origin_s) / clocks.step_s) + clocks.longest + 20
     table = np.zeros((ROWS, size))
-    add_samples(table, samples, likelihood_of_levels(samples, 1.0), origin_s, clocks.step_s)
+    add_samples(table, samples, 1.0, np.zeros((1, len(samples))), origin_s, clocks.step_s)
     start = (sent.start_s - origin_s) / clocks.step_s
     steps = np.array([round(start)]) if told else np.arange(np.ceil(start - 4), np.floor(start + 4) + 1)
     rates = np.arange(len(clocks.drifts))
@@ -216,6 +217,7 @@ def pairs(runs: int) -> dict[str, Any]:
 
 def speed() -> dict[str, float]:
     """Milliseconds of one core for each set of 20 tracks that all send without a pause, in real time."""
+    perception.warm_up()
     rows = {}
     for fps in (30.0, 100.0):
         rng = random(818, int(fps))

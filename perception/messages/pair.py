@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.messages.lattice import ROWS, STEPS_PER_BIT, Clocks, Lattice, add_samples
-from perception.messages.samples import Samples, log_density, usable_samples
+from perception.messages.lattice import STEPS_PER_BIT, Clocks, Lattice
+from perception.messages.samples import ROWS, Samples, add_samples, log_likelihood, usable_samples
 from perception.messages.settings import DecoderSettings
 from perception.messages.uart import encode, meaning, packet_levels
 from perception.types import Message, Signal
@@ -187,25 +187,22 @@ class _PairReader:
 
     def _lattice(self, number: int, other: Array, amplitudes: Array) -> Lattice:
         """Return the scores of a source's packets; `other` are the shares that the other may send, (m, n)."""
-
-        def score(share: Array) -> Array:
-            ways = other.reshape(len(other), *(1,) * (share.ndim - 1), other.shape[1])
-            return _log_mean(self._density(amplitudes[number] * share + amplitudes[1 - number] * ways))
-
         table = np.zeros((ROWS, self._size))
-        add_samples(table, self._samples, score, self._origin_s, self._clocks.step_s)
+        others = amplitudes[1 - number] * np.broadcast_to(other, (len(other), len(self._samples)))
+        add_samples(table, self._samples, amplitudes[number], others, self._origin_s, self._clocks.step_s)
         return Lattice(table, self._clocks)
 
     def _density(self, level: Array) -> Array:
         """Return the log-density of the samples at levels of the sum, shape (..., n)."""
-        return log_density(self._samples.level - level, self._variance(level))
+        return log_likelihood(self._samples, level)
 
     def _scored(self, lattice: Lattice, starts: NDArray[np.int64]) -> tuple[Indices, Indices, Array]:
         """Return starts, rates and word scores of all packets that begin at `starts`."""
         steps, rates = (each.ravel() for each in np.meshgrid(starts, np.arange(len(self._clocks.drifts))))
-        asked = lattice.promising(steps, rates)
+        floor = np.full(len(steps), -np.inf)
+        asked = lattice.best_words(steps, rates, floor)[1] > -np.inf
         steps, rates = steps[asked], rates[asked]
-        return steps, rates, lattice.words(steps, rates).astype(float)
+        return steps, rates, lattice.words(steps, rates)
 
     def _tops(self, lattice: Lattice) -> list[_Packet]:
         """Return the best packets, of each start and word only the best of its neighbours."""
@@ -302,9 +299,3 @@ def _alike(one: _Packet | None, other: _Packet | None) -> bool:
     if one is None or other is None:
         return one is other
     return one.word == other.word and abs(one.start - other.start) <= _NEAR
-
-
-def _log_mean(logs: Array) -> Array:
-    """Return the logarithm of the mean over the first axis."""
-    top = logs.max(axis=0)
-    return np.asarray(top + np.log(np.exp(logs - top).mean(axis=0)))
