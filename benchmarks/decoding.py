@@ -129,9 +129,9 @@ def packets(runs: int, settings: DecoderSettings, drops: float = 0.0) -> dict[st
 
 def inside(runs: int) -> dict[str, Any]:
     """Decode recordings that start inside a packet, all words in turn, at A/σ 4 to 100; they end anywhere."""
-    rng = random(814)
     right = wrong = 0
     for run in range(runs):
+        rng = random(814, run)
         sent = Sent(run % 128, 0.0, rng.uniform(-0.015, 0.015))
         end_s = sent.end_s + rng.choice([-0.5, 0.0, 0.3, 1.2, 2.5])
         begin_s = rng.uniform(0.01, min(5.4, end_s - 0.5))
@@ -146,9 +146,9 @@ def merges(runs: int) -> dict[str, Any]:
     """Two sources that send, whose light falls together for a while, told to the decoder or not."""
     rows = {}
     for told in (True, False):
-        rng = random(815, told)
         right = wrong = 0
         for run in range(runs):
+            rng = random(815, told, run)
             sent = any_packet(rng, run % 128)
             other = any_packet(rng, int(rng.integers(128)), start_s=rng.uniform(-4.0, 6.0))
             times_s = frame_times(rng, 0.0, sent.end_s + 1.5, 30.0, 0.0)
@@ -188,9 +188,9 @@ def pairs(runs: int) -> dict[str, Any]:
     """Two sources in one pixel, the weaker at 8 σ, clocks 0.5 % apart, one up to a packet later."""
     rows = {}
     for ratio in (0.98, 0.9, 0.7, 0.5, 0.2):
-        rng = random(817, round(100 * ratio))
         both = said_who = wrong_who = wrong = 0
-        for _ in range(runs):
+        for run in range(runs):
+            rng = random(817, round(100 * ratio), run)
             words = [int(word) for word in rng.integers(128, size=2)]
             drift = rng.uniform(-0.01, 0.01)
             first = Sent(words[0], 2.0 + rng.uniform(0.0, 0.1), drift + 0.0025)
