@@ -14,11 +14,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import perception
 from perception.messages.decoder import Decoder, decode
-from perception.messages.lattice import ROWS, Clocks, Lattice, add_samples
+from perception.messages.lattice import Clocks, Lattice
 from perception.messages.pair import decode_pair
 from perception.messages.paper import decode_paper
-from perception.messages.samples import likelihood_of_levels, usable_samples
+from perception.messages.samples import ROWS, add_samples, usable_samples
 from perception.messages.settings import DecoderSettings
 from perception.types import Signal
 from tests.unit.perception.messages.signals import (
@@ -47,7 +48,7 @@ def most_likely(signal: Signal, sent: Sent, settings: DecoderSettings, told: boo
     origin_s = float(samples.time_s[0]) - 10 * clocks.step_s
     size = int((samples.time_s[-1] - origin_s) / clocks.step_s) + clocks.longest + 20
     table = np.zeros((ROWS, size))
-    add_samples(table, samples, likelihood_of_levels(samples, 1.0), origin_s, clocks.step_s)
+    add_samples(table, samples, 1.0, np.zeros((1, len(samples))), origin_s, clocks.step_s)
     start = (sent.start_s - origin_s) / clocks.step_s
     steps = np.array([round(start)]) if told else np.arange(np.ceil(start - 4), np.floor(start + 4) + 1)
     rates = np.arange(len(clocks.drifts))
@@ -128,9 +129,9 @@ def packets(runs: int, settings: DecoderSettings, drops: float = 0.0) -> dict[st
 
 def inside(runs: int) -> dict[str, Any]:
     """Decode recordings that start inside a packet, all words in turn, at A/σ 4 to 100; they end anywhere."""
-    rng = random(814)
     right = wrong = 0
     for run in range(runs):
+        rng = random(814, run)
         sent = Sent(run % 128, 0.0, rng.uniform(-0.015, 0.015))
         end_s = sent.end_s + rng.choice([-0.5, 0.0, 0.3, 1.2, 2.5])
         begin_s = rng.uniform(0.01, min(5.4, end_s - 0.5))
@@ -145,9 +146,9 @@ def merges(runs: int) -> dict[str, Any]:
     """Two sources that send, whose light falls together for a while, told to the decoder or not."""
     rows = {}
     for told in (True, False):
-        rng = random(815, told)
         right = wrong = 0
         for run in range(runs):
+            rng = random(815, told, run)
             sent = any_packet(rng, run % 128)
             other = any_packet(rng, int(rng.integers(128)), start_s=rng.uniform(-4.0, 6.0))
             times_s = frame_times(rng, 0.0, sent.end_s + 1.5, 30.0, 0.0)
@@ -187,9 +188,9 @@ def pairs(runs: int) -> dict[str, Any]:
     """Two sources in one pixel, the weaker at 8 σ, clocks 0.5 % apart, one up to a packet later."""
     rows = {}
     for ratio in (0.98, 0.9, 0.7, 0.5, 0.2):
-        rng = random(817, round(100 * ratio))
         both = said_who = wrong_who = wrong = 0
-        for _ in range(runs):
+        for run in range(runs):
+            rng = random(817, round(100 * ratio), run)
             words = [int(word) for word in rng.integers(128, size=2)]
             drift = rng.uniform(-0.01, 0.01)
             first = Sent(words[0], 2.0 + rng.uniform(0.0, 0.1), drift + 0.0025)
@@ -216,6 +217,7 @@ def pairs(runs: int) -> dict[str, Any]:
 
 def speed() -> dict[str, float]:
     """Milliseconds of one core for each set of 20 tracks that all send without a pause, in real time."""
+    perception.warm_up()
     rows = {}
     for fps in (30.0, 100.0):
         rng = random(818, int(fps))

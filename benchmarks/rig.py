@@ -15,8 +15,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from perception.rig.measure_set import measure_set
-from perception.rig.warm_up import warm_up
 from perception.types import Detection, SetMeasurements
+from perception.warm_up import warm_up
 from tests.unit.perception.rig.world import Array, detection, frame_without_pixels, rig
 from tests.unit.perception.simulation import random
 

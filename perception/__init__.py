@@ -75,7 +75,6 @@ from perception.paper import PaperRegression, regress_paper_range_constant
 from perception.pipeline import Heard, Pipeline
 from perception.rig.frame_sets import frame_sets
 from perception.rig.measure_set import detect_set, measure_set
-from perception.rig.warm_up import warm_up
 from perception.track.tracker import Tracker
 from perception.types import (
     Calibration,
@@ -89,6 +88,7 @@ from perception.types import (
     Signal,
     Track,
 )
+from perception.warm_up import warm_up
 
 __all__ = [
     "ESTIMATORS",

@@ -14,15 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.messages.lattice import (
-    ROWS,
-    STEPS_PER_BIT,
-    Clocks,
-    Lattice,
-    add_samples,
-    moved_on,
-)
-from perception.messages.samples import LevelScale, likelihood_of_levels, usable_samples
+from perception.messages.lattice import STEPS_PER_BIT, Clocks, Lattice, moved_on
+from perception.messages.samples import ROWS, LevelScale, add_samples, usable_samples
 from perception.messages.settings import DecoderSettings
 from perception.messages.uart import IDLE_BITS, aliases, meaning
 from perception.types import Message, Signal
@@ -39,6 +32,8 @@ _WORTH_ASKING = 15.0  # log-likelihood over idle from which a packet is looked i
 _GARBAGE = float(np.log(1e-3))  # log-probability that what starts is no packet
 _LIKELY = 7.0  # a packet's clocks are those whose log-probability is not this far below the best one's
 _CONTRADICTS = 25.0  # log-likelihood of another word in one frame: another's light fell in with its own
+_INTRUDED = 14.0  # the same of any levels in a stretch of bits: an undisturbed packet shows it once in 2·10⁴
+_NEGLIGIBLE = 35.0  # log-probability below another explanation from which one is left out
 _KEPT = 3  # packets that are looked into of those that end in a block
 _NEIGHBOURS = 6  # steps to either side that count as the same packet
 _FORGET_S = 12.0  # a gap after which a signal starts anew
@@ -100,7 +95,8 @@ class Decoder:
         """Take in samples of the track, later than those before; return the messages that they complete."""
         columns = (signal.time_s, signal.exposure_s, signal.level, signal.sigma_dark, signal.sigma_lit)
         rows = np.array(columns, float)
-        if rows.shape[1] == 1 and 0.0 < rows[0, 0] - self._last_s <= _FORGET_S:
+        since = rows[0] - np.append(self._last_s, rows[0, :-1])
+        if ((since > 0.0) & (since <= _FORGET_S)).all():
             return tuple(self._take(rows))  # as it is in a stream, and quicker
         messages: list[Message] = []
         while rows.shape[1]:
@@ -168,8 +164,8 @@ class Decoder:
         time_s, exposure_s, level, dark, lit = rows[:, now]
         samples = usable_samples(time_s, exposure_s, level, dark, lit, self._settings)
         if len(samples):
-            score = likelihood_of_levels(samples, self._scale.learn(samples))
-            add_samples(self._table, samples, score, self._step_s(0), self._clocks.step_s)
+            amplitude, alone = self._scale.learn(samples), np.zeros((1, len(samples)))
+            add_samples(self._table, samples, amplitude, alone, self._step_s(0), self._clocks.step_s)
 
     def _recurse(self, lattice: Lattice) -> None:
         """Go on with the probability of idle at each step, and note the best packet that ends there."""
@@ -177,12 +173,13 @@ class Decoder:
         rates = np.repeat(np.arange(len(self._idle)), _BLOCK)
         starts = (ends - self._clocks.lengths[:, None]).ravel()
         before = self._before[rates, starts]
-        ended = before + self._log_garbage + lattice.garbage(starts, rates)
+        garbage = self._log_garbage + lattice.garbage(starts, rates)
+        ended = before + garbage
         if self._dark_in_reach():
-            asked = np.flatnonzero(lattice.promising(starts, rates))
-            words = lattice.words(starts[asked], rates[asked])
-            ended[asked] = np.logaddexp(ended[asked], before[asked] + self._log_start + _log_sum(words))
-            self._note_best(words, before[asked], starts[asked], rates[asked])
+            floor = np.maximum(garbage, self._idle[rates] - before) - self._log_start - _NEGLIGIBLE
+            total, tops, columns = lattice.best_words(starts, rates, floor)
+            ended = np.logaddexp(ended, before + self._log_start + total)
+            self._note_best(tops, columns, before, starts, rates)
         ended = ended.reshape(-1, _BLOCK)
         idle = np.logaddexp.accumulate(np.concatenate([self._idle[:, None], ended], axis=1), axis=1)
         self._before[:, ends] = idle[:, 1:]
@@ -193,16 +190,17 @@ class Decoder:
         first = self._complete - _BLOCK - self._clocks.longest
         return float(np.maximum(self._table[0, first:], 0.0).sum()) > _WORTH_ASKING
 
-    def _note_best(self, words: Floats, before: Array, starts: Numbers, rates: Numbers) -> None:
+    def _note_best(
+        self, tops: Array, columns: Numbers, before: Array, starts: Numbers, rates: Numbers
+    ) -> None:
         """Keep the best packets that may have been sent, of neighbours the best."""
-        tops = words.max(axis=1, initial=-np.inf)
         worthy = (tops > _WORTH_ASKING) & (starts + self._done + _MARGIN >= self._spoken_until)
         score = np.where(worthy, tops + before, -np.inf)
         for _ in range(_KEPT):
-            row = int(np.argmax(score)) if len(score) else 0
-            if not len(score) or score[row] == -np.inf:
+            row = int(np.argmax(score))
+            if score[row] == -np.inf:
                 break
-            start, column = int(starts[row]) + self._done, int(np.argmax(words[row]))
+            start, column = int(starts[row]) + self._done, int(columns[row])
             found = _Candidate(float(score[row]), start, int(rates[row]), column)
             score[np.abs(starts - starts[row]) <= STEPS_PER_BIT] = -np.inf
             same = [
@@ -236,6 +234,12 @@ class Decoder:
     def _message(self, one: _Candidate, lattice: Lattice) -> Message | None:
         """Return a packet as a message if its probability is high enough."""
         here = one.start - self._done
+        if lattice.contradiction(here, one.rate, one.column) > _CONTRADICTS:
+            return None
+        if lattice.intrusion(here, one.rate, one.column) > _INTRUDED:
+            return None
+        if not self._phase_known(one, lattice):
+            return None
         shift = np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
         # On other clocks the same packet is where the middle of what was seen of it stays.
         unseen = min(max(self._begin_at - self._done - here, 0), int(self._clocks.lengths[one.rate]))
@@ -246,11 +250,7 @@ class Decoder:
         over = starts + self._clocks.lengths[rates] <= self._complete
         starts, rates = starts[over], rates[over]
         ends = starts + self._clocks.lengths[rates]
-        if not self._phase_known(one, lattice):
-            return None
-        if lattice.contradiction(here, one.rate, one.column) > _CONTRADICTS:
-            return None
-        score = lattice.words(starts, rates)[:, one.column]
+        score = lattice.word(starts, rates, one.column)
         log = self._before[rates, starts] + score + self._log_start
         # What is under way on the packet's own clocks refuses most that is refused.
         own = np.zeros(len(self._idle), bool)
@@ -311,9 +311,8 @@ class Decoder:
         going = starts + self._clocks.lengths[rates] > self._complete
         starts, rates = starts[going], rates[going]
         log = lattice.garbage(starts, rates) + self._log_garbage
-        likely = np.flatnonzero(lattice.promising(starts, rates))
-        words = _log_sum(lattice.words(starts[likely], rates[likely])) + self._log_start
-        log[likely] = np.logaddexp(log[likely], words)
+        total, _, _ = lattice.best_words(starts, rates, log - self._log_start - _NEGLIGIBLE)
+        log = np.logaddexp(log, total + self._log_start)
         self._under_way[rates, starts - first] = log + self._before[rates, starts]
 
     def _after(self, rates: Numbers, ends: Numbers) -> Array:

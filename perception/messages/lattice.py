@@ -1,16 +1,19 @@
-"""Scores of whole packets over a lattice of starts and clock rates, as matrix products.
+"""Scores of whole packets over a lattice of starts and clock rates.
 
 Time is cut in steps of an eighth of a bit. All scores are log-likelihoods over those of a source that is lit
 throughout: bits outside a packet then count nothing, and packets anywhere can be compared. Between two edges
 of a packet lie bits whose samples are wholly dark or lit; samples near an edge, whose exposure it cuts or may
-cut, are scored by the levels on both its sides. Summed over the repeats, eleven dark bits and eleven edges
-are all that the score of any word is made of: a row of 44 numbers times one column for each word.
+cut, are scored by the levels on both its sides. Summed over the repeats, each of eleven bits has four scores,
+by itself and the bit before it: the score of any word is the sum of eleven of these 44.
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.messages.samples import LevelLikelihood, Samples
+from perception.compiled import compiled
+from perception.messages.samples import BEGUN, DARK, ENDED, FALL, FOREIGN, GARBAGE, RISE, SEEN
 from perception.messages.settings import DecoderSettings
 from perception.messages.uart import FRAME_BITS, IDLE_BITS, frames_of_words
 
@@ -19,15 +22,10 @@ Numbers = NDArray[np.int64]
 
 STEPS_PER_BIT = 8
 _RATES = 11  # clock rates from −drift to +drift: neighbours part by 1.3 steps over a packet
-# Where an edge may lie about its step, in steps, and how probably: the lattice rounds start, rate and edge.
-_JITTER = np.array([-0.9, -0.35, 0.0, 0.35, 0.9])
-_LOG_JITTER = np.log([0.1, 0.25, 0.3, 0.25, 0.1])
-_GARBAGE_LEVELS = np.linspace(0.0, 1.0, 5)[:, None]
-_ENDED, _BEGUN, _DARK, _RISE, _FALL, _GARBAGE, _SEEN = range(7)
-_SUMMED = [_ENDED, _BEGUN, _GARBAGE, _SEEN]
-ROWS = 7
+_SUMMED = [ENDED, BEGUN, GARBAGE, FOREIGN, SEEN]
 _HOPELESS = 6.0  # log-likelihood for lit against dark that tells
 _DARK_BIT = 3.0  # and for dark against lit
+_NEGLIGIBLE = 30.0  # log-likelihood below the best from which what is summed does not count
 
 
 class Clocks:
@@ -44,62 +42,21 @@ class Clocks:
         self.lengths: Numbers = self.edges[:, -1]
         self.idle: Numbers = np.ceil(STEPS_PER_BIT * IDLE_BITS * (1.0 + self.drifts)).astype(np.int64)
         self.longest = int(self.lengths.max())
-        self.templates = _templates(settings.words)
+        self.ways = _ways(settings.words)
 
 
-def _templates(words: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return for each word which of the 44 numbers count, shape (44, words)."""
-    bits = frames_of_words()[list(words)].T == 1
-    before = np.roll(bits, 1, axis=0)
-    counts = np.stack([~bits, ~before & ~bits, ~before & bits, before & ~bits], axis=1)
-    return counts.reshape(4 * FRAME_BITS, len(words)).astype(np.float32)
-
-
-def add_samples(
-    table: Array, samples: Samples, score: LevelLikelihood, origin_s: float, step_s: float
-) -> None:
-    """Add samples to a table of shape (7, steps), whose step 0 is at `origin_s`.
-
-    Its rows hold, for an edge at each step: the scores for dark of the samples that end before it and after
-    the step before; of those that begin; and of the samples that it may cut, their scores with dark on both
-    sides, dark before and lit after, lit before and dark after; the score for being anything, and how many.
-    """
-    size = table.shape[1]
-    lit = score(np.ones(len(samples)))
-    dark = score(np.zeros(len(samples))) - lit
-    garbage = np.log(np.exp(score(_GARBAGE_LEVELS) - lit).mean(axis=0))
-    middle = (samples.time_s - origin_s) / step_s
-    half = 0.5 * samples.exposure_s / step_s
-    begun = np.floor(middle - half - 1.0).astype(np.int64) + 1  # the first edge that may cut it
-    ended = np.ceil(middle + half + 1.0).astype(np.int64)  # the first one after it
-    table[_ENDED] += np.bincount(ended, dark, size)[:size]
-    table[_BEGUN] += np.bincount(begun, dark, size)[:size]
-    table[_GARBAGE] += np.bincount(ended, garbage, size)[:size]
-    table[_SEEN] += np.bincount(middle.astype(np.int64), minlength=size)[:size]
-    for further in range(int((ended - begun).max(initial=0))):
-        edge = begun + further
-        cut = edge < ended
-        place = np.add.outer(_JITTER, edge - middle + half) / (2.0 * half)
-        before = np.clip(place, 0.0, 1.0)
-        fall = np.where(cut, _over_jitter(score(before)) - lit, 0.0)
-        rise = np.where(cut, _over_jitter(score(1.0 - before)) - lit, 0.0)
-        table[_DARK] += np.bincount(edge, np.where(cut, dark, 0.0), size)[:size]
-        table[_RISE] += np.bincount(edge, rise, size)[:size]
-        table[_FALL] += np.bincount(edge, fall, size)[:size]
+def _ways(words: tuple[int, ...]) -> Numbers:
+    """Return for each word which of the 44 scores its bits have, shape (words, 11)."""
+    bits = frames_of_words()[list(words)].astype(np.int64)
+    return 4 * np.arange(FRAME_BITS) + 2 * np.roll(bits, 1, axis=1) + bits
 
 
 def moved_on(table: Array, steps: int) -> None:
     """Move a table's window on: its first steps are dropped, as many empty ones follow."""
-    open_score = table[_ENDED, :steps].sum() - table[_BEGUN, :steps].sum()
+    open_score = table[ENDED, :steps].sum() - table[BEGUN, :steps].sum()
     table[:, :-steps] = table[:, steps:]
     table[:, -steps:] = 0.0
-    table[_ENDED, 0] += open_score  # of samples that began before the window and end within it
-
-
-def _over_jitter(logs: Array) -> Array:
-    weighted = logs + _LOG_JITTER[:, None]
-    top = weighted.max(axis=0)
-    return np.asarray(top + np.log(np.exp(weighted - top).sum(axis=0)))
+    table[ENDED, 0] += open_score  # of samples that began before the window and end within it
 
 
 class Lattice:
@@ -111,33 +68,41 @@ class Lattice:
     def __init__(self, table: Array, clocks: Clocks) -> None:
         self._clocks = clocks
         self._sums = np.cumsum(table[_SUMMED], axis=1)
-        ended, begun, self._garbage, self._seen = self._sums
-        edges = [ended, begun, table[_DARK], table[_RISE], table[_FALL]]
-        self._by_edge = np.stack(edges, axis=1).astype(np.float32)
+        ended, begun, self._garbage, self._foreign, self._seen = self._sums
+        self._by_edge = np.ascontiguousarray(np.stack([ended, begun, *table[[DARK, RISE, FALL]]]).T)
         self._repeats = np.arange(0, clocks.edges.shape[1] - 1, FRAME_BITS)
 
-    def promising(self, starts: Numbers, rates: Numbers) -> NDArray[np.bool_]:
-        """Return which packets' start bits are not plainly lit, shape (n,)."""
-        edges = self._clocks.edges[rates]
-        begin = starts[:, None] + edges[:, self._repeats]
-        end = starts[:, None] + edges[:, self._repeats + 1]
-        return np.asarray((self._sums[0].take(end) - self._sums[1].take(begin)).sum(axis=1) > -_HOPELESS)
+    def best_words(self, starts: Numbers, rates: Numbers, floor: Array) -> tuple[Array, Array, Numbers]:
+        """Return the log of the sum over all words, the best word's score, and its column, shape (n,) each.
 
-    def words(self, starts: Numbers, rates: Numbers) -> NDArray[np.float32]:
+        Minus infinity where start bits are plainly lit, or no word can reach `floor`.
+        """
+        return _best_words(self._by_edge, self._clocks.edges, self._clocks.ways, starts, rates, floor)
+
+    def words(self, starts: Numbers, rates: Numbers) -> Array:
         """Return the scores of all words, shape (n, words)."""
-        by_edge = self._by_edge.take(starts[:, None] + self._clocks.edges[rates], axis=0)
-        shape = (len(starts), len(self._repeats), FRAME_BITS)
-        row = by_edge[:, :-1, 1:].reshape(*shape, 4).sum(axis=1)
-        row[:, :, 0] = by_edge[:, 1:, 0].reshape(shape).sum(axis=1) - row[:, :, 0]
-        return np.asarray(row.reshape(-1, 4 * FRAME_BITS) @ self._clocks.templates)
+        return _words(self._by_edge, self._clocks.edges, self._clocks.ways, starts, rates)
+
+    def word(self, starts: Numbers, rates: Numbers, column: int) -> Array:
+        """Return the scores of one word, shape (n,)."""
+        one = self._clocks.ways[column : column + 1]
+        return _words(self._by_edge, self._clocks.edges, one, starts, rates)[:, 0]
 
     def contradiction(self, start: int, rate: int, column: int) -> float:
         """Return by how much another word explains one of a packet's frames better, for the worst of them."""
-        by_edge = self._by_edge[start + self._clocks.edges[rate]]
-        row = by_edge[:-1, 1:].copy()
-        row[:, 0] = by_edge[1:, 0] - row[:, 0]
-        words = row.reshape(len(self._repeats), -1) @ self._clocks.templates
+        frames = self._clocks.edges[rate][self._repeats[:, None] + np.arange(FRAME_BITS + 1)]
+        every = np.arange(len(frames))
+        words = _words(self._by_edge, frames, self._clocks.ways, np.full(len(frames), start), every)
         return float((words.max(axis=1) - words[:, column]).max())
+
+    def intrusion(self, start: int, rate: int, column: int) -> float:
+        """Return how much better any levels explain some stretch of a packet's bits than its word does.
+
+        A ratio of likelihoods over the best of n stretches: of a packet that lies undisturbed it exceeds x
+        with a probability of less than n exp(−x) (Ville's inequality, from each beginning on).
+        """
+        ways = self._clocks.ways[column]
+        return _intrusion(self._by_edge, self._foreign, self._clocks.edges[rate], ways, start)
 
     def garbage(self, starts: Numbers, rates: Numbers) -> Array:
         """Return the score of a stretch as long as a packet in which anything goes, shape (n,)."""
@@ -159,3 +124,96 @@ class Lattice:
         dark = self._sums[0][edges[1:]] - self._sums[1][edges[:-1]]
         seen = np.diff(self._seen[edges]) > 0
         return bool(seen.sum() >= IDLE_BITS - 2 and dark.max() < _DARK_BIT and dark.sum() < -_HOPELESS)
+
+
+@compiled
+def _promising(by_edge: Array, edges: Numbers, start: int, rate: int) -> bool:
+    """Return whether a packet's start bits are not plainly lit."""
+    dark = 0.0
+    for bit in range(0, edges.shape[1] - 1, FRAME_BITS):
+        dark += by_edge[start + edges[rate, bit + 1], 0] - by_edge[start + edges[rate, bit], 1]
+    return dark > -_HOPELESS
+
+
+@compiled
+def _bits(scores: Array, by_edge: Array, edges: Numbers, start: int, rate: int) -> None:
+    """Find the scores of a packet's bits: dark after dark, lit after dark, dark after lit, lit after lit."""
+    scores[:] = 0.0
+    for bit in range(edges.shape[1] - 1):
+        edge, after = start + edges[rate, bit], start + edges[rate, bit + 1]
+        dark = by_edge[after, 0] - by_edge[edge, 1]
+        place = 4 * (bit % FRAME_BITS)
+        scores[place] += dark + by_edge[edge, 2]
+        scores[place + 1] += by_edge[edge, 3]
+        scores[place + 2] += dark + by_edge[edge, 4]
+
+
+@compiled
+def _limit(scores: Array) -> float:
+    """Return the score of the best frame, parity not asked for."""
+    dark, lit = scores[2], -np.inf
+    for place in range(4, 4 * (FRAME_BITS - 2), 4):
+        was = dark
+        dark = max(was + scores[place], lit + scores[place + 2])
+        lit = max(was + scores[place + 1], lit + scores[place + 3])
+    return float(max(dark + scores[4 * (FRAME_BITS - 2) + 1], lit))
+
+
+@compiled
+def _score(scores: Array, ways: Numbers, word: int) -> float:
+    total = 0.0
+    for bit in range(FRAME_BITS):
+        total += scores[ways[word, bit]]
+    return total
+
+
+@compiled
+def _words(by_edge: Array, edges: Numbers, ways: Numbers, starts: Numbers, rates: Numbers) -> Array:
+    found = np.empty((starts.shape[0], ways.shape[0]))
+    scores = np.empty(4 * FRAME_BITS)
+    for n in range(starts.shape[0]):
+        _bits(scores, by_edge, edges, starts[n], rates[n])
+        for word in range(ways.shape[0]):
+            found[n, word] = _score(scores, ways, word)
+    return found
+
+
+@compiled
+def _intrusion(by_edge: Array, foreign: Array, edges: Numbers, ways: Numbers, start: int) -> float:
+    most = since = 0.0
+    for bit in range(edges.shape[0] - 1):
+        edge, after = start + edges[bit], start + edges[bit + 1]
+        way = ways[bit % FRAME_BITS] % 4  # twice the bit before, and the bit
+        score = 0.0
+        if way % 2 == 0:
+            score = by_edge[after, 0] - by_edge[edge, 1]
+        if way < 3:
+            score += by_edge[edge, 2 + (way if way < 2 else 2)]
+        since = max(since + foreign[after] - foreign[edge] - score, 0.0)
+        most = max(most, since)
+    return most
+
+
+@compiled
+def _best_words(
+    by_edge: Array, edges: Numbers, ways: Numbers, starts: Numbers, rates: Numbers, floor: Array
+) -> tuple[Array, Array, Numbers]:
+    total, top = np.full(starts.shape[0], -np.inf), np.full(starts.shape[0], -np.inf)
+    column = np.zeros(starts.shape[0], np.int64)
+    scores, words = np.empty(4 * FRAME_BITS), np.empty(ways.shape[0])
+    for n in range(starts.shape[0]):
+        if not _promising(by_edge, edges, starts[n], rates[n]):
+            continue
+        _bits(scores, by_edge, edges, starts[n], rates[n])
+        if _limit(scores) < floor[n]:
+            continue
+        for word in range(ways.shape[0]):
+            words[word] = _score(scores, ways, word)
+            if words[word] > top[n]:
+                top[n], column[n] = words[word], word
+        weight = 0.0
+        for word in range(ways.shape[0]):
+            if words[word] > top[n] - _NEGLIGIBLE:
+                weight += math.exp(words[word] - top[n])
+        total[n] = top[n] + math.log(weight)
+    return total, top, column

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.messages.lattice import ROWS, STEPS_PER_BIT, Clocks, Lattice, add_samples
-from perception.messages.samples import Samples, log_density, usable_samples
+from perception.messages.lattice import STEPS_PER_BIT, Clocks, Lattice
+from perception.messages.samples import ROWS, Samples, add_samples, log_likelihood, usable_samples
 from perception.messages.settings import DecoderSettings
-from perception.messages.uart import encode, meaning, packet_levels
+from perception.messages.uart import FRAME_BITS, encode, frames_of_words, meaning, packet_levels
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]
@@ -27,6 +27,11 @@ _LOOKED_AT = 20000  # best scores of starts, rates and words among which these a
 _TRIED = 10  # packets of each source that are tried as a beginning
 _TURNS = 4
 _WORTH = 15.0  # log-likelihood over idle that a packet needs
+_COARSE = -50.0  # and where it is looked over coarsely
+_NEGLIGIBLE = -20.0  # log-likelihood over idle of words that are not counted
+_TURNED_OVER = 3  # best pairs of which other words are tried
+_OTHERS = 8  # pairs of other words that are tried where two packets lie
+_RIVALS = 40.0  # log-likelihood below the best of them
 _SHIFTS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # of a packet's edges, in steps: they are known to a step
 _LATE = np.linspace(-1.0, 1.0, 9)  # steps by which a start is moved, and by how much the drift,
 _DRIFTS = np.linspace(-2e-3, 2e-3, 9)  # about the packet's middle
@@ -42,11 +47,14 @@ class _Packet:
     word: int
 
 
+_Packets = tuple[_Packet | None, _Packet | None]
+
+
 @dataclass(frozen=True)
 class _Pair:
     """What both sources sent (None: nothing), with amplitudes, and how well that explains the samples."""
 
-    packets: tuple[_Packet | None, _Packet | None]
+    packets: _Packets
     amplitudes: Array
     score: float
     confidence: tuple[float, float] = (0.0, 0.0)
@@ -126,10 +134,15 @@ class _PairReader:
     def best(self) -> _Pair | None:
         """Return the pair that explains the samples best; None where nothing was sent."""
         either = np.array([0.0, 1.0, 1.0, 1.0])[:, None]  # lit more often than dark
-        found: list[_Pair] = []
+        ways: list[_Packets] = []
         for number in (0, 1):
             lattice = self._lattice(number, either, self._amplitudes)
-            found += [self._settled(number, packet) for packet in self._tops(lattice)]
+            for packet in self._tops(lattice):
+                _add_new(ways, self._in_turn(number, packet))
+        found = sorted(map(self._settled, ways), key=lambda pair: -pair.score)
+        tried = [pair.packets for pair in found]
+        for pair in found[:_TURNED_OVER]:
+            found += [self._settled(way) for way in self._other_words(pair) if _add_new(tried, way)]
         if not found:
             return None
         best = max(found, key=lambda pair: pair.score)
@@ -139,8 +152,17 @@ class _PairReader:
     def _share_of_word(self, pair: _Pair, number: int) -> float:
         """Return the probability of a source's word among all it may have sent, given the other's."""
         lattice = self._lattice(number, self._shifted(pair.packets[1 - number]), pair.amplitudes)
-        packet, share = self._read(lattice, None)
-        return share if _alike(packet, pair.packets[number]) else 0.0
+        steps, rates = self._grid(self._starts(), 1)
+        total, top, columns = lattice.best_words(steps, rates, np.full(len(steps), _NEGLIGIBLE))
+        best, said = int(np.argmax(top)), pair.packets[number]
+        if said is None or top[best] < _WORTH:
+            return float(said is None and top[best] < _WORTH)
+        if self._settings.words[columns[best]] != said.word or abs(steps[best] - said.start) > _NEAR:
+            return 0.0
+        near = np.abs(steps - steps[best]) <= _NEAR
+        word = lattice.word(steps[near], rates[near], int(columns[best]))
+        share = np.exp(word - top[best]).sum() / (np.exp(total - top[best]).sum() + np.exp(-top[best]))
+        return min(float(share), 1.0)
 
     def log_odds_of_who(self, pair: _Pair) -> float:
         """Return the log-odds of who said which against the other way round, over the amplitudes."""
@@ -150,17 +172,22 @@ class _PairReader:
         weight = (np.abs(self._samples.level - level) < 6.0 * np.sqrt(variance)) / variance
         return self._evidence(shares, weight) - self._evidence(shares[::-1], weight)
 
-    def _settled(self, number: int, packet: _Packet) -> _Pair:
+    def _in_turn(self, number: int, packet: _Packet) -> _Packets:
         """Read the two sources in turn from a packet of one on."""
         packets: list[_Packet | None] = [None, None]
         packets[number] = packet
         amplitudes = self._amplitudes
         for turn in range(_TURNS):
             other = 1 - number if turn % 2 == 0 else number
-            given = packets[1 - other]
-            lattice = self._lattice(other, self._shifted(given), amplitudes)
-            packets[other] = self._read(lattice, packets[other] if turn >= _TURNS // 2 else None)[0]
+            lattice = self._lattice(other, self._shifted(packets[1 - other]), amplitudes)
+            packets[other] = self._read(lattice, packets[other] if turn >= _TURNS // 2 else None)
             amplitudes = self._fitted(packets)
+        return packets[0], packets[1]
+
+    def _settled(self, way: _Packets) -> _Pair:
+        """Return two packets with starts, drifts and amplitudes fitted, and how well they explain all."""
+        packets = list(way)
+        amplitudes = self._fitted(packets)
         for _ in range(2):
             for one in (0, 1):
                 packets[one] = self._polished(packets, one, amplitudes)
@@ -170,46 +197,67 @@ class _PairReader:
         score -= 0.5 * float((((amplitudes - self._amplitudes) / self._sigmas) ** 2).sum())
         return _Pair((packets[0], packets[1]), amplitudes, score)
 
+    def _other_words(self, pair: _Pair) -> list[_Packets]:
+        """Return the best other words of two packets as they lie: all pairs at once, by least squares.
+
+        Where the two amplitudes are alike, a bit more of one and a bit less of the other look alike too, and
+        no reading in turn finds from one of these pairs to the other.
+        """
+        first, second = pair.packets
+        if first is None or second is None:
+            return []
+        every = np.ones(len(self._samples))
+        weight = 1.0 / self._variance(
+            pair.amplitudes @ np.stack([self._share(one, 0.0) for one in pair.packets])
+        )
+        # The light that each bit takes away where it is dark, summed over the repeats: shape (11, n) each.
+        taken = [
+            amplitude * (every - self._lit_but_one(packet))
+            for amplitude, packet in zip(pair.amplitudes, (first, second), strict=True)
+        ]
+        less = pair.amplitudes.sum() - self._samples.level
+        dark = 1.0 - frames_of_words()[list(self._settings.words)]
+        alone = [dark @ each @ (weight * less) - 0.5 * (dark @ each) ** 2 @ weight for each in taken]
+        scores = alone[0][:, None] + alone[1] - dark @ ((taken[0] * weight) @ taken[1].T) @ dark.T
+        best = np.argsort(-scores, axis=None)[:_OTHERS]
+        words = self._settings.words
+        return [
+            (replace(first, word=words[row]), replace(second, word=words[column]))
+            for row, column in zip(*np.unravel_index(best, scores.shape), strict=True)
+            if scores[row, column] > scores.max() - _RIVALS
+        ]
+
     def _polished(self, packets: Sequence[_Packet | None], number: int, amplitudes: Array) -> _Packet | None:
         """Return a packet with its start and drift between those of the lattice."""
         packet = packets[number]
         if packet is None:
             return None
         other = amplitudes[1 - number] * self._share(packets[1 - number], 0.0)
-        ways = [
-            replace(packet, start=packet.start + late - 0.5 * self._clocks.longest * drift,
-                    drift=packet.drift + drift)
-            for late in _LATE
-            for drift in _DRIFTS
-        ]  # fmt: skip
-        levels = np.stack([amplitudes[number] * self._share(way, 0.0) + other for way in ways])
-        return ways[int(np.argmax(self._density(levels).sum(axis=1)))]
+        drifts = packet.drift + np.repeat(_DRIFTS, len(_LATE))
+        middle = 0.5 * self._clocks.longest * np.repeat(_DRIFTS, len(_LATE))
+        starts = packet.start + np.tile(_LATE, len(_DRIFTS)) - middle
+        levels = other + amplitudes[number] * self._shares(packet.word, starts, drifts)
+        best = int(np.argmax(self._density(levels).sum(axis=1)))
+        return replace(packet, start=float(starts[best]), drift=float(drifts[best]))
 
     def _lattice(self, number: int, other: Array, amplitudes: Array) -> Lattice:
         """Return the scores of a source's packets; `other` are the shares that the other may send, (m, n)."""
-
-        def score(share: Array) -> Array:
-            ways = other.reshape(len(other), *(1,) * (share.ndim - 1), other.shape[1])
-            return _log_mean(self._density(amplitudes[number] * share + amplitudes[1 - number] * ways))
-
         table = np.zeros((ROWS, self._size))
-        add_samples(table, self._samples, score, self._origin_s, self._clocks.step_s)
+        others = amplitudes[1 - number] * np.broadcast_to(other, (len(other), len(self._samples)))
+        add_samples(table, self._samples, amplitudes[number], others, self._origin_s, self._clocks.step_s)
         return Lattice(table, self._clocks)
 
     def _density(self, level: Array) -> Array:
         """Return the log-density of the samples at levels of the sum, shape (..., n)."""
-        return log_density(self._samples.level - level, self._variance(level))
-
-    def _scored(self, lattice: Lattice, starts: NDArray[np.int64]) -> tuple[Indices, Indices, Array]:
-        """Return starts, rates and word scores of all packets that begin at `starts`."""
-        steps, rates = (each.ravel() for each in np.meshgrid(starts, np.arange(len(self._clocks.drifts))))
-        asked = lattice.promising(steps, rates)
-        steps, rates = steps[asked], rates[asked]
-        return steps, rates, lattice.words(steps, rates).astype(float)
+        return log_likelihood(self._samples, level)
 
     def _tops(self, lattice: Lattice) -> list[_Packet]:
         """Return the best packets, of each start and word only the best of its neighbours."""
-        steps, rates, scores = self._scored(lattice, self._starts())
+        steps, rates = self._grid(self._starts()[::2], 2)
+        top = lattice.best_words(steps, rates, np.full(len(steps), _WORTH))[1]
+        worthy = np.flatnonzero(top > _WORTH)
+        steps, rates = steps[worthy], rates[worthy]
+        scores = lattice.words(steps, rates)
         tops: list[_Packet] = []
         if not scores.size:
             return tops
@@ -223,27 +271,33 @@ class _PairReader:
                 tops.append(_Packet(start, float(self._clocks.drifts[rates[row]]), word))
         return tops
 
-    def _starts(self) -> NDArray[np.int64]:
+    def _starts(self) -> Indices:
         return np.arange(self._first, self._steps - self._first)
 
-    def _read(self, lattice: Lattice, about: _Packet | None) -> tuple[_Packet | None, float]:
-        """Return the best packet of a source, given the other's, and its word's probability.
+    def _grid(self, starts: Indices, every: int) -> tuple[Indices, Indices]:
+        """Return starts and rates of all packets that begin at `starts`, on every rate or every second."""
+        steps, rates = np.meshgrid(starts, np.arange(0, len(self._clocks.drifts), every))
+        return steps.ravel(), rates.ravel()
 
-        It is looked for everywhere, or only near where it was found before.
+    def _read(self, lattice: Lattice, about: _Packet | None) -> _Packet | None:
+        """Return the best packet of a source, given the other's: of all, or only near where it was found.
+
+        All are looked over in steps of two, and the best is looked at from near.
         """
+        if about is None:
+            steps, rates = self._grid(self._starts()[::2], 2)
+            top = lattice.best_words(steps, rates, np.full(len(steps), _COARSE))[1]
+            centre = float(steps[np.argmax(top)])
+        else:
+            centre = about.start
         starts = self._starts()
-        if about is not None:
-            starts = starts[np.abs(starts - about.start) <= _NEAR]
-        steps, rates, scores = self._scored(lattice, starts)
-        top = float(scores.max(initial=-np.inf))
-        if top < _WORTH:
-            return None, 1.0
-        row, column = divmod(int(np.argmax(scores)), scores.shape[1])
-        near = np.abs(steps - steps[row]) <= _NEAR
-        total = np.exp(scores - top).sum() + np.exp(-top)
-        share = float(np.exp(scores[near, column] - top).sum() / total)
-        word = self._settings.words[column]
-        return _Packet(int(steps[row]), float(self._clocks.drifts[rates[row]]), word), min(share, 1.0)
+        steps, rates = self._grid(starts[np.abs(starts - centre) <= _NEAR], 1)
+        _, top, columns = lattice.best_words(steps, rates, np.full(len(steps), _COARSE))
+        best = int(np.argmax(top)) if len(top) else 0
+        if not len(top) or top[best] < _WORTH:
+            return None
+        word = self._settings.words[columns[best]]
+        return _Packet(float(steps[best]), float(self._clocks.drifts[rates[best]]), word)
 
     def _fitted(self, packets: Sequence[_Packet | None]) -> Array:
         """Return the amplitudes by least squares, with what was known of them; outliers do not count."""
@@ -278,13 +332,32 @@ class _PairReader:
     def _share(self, packet: _Packet | None, shift: float) -> Array:
         if packet is None:
             return np.ones(len(self._samples))
-        start_s, bit_s = self.times_s(packet)
-        start_s += shift * self._clocks.step_s
+        return self._shares(packet.word, np.array([packet.start + shift]), np.array([packet.drift]))[0]
+
+    def _lit_but_one(self, packet: _Packet) -> Array:
+        """Return the shares of exposures that a packet of one dark bit lights, for each bit of a frame."""
+        start, drift = np.array([packet.start]), np.array([packet.drift])
+        frames = np.tile(1 - np.eye(FRAME_BITS, dtype=np.uint8), self._settings.repeats)
+        return np.concatenate([self._lit(bits, start, drift) for bits in frames])
+
+    def _shares(self, word: int, starts: Array, drifts: Array) -> Array:
+        """Return the shares of exposures that a word's packets light, shape (k, n), by starts and drifts."""
+        return self._lit(encode(word, self._settings.repeats), starts, drifts)
+
+    def _lit(self, bits: NDArray[np.uint8], starts: Array, drifts: Array) -> Array:
         one = self._samples
-        begin_s = one.time_s - 0.5 * one.exposure_s
-        return packet_levels(
-            begin_s, one.exposure_s, encode(packet.word, self._settings.repeats), start_s, bit_s
-        )
+        bit_s = (1.0 + drifts[:, None]) / self._settings.rate_hz
+        start_s = self._origin_s + starts[:, None] * self._clocks.step_s
+        begin = (one.time_s - 0.5 * one.exposure_s - start_s) / bit_s
+        return packet_levels(begin, one.exposure_s / bit_s, bits, 0.0, 1.0)
+
+
+def _add_new(ways: list[_Packets], way: _Packets) -> bool:
+    """Add a pair of packets where none alike is there; return whether it was new."""
+    new = not any(all(_alike(*each) for each in zip(way, one, strict=True)) for one in ways)
+    if new:
+        ways.append(way)
+    return new
 
 
 def _among(found: Sequence[_Pair], best: _Pair, number: int) -> float:
@@ -302,9 +375,3 @@ def _alike(one: _Packet | None, other: _Packet | None) -> bool:
     if one is None or other is None:
         return one is other
     return one.word == other.word and abs(one.start - other.start) <= _NEAR
-
-
-def _log_mean(logs: Array) -> Array:
-    """Return the logarithm of the mean over the first axis."""
-    top = logs.max(axis=0)
-    return np.asarray(top + np.log(np.exp(logs - top).mean(axis=0)))

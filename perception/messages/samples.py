@@ -1,17 +1,22 @@
-"""What each sample of a signal says: its log-likelihood at a level between dark and lit, robustly."""
+"""What each sample of a signal says: its log-likelihood at a level, robustly; what it says of an edge."""
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
 from perception.messages.settings import DecoderSettings
 
 Array = NDArray[np.float64]
-LevelLikelihood = Callable[[Array], Array]
-"""Log-likelihood of the samples, shape (n,), where their source is lit for a share of the exposure, shape
-(..., n)."""
+
+ENDED, BEGUN, DARK, RISE, FALL, GARBAGE, FOREIGN, SEEN = range(8)
+ROWS = 8
+# Where an edge may lie about its step, in steps, and how probably: the lattice rounds start, rate and edge.
+_JITTER = np.array([-0.9, -0.35, 0.0, 0.35, 0.9])
+_JITTER_SHARE = np.array([0.1, 0.25, 0.3, 0.25, 0.1])
+_GARBAGE_LEVELS = 5
 
 _OUTLIERS = 1e-3  # share of samples that follow no model (a merger unnoticed, a glint)
 _OUTLIER_SPAN = 3.0  # the levels over which they spread evenly
@@ -51,20 +56,104 @@ def usable_samples(
     return Samples(time_s[keep], np.maximum(exposure_s[keep], 1e-9), level[keep], dark, lit)
 
 
-def likelihood_of_levels(samples: Samples, scale: float) -> LevelLikelihood:
-    """Return the log-likelihood where a lit source has the level `scale`; variances grow with the light."""
-
-    def log_likelihood(share: Array) -> Array:
-        variance = samples.dark_variance + share * (samples.lit_variance - samples.dark_variance)
-        return log_density(samples.level - scale * share, variance)
-
-    return log_likelihood
+def log_likelihood(samples: Samples, level: Array) -> Array:
+    """Return the log-likelihood of samples at levels, shape (..., n); variances grow with the light."""
+    one = samples
+    shape = (*level.shape[:-1], len(one))
+    flat = np.ascontiguousarray(np.broadcast_to(level, shape).reshape(-1, len(one)), dtype=np.float64)
+    return _log_likelihood(one.level, one.dark_variance, one.lit_variance, flat).reshape(shape)
 
 
-def log_density(off: Array, variance: Array) -> Array:
-    """Return the log-density of errors, a few of which follow no model."""
-    density = np.exp(-0.5 * off * off / variance) / np.sqrt(2.0 * np.pi * variance)
-    return np.asarray(np.log((1.0 - _OUTLIERS) * density + _OUTLIERS / _OUTLIER_SPAN))
+def add_samples(
+    table: Array, samples: Samples, amplitude: float, others: Array, origin_s: float, step_s: float
+) -> None:
+    """Add samples to a table of shape (8, steps), whose step 0 is at `origin_s`.
+
+    A source has the level `amplitude` where it is lit; on it lies the light of others, each row of `others`,
+    shape (m, n), with the same probability. The table's rows hold, for an edge at each step: the scores for
+    dark of the samples that end before it and after the step before; of those that begin; and of the samples
+    that it may cut, their scores with dark on both sides, dark before and lit after, lit before and dark
+    after; the score for being any level up to lit; for being any at all, as another's light makes it; and how
+    many.
+    """
+    one = samples
+    middle = (one.time_s - origin_s) / step_s
+    half = 0.5 * one.exposure_s / step_s
+    _add(table, one.level, one.dark_variance, one.lit_variance, middle, half, amplitude, others)
+
+
+@compiled
+def _density(level: float, dark: float, lit: float, at: float) -> float:
+    """Return the density of a sample at a level; a few samples follow no model."""
+    variance = max(dark + max(at, 0.0) * (lit - dark), min(dark, lit))
+    off = level - at
+    density = math.exp(-0.5 * off * off / variance) / math.sqrt(2.0 * math.pi * variance)
+    return (1.0 - _OUTLIERS) * density + _OUTLIERS / _OUTLIER_SPAN
+
+
+@compiled
+def _log_likelihood(level: Array, dark: Array, lit: Array, at: Array) -> Array:
+    found = np.empty_like(at)
+    for row in range(at.shape[0]):
+        for n in range(at.shape[1]):
+            found[row, n] = math.log(_density(level[n], dark[n], lit[n], at[row, n]))
+    return found
+
+
+@compiled
+def _mean_density(
+    level: float, dark: float, lit: float, amplitude: float, others: Array, n: int, share: float
+) -> float:
+    """Return a sample's density where the source is lit for a share of it, over what others may add."""
+    total = 0.0
+    for way in range(others.shape[0]):
+        total += _density(level, dark, lit, amplitude * share + others[way, n])
+    return float(total / others.shape[0])
+
+
+@compiled
+def _add(
+    table: Array, level: Array, dark: Array, lit: Array, middle: Array, half: Array, amplitude: float,
+    others: Array,
+) -> None:  # fmt: skip
+    steps = table.shape[1]
+    for n in range(level.shape[0]):
+        of_lit = _mean_density(level[n], dark[n], lit[n], amplitude, others, n, 1.0)
+        of_dark = _mean_density(level[n], dark[n], lit[n], amplitude, others, n, 0.0)
+        anything = of_lit + of_dark
+        for k in range(1, _GARBAGE_LEVELS - 1):
+            share = k / (_GARBAGE_LEVELS - 1.0)
+            anything += _mean_density(level[n], dark[n], lit[n], amplitude, others, n, share)
+        score = math.log(of_dark / of_lit)
+        begun = math.floor(middle[n] - half[n] - 1.0) + 1  # the first edge that may cut it
+        ended = math.ceil(middle[n] + half[n] + 1.0)  # the first one after it
+        if begun < 0 or ended >= steps:
+            continue
+        table[ENDED, ended] += score
+        table[BEGUN, begun] += score
+        table[GARBAGE, ended] += math.log(anything / _GARBAGE_LEVELS / of_lit)
+        table[FOREIGN, ended] -= math.log(of_lit * _OUTLIER_SPAN)
+        table[SEEN, int(middle[n])] += 1.0
+        for edge in range(begun, ended):
+            fall = rise = 0.0
+            for k in range(_JITTER.shape[0]):
+                before = (_JITTER[k] + edge - middle[n] + half[n]) / (2.0 * half[n])
+                if before <= 0.0:
+                    fall += _JITTER_SHARE[k] * of_dark
+                    rise += _JITTER_SHARE[k] * of_lit
+                elif before >= 1.0:
+                    fall += _JITTER_SHARE[k] * of_lit
+                    rise += _JITTER_SHARE[k] * of_dark
+                else:
+                    fall += _JITTER_SHARE[k] * _mean_density(
+                        level[n], dark[n], lit[n], amplitude, others, n, before
+                    )
+                    rise += _JITTER_SHARE[k] * _mean_density(
+                        level[n], dark[n], lit[n], amplitude, others, n, 1.0 - before
+                    )
+            table[DARK, edge] += score
+            table[RISE, edge] += math.log(rise / of_lit)
+            table[FALL, edge] += math.log(fall / of_lit)
 
 
 class LevelScale:
@@ -86,10 +175,22 @@ class LevelScale:
 
     def learn(self, samples: Samples) -> float:
         """Add samples (an EM step of the mixture of dark and lit), and return the factor."""
-        score = likelihood_of_levels(samples, self.value)
-        lit = 1.0 / (1.0 + np.exp(score(np.zeros(1)) - score(np.ones(1))))
-        weight = lit / samples.lit_variance
-        near = np.abs(samples.level - self.value) ** 2 < 9.0 * samples.lit_variance + 0.25
-        self._weight = self._KEEP * self._weight + float(weight[near].sum())
-        self._sum = self._KEEP * self._sum + float((weight * samples.level)[near].sum())
+        one = samples
+        weight, moment = _weight_of_lit(one.level, one.dark_variance, one.lit_variance, self.value)
+        self._weight = self._KEEP * self._weight + weight
+        self._sum = self._KEEP * self._sum + moment
         return self.value
+
+
+@compiled
+def _weight_of_lit(level: Array, dark: Array, lit: Array, value: float) -> tuple[float, float]:
+    """Return the weight of the samples that are probably lit and not far off, and their weighted sum."""
+    total = moment = 0.0
+    for n in range(level.shape[0]):
+        if (level[n] - value) ** 2 < 9.0 * lit[n] + 0.25:
+            of_lit = _density(level[n], dark[n], lit[n], value)
+            of_dark = _density(level[n], dark[n], lit[n], 0.0)
+            weight = of_lit / (of_lit + of_dark) / lit[n]
+            total += weight
+            moment += weight * level[n]
+    return total, moment

@@ -33,6 +33,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.randomness": (),
     "nir_render.geometry": (),
     "nir_render.errors": (),
+    "perception.warm_up": (),
     "perception.pipeline": (),
     "perception.pairs": (),
     "perception.photometry": (),

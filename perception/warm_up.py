@@ -5,17 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from perception.messages.decoder import decode
+from perception.messages.pair import decode_pair
+from perception.messages.uart import encode, packet_levels
 from perception.model.fisher import flare_limit
 from perception.model.flare import PixelBox, flare_image
 from perception.rig.measure_set import measure_set
 from perception.robust.detect import detect_robust
-from perception.types import Calibration, Detection, RawFrame
+from perception.types import Calibration, Detection, RawFrame, Signal
 
 _ROWS, _COLUMNS = 256, 320
 
 
 def warm_up() -> None:
-    """Compile the loops of the robust detector and of the limits, where that was not done on this machine.
+    """Compile the loops of detector, limits and decoders, where that was not done on this machine.
 
     It takes a minute once, when the package is new, and a moment after: to be called where a robot is set up,
     or starts, so that no frame waits for it.
@@ -25,6 +28,19 @@ def warm_up() -> None:
     flare_limit(calibration, 40.3, 60.2, 4.0, 9e3, 20.0)
     flare_image(40.3, 60.2, 0.0025, PixelBox(50, 30, 21, 21), calibration)
     _measure_sample_set(calibration)
+    _decode_sample()
+
+
+def _decode_sample() -> None:
+    """Decode a packet, by itself and with another."""
+    time_s = np.arange(0.0, 8.0, 1.0 / 30.0)
+    every = np.ones(len(time_s))
+    lit = packet_levels(time_s, 1e-3 * every, encode(42), 1.0)
+    signal = Signal("warm-up", 1, time_s, 1e-3 * every, lit, 0.1 * every, 0.1 * every)
+    decode(signal)
+    other = packet_levels(time_s, 1e-3 * every, encode(19), 1.7)
+    both = replace(signal, level=lit + 0.5 * other)
+    decode_pair(both, (1.0, 0.5), (0.05, 0.025), (1, 2))
 
 
 def _measure_sample_set(calibration: Calibration) -> None:
