@@ -96,4 +96,6 @@ def _lit_units(emitter: Emitter) -> float:
 def _spectrum_key(emitter: Emitter) -> Hashable:
     if isinstance(emitter, Sun):
         return "sun"
-    return emitter.temperature_k if isinstance(emitter, Lamp) else emitter.spectrum
+    if isinstance(emitter, Lamp):
+        return emitter.temperature_k
+    return emitter.spectrum, emitter.unit.wavelength_m

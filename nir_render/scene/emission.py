@@ -1,5 +1,7 @@
 """What a light group sends: its spectrum of unit flux, and how many units of emission."""
 
+from dataclasses import replace
+
 from nir_render.scene.documents.emitters import Lamp, Source, Sun
 from nir_render.spectra.curve import Curve, constant_curve
 from nir_render.spectra.illuminants import SILICON_M, incandescent_flux_w, incandescent_spectrum
@@ -13,7 +15,9 @@ def emission_spectrum(emitter: Emitter) -> Curve:
         return incandescent_spectrum(emitter.temperature_k, "the lamp's spectrum")
     if isinstance(emitter, Sun):
         return constant_curve(1.0, *SILICON_M, "the sun's spectrum").normalised()
-    return emitter.spectrum.curve("the source's spectrum").normalised()
+    curve = emitter.spectrum.curve("the source's spectrum").normalised()
+    offset_m = emitter.unit.wavelength_m
+    return replace(curve, wavelength_m=curve.wavelength_m + offset_m) if offset_m else curve
 
 
 def emission_units(emitter: Emitter) -> float:
@@ -26,4 +30,4 @@ def emission_units(emitter: Emitter) -> float:
         return incandescent_flux_w(emitter.luminous_flux_lm, emitter.temperature_k)
     if isinstance(emitter, Sun):
         return emitter.irradiance_w_per_m3 * (SILICON_M[1] - SILICON_M[0])
-    return emitter.flux_w
+    return emitter.sent_flux_w

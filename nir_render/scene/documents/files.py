@@ -17,7 +17,9 @@ from nir_render.scene.text.yaml_text import parse_yaml, read_yaml
 _MOST_NAME_BYTES = 255  # of a file, in the file systems in use
 # Keys of which a document has one: a change that writes another replaces the first.
 _ALTERNATIVES = (
-    {"constant", "gaussian", "points", "grid", "file"},
+    {"constant", "gaussian", "points", "grid", "file", "led"},
+    {"junction_temperature", "ambient_temperature"},
+    {"centroid", "table"},
     {"extinction", "visibility"},
     {"full_well", "saturation_capacity"},
     {"values", "file"},
