@@ -192,7 +192,7 @@ def _merged_grid(spectrum: Curve, camera: Camera, nodes_m: tuple[float, ...]) ->
     """Return wavelengths that resolve spectrum, filter's flanks, quantum efficiency and hat functions."""
     parts = [spectrum.wavelength_m]
     if camera.filter is not None:
-        step_m = camera.filter.fwhm_m / 100.0
+        step_m = camera.filter.step_m
         parts.append(np.arange(spectrum.low_m, spectrum.high_m, step_m))
     efficiency = camera.sensor.efficiency().wavelength_m
     bends = np.concatenate([efficiency, nodes_m])

@@ -109,7 +109,7 @@ class Led(PresetDocument):
                 )
             if None in (self.thermal_resistance_k_per_w, self.forward_voltage_v, self._current_in_use_a):
                 raise ValueError(
-                    "ambient_temperature: the junction's follows with 'thermal_resistance', 'forward_voltage' "
+                    "ambient_temperature: the junction's follows by 'thermal_resistance', 'forward_voltage' "
                     "and 'current'; give them, or 'junction_temperature' in its place"
                 )
         if not self.coolest_k <= self.temperature_k <= self.hottest_k:
