@@ -40,7 +40,9 @@ def transmission(
     """
     wavelength, cosine = np.broadcast_arrays(np.asarray(wavelength_m, float), np.asarray(cos_angle, float))
     shifted_m = centre_m * blue_shift(cosine, effective_index)
-    detuning = np.abs(wavelength - shifted_m) / (0.5 * fwhm_m)
+    detuning = (wavelength - shifted_m) / (0.5 * fwhm_m)
+    if not float(cavities).is_integer():
+        detuning = np.abs(detuning)  # only then: powers of ±x differ in their last bit on some processors
     with np.errstate(over="ignore"):  # far from a steep passband nothing is left but the floor
         passband = peak / (1.0 + detuning ** (2 * cavities))
     return np.asarray(np.maximum(passband, 10.0**-blocking_od))
