@@ -25,6 +25,7 @@ from nir_render.run.manifest import (
     noise_warning,
     refresh_facts,
     sample_facts,
+    spectral_facts,
     versions,
 )
 from nir_render.scene.scene import Scene
@@ -274,6 +275,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
         "seconds": {"render": round(seconds, 3)},
         "indirect": _indirect_facts(scene) | by_camera | refresh_facts(scene, writer.refresh),
         "render_noise": noise,
+        "spectral": spectral_facts(scene),
         "lights": {"rendered": writer.lights[0], "reused": writer.lights[1]},
     }
 

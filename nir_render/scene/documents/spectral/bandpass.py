@@ -13,6 +13,7 @@ from nir_render.scene.documents.files import PresetDocument
 from nir_render.spectra.bandpass import blue_shift, cavities_of_edge, transmission, width_at_half_m
 from nir_render.spectra.curve import Curve
 
+_LEAST_OF_PEAK = 0.01  # what counts as in band
 _FINEST_M = 0.02e-9  # steps of integrals over tables
 
 
@@ -91,6 +92,20 @@ class Bandpass(PresetDocument):
         width_m = width_at_half_m(known.wavelength_m, known.value)
         return max(min(width_m / 100.0, finest_m), _FINEST_M)
 
+    def band_m(self, cos_angle: float) -> tuple[float, float]:
+        """Return between which wavelengths more than 1 % of the peak pass, at angles up to one."""
+        if self.table is not None:
+            known = self._table()
+            above = np.flatnonzero(known.value > _LEAST_OF_PEAK * known.value.max())
+            first, last = max(above[0] - 1, 0), min(above[-1] + 1, len(known.value) - 1)
+            low_m, high_m = known.wavelength_m[first] + self.shift_m, known.wavelength_m[last] + self.shift_m
+            return float(low_m * blue_shift(cos_angle, self.effective_index)), float(high_m)
+        assert self.centre_m is not None
+        assert self.fwhm_m is not None
+        reach = (1.0 / _LEAST_OF_PEAK - 1.0) ** (0.5 / self._cavities)
+        centre_m, half_m = self.centre_m + self.shift_m, 0.5 * self.fwhm_m * reach
+        return float(centre_m * blue_shift(cos_angle, self.effective_index) - half_m), centre_m + half_m
+
     def transmission(self, wavelength_m: ArrayLike, cos_angle: ArrayLike) -> NDArray[np.float64]:
         """Return the transmission at wavelengths in vacuum and cosines in air; they broadcast.
 
@@ -100,6 +115,13 @@ class Bandpass(PresetDocument):
             floor = 0.0 if self.blocking_od is None else 10.0**-self.blocking_od
             return self._of_table(wavelength_m, cos_angle, floor)
         return self._of_figures(wavelength_m, cos_angle, self.blocking_od)
+
+    def unblocked_m(self) -> tuple[float, float] | None:
+        """Return the ends of a table beyond which nothing is known; None where nothing is left unknown."""
+        if self.table is None or self.blocking_od is not None:
+            return None
+        known = self._table()
+        return known.low_m + self.shift_m, known.high_m + self.shift_m
 
     def bounds(
         self, wavelength_m: ArrayLike, cos_angle: ArrayLike
@@ -120,7 +142,6 @@ class Bandpass(PresetDocument):
         assert self.centre_m is not None
         assert self.fwhm_m is not None
         assert self.peak_transmission is not None
-        edge_m = self.edge_m
         return transmission(
             wavelength_m,
             cos_angle,
@@ -128,9 +149,14 @@ class Bandpass(PresetDocument):
             fwhm_m=self.fwhm_m,
             peak=self.peak_transmission,
             effective_index=self.effective_index,
-            cavities=self.cavities if edge_m is None else cavities_of_edge(edge_m, self.fwhm_m),
+            cavities=self._cavities,
             blocking_od=math.inf if blocking_od is None else blocking_od,
         )
+
+    @property
+    def _cavities(self) -> float:
+        assert self.fwhm_m is not None
+        return self.cavities if self.edge_m is None else cavities_of_edge(self.edge_m, self.fwhm_m)
 
     def _of_table(self, wavelength_m: ArrayLike, cos_angle: ArrayLike, beyond: float) -> NDArray[np.float64]:
         """Return the table, read at the wavelength that moves to the one asked for at this angle."""
