@@ -17,7 +17,13 @@ FILTER = {
     "placement": "in_front_of_lens", "centre": "940 nm", "fwhm": "10 nm", "peak_transmission": 0.9,
     "effective_index": 2.0, "blocking_od": 4.0, "cavities": 6,
 }  # fmt: skip
-MEASURED: list[tuple[str, float]] = [("300 nm", 0.3), ("525 nm", 0.76), ("850 nm", 0.2), ("940 nm", 0.077), ("1100 nm", 0.0)]
+MEASURED: list[tuple[str, float]] = [
+    ("300 nm", 0.3),
+    ("525 nm", 0.76),
+    ("850 nm", 0.2),
+    ("940 nm", 0.077),
+    ("1100 nm", 0.0),
+]
 
 
 def scene(**changes: Any) -> nr.Scene:
@@ -52,7 +58,7 @@ def planck(nm: Any) -> Any:
     return nm**-5.0 / np.expm1(constants.h * constants.c / (constants.k * 2856.0 * nm * 1e-9))
 
 
-@pytest.mark.parametrize(("emitter", "density"), [("lamps.lamp", planck], ["sun", np.ones_like)])
+@pytest.mark.parametrize(("emitter", "density"), [("lamps.lamp", planck), ("sun", np.ones_like)])
 def test_the_leak_of_lamp_and_sun_is_the_integral_over_all_that_silicon_sees(
     emitter: str, density: Any
 ) -> None:
@@ -73,7 +79,7 @@ def test_the_leak_of_lamp_and_sun_is_the_integral_over_all_that_silicon_sees(
 def test_one_flat_number_understates_the_leak_that_its_envelope_allows() -> None:
     """IMX428: 7.7 % at 940 nm and 76 % at 525 nm. Flat, the leak of a lamp is several times too small."""
     of = scene(preset="imx420")
-    for emitter, least in (("lamps.lamp", 2.5], ["sun", 3.0)):
+    for emitter, least in (("lamps.lamp", 2.5), ("sun", 3.0)):
         found = seen(of, emitter)
         assert found.low_e_per_j < found.out_of_band_e_per_j < found.high_e_per_j
         assert found.high_e_per_j > least * found.out_of_band_e_per_j
