@@ -31,6 +31,9 @@ _ALTERNATIVES = (
     {"auto_exposure", "bracket"},
 )
 
+# What a change of one key takes away with it: what a preset knows of another quantum efficiency, say.
+_GOES_WITH = {"quantum_efficiency": {"efficiency_envelope", "efficiency_taken"}}
+
 
 class PresetDocument(Document):
     """A part that may be named instead of written: a preset of `data/`, or a `.yaml` file beside the scene.
@@ -138,4 +141,6 @@ def without_alternatives(base: Mapping[str, Any], change: Mapping[str, Any]) -> 
     for forms in _ALTERNATIVES:
         if any(change[key] is not None for key in forms & change.keys()):
             kept = {key: value for key, value in kept.items() if key not in forms}
+    for key in change.keys() & _GOES_WITH.keys():
+        kept = {other: value for other, value in kept.items() if other not in _GOES_WITH[key]}
     return kept

@@ -25,6 +25,11 @@ MEASURED: list[tuple[str, float]] = [
     ("1100 nm", 0.0),
 ]
 
+ENVELOPE = {
+    "low": {"points": [["300 nm", 0.1], ["1100 nm", 0.1]]},
+    "high": {"points": [["300 nm", 0.3], ["1100 nm", 0.3]]},
+}
+
 
 def scene(**changes: Any) -> nr.Scene:
     known = {
@@ -127,7 +132,10 @@ def test_without_a_filter_all_must_be_known() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"quantum_efficiency": 0.5}, "0.5 at 940 nm lies outside of efficiency_envelope, 0.09 to 0.28"),
+        (
+            {"quantum_efficiency": 0.5, "efficiency_envelope": ENVELOPE},
+            "0.5 at 940 nm lies outside of efficiency_envelope, 0.1 to 0.3",
+        ),
         ({"efficiency_envelope": None, "efficiency_taken": "low"}, "there is no 'efficiency_envelope'"),
         ({"efficiency_envelope": {"low": 0.1, "high": 0.2}}, "wanted 'points' or 'file' for both"),
         (
