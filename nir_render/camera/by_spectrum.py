@@ -99,4 +99,4 @@ def _spectrum_key(emitter: Emitter) -> Hashable:
         return "sun" if isinstance(emitter, Sun) else "sky"
     if isinstance(emitter, Lamp):
         return emitter.temperature_k if emitter.illuminant is None else (emitter.illuminant, emitter.infrared)
-    return emitter.spectrum
+    return emitter.spectrum, emitter.unit.wavelength_m

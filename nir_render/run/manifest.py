@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from nir_render.camera.optics.leak import Leak, leak
 from nir_render.camera.render_noise import RenderNoise
 from nir_render.light.light import Light
 from nir_render.scene.emission import emission_spectrum, emission_units
@@ -147,6 +148,34 @@ def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[s
     }
     known = {name: None if isinstance(one, float) and math.isnan(one) else one for name, one in facts.items()}
     return {"refresh": known}
+
+
+def spectral_facts(scene: Scene) -> dict[str, list[dict[str, Any]]]:
+    """Return, by camera, what it sees of each emitter in band and out of it, on its axis, per joule.
+
+    Out of band what frames were rendered with, and between what that is known to lie, as shares of what is
+    in band. Emitters of equal figures stand together.
+    """
+    facts: dict[str, list[dict[str, Any]]] = {}
+    for name in scene.cameras():
+        alike: dict[Leak, list[str]] = {}
+        for emitter_name, emitter in scene.emitters().items():
+            alike.setdefault(leak(scene.camera(name)[1], emitter), []).append(emitter_name)
+        facts[name] = [_leak_record(one, emitters) for one, emitters in alike.items()]
+    return facts
+
+
+def _leak_record(one: Leak, emitters: list[str]) -> dict[str, Any]:
+    in_band = one.in_band_e_per_j
+    out_of_band = (one.out_of_band_e_per_j, one.low_e_per_j, one.high_e_per_j)
+    shares = [None if in_band == 0.0 else float(f"{share / in_band:.6g}") for share in out_of_band]
+    return {
+        "emitters": emitters,
+        "band_nm": [round(1e9 * end_m, 3) for end_m in one.band_m],
+        "in_band_e_per_j": float(f"{in_band:.6g}"),
+        "out_of_band_share": shares[0],
+        "out_of_band_share_within": shares[1:],
+    }
 
 
 def enlarging_facts(shot: Shot) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from nir_render.run.manifest import (
     noise_warning,
     refresh_facts,
     sample_facts,
+    spectral_facts,
     versions,
 )
 from nir_render.scene.scene import Scene
@@ -281,6 +282,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
         "indirect": _indirect_facts(scene) | by_camera | refresh_facts(scene, writer.refresh),
         "render_noise": noise,
         "ambient": ambient_facts(scene),
+        "spectral": spectral_facts(scene),
         "lights": {"rendered": writer.lights[0], "reused": writer.lights[1]},
     }
 

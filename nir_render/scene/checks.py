@@ -23,7 +23,7 @@ from nir_render.scene.motion import (
     robot_rotations,
 )
 from nir_render.scene.pose import rotation_of
-from nir_render.spectra.curve import constant_curve
+from nir_render.spectra.curve import Curve, constant_curve
 from nir_render.spectra.illuminants import SILICON_M
 from nir_render.spectra.nodes import BAND_M
 
@@ -194,18 +194,35 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
     for name, robot in document.robots.items():
         for camera_name, camera in robot.rig.cameras.items():
             efficiency = camera.sensor.efficiency()
+            key = f"robots.{name}.rig.cameras.{camera_name}"
+            # At grazing incidence a passband lies farthest to the blue; beyond it the filter blocks.
+            band_m = (0.0, math.inf) if camera.filter is None else camera.filter.band_m(0.0)
             for place, spectrum in spectra.items():
-                if (
-                    efficiency.low_m > spectrum.low_m + _SLACK_M
-                    or efficiency.high_m < spectrum.high_m - _SLACK_M
-                ):
+                low_m, high_m = max(spectrum.low_m, band_m[0]), min(spectrum.high_m, band_m[1])
+                if efficiency.low_m > low_m + _SLACK_M or efficiency.high_m < high_m - _SLACK_M:
                     problems.append(
-                        f"robots.{name}.rig.cameras.{camera_name}.sensor.quantum_efficiency: covers "
+                        f"{key}.sensor.quantum_efficiency: covers "
                         f"{efficiency.range_nm()}, but {place} shines from "
                         f"{spectrum.range_nm()}; give data for it all"
+                        + ("" if camera.filter is None else ", or for all that the filter passes")
                     )
                     break
+            problems += _beyond_the_table(key, camera, spectra)
     return problems
+
+
+def _beyond_the_table(key: str, camera: Camera, spectra: Mapping[str, Curve]) -> list[str]:
+    """Tell of light that a filter's table says nothing of."""
+    known_m = None if camera.filter is None else camera.filter.unblocked_m()
+    if known_m is None:
+        return []
+    return [
+        f"{key}.filter.table: covers {known_m[0] * 1e9:.4g} to {known_m[1] * 1e9:.4g} nm, but {place} shines "
+        f"from {spectrum.range_nm()}; give data for it all, or 'blocking_od', the least optical density "
+        "beyond the table"
+        for place, spectrum in spectra.items()
+        if spectrum.low_m < known_m[0] - _SLACK_M or spectrum.high_m > known_m[1] + _SLACK_M
+    ][:1]
 
 
 def _cameras_inside_solids(document: SceneDocument) -> list[str]:

@@ -1,5 +1,6 @@
 """What a light group sends: its spectrum of unit flux, and how many units of emission."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 from nir_render.scene.documents.ambient.lamps import Infrared, Lamp
@@ -34,7 +35,9 @@ def emission_spectrum(emitter: Emitter) -> Curve:
             return constant_curve(1.0, *SILICON_M, "the sky's spectrum").normalised()
         assert emitter.sun.air is not None  # a sky has one of both
         return _behind(emitter.sun.air, emitter.sun).diffuse.normalised()
-    return emitter.spectrum.curve("the source's spectrum").normalised()
+    curve = emitter.spectrum.curve("the source's spectrum").normalised()
+    offset_m = emitter.unit.wavelength_m
+    return replace(curve, wavelength_m=curve.wavelength_m + offset_m) if offset_m else curve
 
 
 def emission_units(emitter: Emitter) -> float:
@@ -58,7 +61,7 @@ def emission_units(emitter: Emitter) -> float:
             return emitter.sky.clouds * emitter.sky.irradiance_w_per_m3 * (SILICON_M[1] - SILICON_M[0])
         assert emitter.sun.air is not None  # a sky has one of both
         return emitter.sky.clouds * _behind(emitter.sun.air, emitter.sun).diffuse.integral()
-    return emitter.flux_w
+    return emitter.sent_flux_w
 
 
 def _behind(air: Air, sun: Sun) -> Sunlight:

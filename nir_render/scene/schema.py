@@ -8,8 +8,9 @@ from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import SceneDocument
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import PresetDocument, preset_names
-from nir_render.scene.documents.lens import Bandpass, Lens
+from nir_render.scene.documents.lens import Lens
 from nir_render.scene.documents.sensor import Sensor
+from nir_render.scene.documents.spectral.bandpass import Bandpass
 from nir_render.scene.text.units import SPEED, VISIBILITY
 
 _PRESET_MODELS: tuple[type[PresetDocument], ...] = (

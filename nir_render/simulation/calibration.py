@@ -69,7 +69,7 @@ def _devices(world: Scene | Snapshot, camera: str) -> tuple[Camera, tuple[Source
     sources = others or list(everyone.values())
     if not sources:
         raise InputError(f"{snapshot.origin}: robots: no robot has a source, so there is no range constant")
-    return device, tuple(sources)
+    return device, tuple(source.of_its_type for source in sources)
 
 
 def _with_robot(known: Calibration, world: Scene | Snapshot) -> Calibration:
@@ -154,7 +154,7 @@ def range_constant(camera: Camera, source: Source) -> float:
     The share is that which perception finds of a flare's light under the camera's point spread.
     """
     electrons_per_j = float(response(camera, source).electrons_per_j[0])
-    intensity_w_per_sr = source.flux_w / (4.0 * np.pi)
+    intensity_w_per_sr = source.sent_flux_w / (4.0 * np.pi)
     return (
         camera.sensor.system_gain_dn_per_e
         * aperture_area_m2(camera)

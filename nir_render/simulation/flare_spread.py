@@ -103,7 +103,7 @@ def source_beam(source: Source, unit: Response, direction: NDArray[np.float64], 
     return Beam(
         direction=direction,
         angular_radius_rad=float(np.arcsin(min(source.radius_m / range_m, 1.0))),
-        irradiance_w_per_m2=source.flux_w / (4.0 * np.pi * range_m**2),
+        irradiance_w_per_m2=source.sent_flux_w / (4.0 * np.pi * range_m**2),
         response=unit,
         distance_m=range_m,
     )
@@ -242,7 +242,7 @@ def _rail(camera: Camera, source: Source) -> _RailFrames:
         for range_m, image in zip(_RAIL_M, images, strict=True)
     )
     known = _finely_read(small, source, on_axis, headroom_e)
-    irradiance_w_per_m2 = source.flux_w / (4.0 * math.pi)
+    irradiance_w_per_m2 = source.sent_flux_w / (4.0 * math.pi)
     at_one_metre_e = aperture_area_m2(camera) * float(on_axis.electrons_per_j[0]) * irradiance_w_per_m2
     return _RailFrames(known, frames, at_one_metre_e)
 

@@ -6,14 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
 from nir_render.errors import shown
+from nir_render.randomness import generator
 from nir_render.scene.documents.base import Document, KeyProblem
 from nir_render.scene.text.units import Reading, read_quantity
 
 MOST_VALUES = 1000
+_MOST_DRAWS = 1000
 
 DottedPath = Annotated[str, Field(max_length=200)]
 Label = Annotated[str, Field(max_length=100)]
@@ -43,6 +46,8 @@ class Axis:
         The same in SI units, which stand in the table.
     log
         Whether neighbours differ by ratios rather than by steps.
+    units
+        Of an axis that draws: what each unit sets, by dotted path, shape (n,); else None.
     """
 
     name: str
@@ -54,17 +59,93 @@ class Axis:
     numbers: tuple[float, ...] | None = None
     values_si: tuple[float, ...] | None = None
     log: bool = False
+    units: tuple[Mapping[str, Any], ...] | None = None
 
     def settings(self, index: int) -> dict[str, Any]:
         """Return what the value of this index sets, by dotted path."""
+        if self.units is not None:
+            return dict(self.units[index])
         return dict.fromkeys(self.paths, self.values[index])
 
 
+class Distribution(Document):
+    """How a value spreads over units: normal about `mean` with `sigma`, or uniform from `least` to `most`.
+
+    A normal one with `least` or `most` is cut off there: units beyond are sorted out, as bins do.
+    """
+
+    example: ClassVar[str] = "{mean: 940 nm, sigma: 4 nm, least: 920 nm, most: 960 nm}"
+
+    mean: Any = None
+    sigma: Any = None
+    least: Any = None
+    most: Any = None
+
+    @model_validator(mode="after")
+    def _normal_or_uniform(self) -> Self:
+        if (self.mean is None) != (self.sigma is None) or (
+            self.mean is None and (self.least is None or self.most is None)
+        ):
+            raise ValueError(
+                "wanted 'mean' and 'sigma', or 'least' and 'most' alone (all values between alike), such as "
+                f"{self.example}"
+            )
+        return self
+
+    def value(self, rng: np.random.Generator) -> str | float:
+        """Return a drawn value, as a scene file holds it.
+
+        Raises
+        ------
+        ValueError
+            A figure is no number, they are not of one kind, or hardly a unit lies within the bounds.
+        """
+        like, (mean, sigma, least, most) = self._numbers()
+        if mean is None or sigma is None:
+            assert least is not None
+            assert most is not None
+            if not least < most:
+                raise ValueError(f"'least', {self.least}, is not below 'most', {self.most}")
+            number = rng.uniform(least, most)
+        else:
+            if not sigma > 0.0:
+                raise ValueError(f"'sigma' is {shown(self.sigma)}; wanted one above 0")
+            low, high = -np.inf if least is None else least, np.inf if most is None else most
+            drawn = rng.normal(mean, sigma, _MOST_DRAWS)
+            within = drawn[(drawn >= low) & (drawn <= high)]
+            if not within.size:
+                raise ValueError(
+                    f"not one unit in {_MOST_DRAWS} lies from {shown(self.least)} to {shown(self.most)}; "
+                    "check them"
+                )
+            number = within[0]
+        rounded = float(f"{number:.12g}")
+        return f"{rounded!r} {like.unit}" if like.unit else rounded
+
+    def _numbers(self) -> tuple[Reading, list[float | None]]:
+        """Return a figure whose unit is taken, and all in that unit."""
+        written = [self.mean, self.sigma, self.least, self.most]
+        readings = [None if one is None else read_quantity(one) for one in written]
+        for one, reading in zip(written, readings, strict=True):
+            if one is not None and reading is None:
+                raise ValueError(f"{shown(one)} is no number with a unit; write such as {self.example}")
+        known = [reading for reading in readings if reading is not None]
+        like = known[0]
+        if any(reading.quantity is not like.quantity for reading in known):
+            raise ValueError(
+                f"wanted figures of one kind, not {' and '.join(r.quantity.name for r in known)}"
+            )
+        unit = read_quantity(f"1 {like.unit}".rstrip())
+        assert unit is not None  # it was read before
+        return like, [None if reading is None else reading.value_si / unit.value_si for reading in readings]
+
+
 class AxisDocument(Document):
-    """An axis as written: a list of values, or a range `from` … `to` of `count` values.
+    """An axis as written: a list of values, a range `from` … `to` of `count` values, or units that are drawn.
 
     `path` is the dotted path, or several that get the same value; without it the axis's name is the path.
-    `labels` name the values, one for each.
+    `labels` name the values, one for each. `draw` holds distributions by dotted path; each of `count` units
+    draws all of them, keyed by `seed`.
     """
 
     example: ClassVar[str] = "{path: robots.r2.position.x, from: 1 m, to: 6 m, count: 6}"
@@ -77,6 +158,8 @@ class AxisDocument(Document):
     to: Any = None
     count: Annotated[int, Field(ge=2, le=MOST_VALUES)] | None = None
     spacing: Literal["linear", "log"] = "linear"
+    draw: Annotated[dict[DottedPath, Distribution], Field(min_length=1)] | None = None
+    seed: Annotated[int, Field(ge=0)] = 1
 
     read_keys: ClassVar[tuple[str, ...]] = ("from",)
 
@@ -92,6 +175,8 @@ class AxisDocument(Document):
 
     @model_validator(mode="after")
     def _list_or_range(self) -> Self:
+        if self.draw is not None:
+            return self._drawn()
         of_range = (self.start, self.to, self.count)
         if (self.values is None) == all(part is None for part in of_range):
             raise ValueError(f"write either 'values' or 'from', 'to' and 'count', such as {self.example}")
@@ -103,6 +188,17 @@ class AxisDocument(Document):
             raise ValueError("two of the 'labels' are the same")
         return self
 
+    def _drawn(self) -> Self:
+        others = {"path": self.path, "values": self.values, "from": self.start, "to": self.to}
+        written = [key for key, value in {**others, "labels": self.labels}.items() if value is not None]
+        if written or self.count is None:
+            wrong = f"{written[0]!r} has no place there" if written else "'count' is missing"
+            raise ValueError(
+                f"'draw' stands with 'count' (how many units) and 'seed' alone, {wrong}; write it such as "
+                "{draw: {robots.r2.rig.sources.top.flux: {mean: 0.2 W, sigma: 0.02 W}}, count: 12}"
+            )
+        return self
+
     def axis(self, name: str) -> Axis:
         """Return the axis.
 
@@ -111,6 +207,10 @@ class AxisDocument(Document):
         ValueError
             A range whose ends are no numbers of one unit, or the same; a value that stands twice.
         """
+        if self.draw is not None:
+            units = _drawn_units(self.draw, name, self.seed, self.count or 1)
+            labels = tuple(f"{name} {number}" for number in range(1, len(units) + 1))
+            return Axis(name, self.title or name, tuple(self.draw), units, labels, units=units)
         paths = self.path if isinstance(self.path, tuple) else (self.path or name,)
         values = self._range() if self.values is None else self.values
         read = [read_quantity(value) for value in values]
@@ -178,6 +278,26 @@ class AxisDocument(Document):
         if not first.unit:
             return tuple(int(number) for number in rounded) if whole else tuple(rounded)
         return tuple(f"{number:.12g} {first.unit}" for number in rounded)
+
+
+def _drawn_units(
+    draws: Mapping[str, Distribution], name: str, seed: int, count: int
+) -> tuple[dict[str, Any], ...]:
+    """Return what each of so many units sets, by dotted path.
+
+    Unit k of an axis `name` is the same whatever the count and the other paths: its numbers are keyed by the
+    seed, the axis, the path, and k. Raises ValueError as `Distribution.value`.
+    """
+    units: list[dict[str, Any]] = []
+    for unit in range(count):
+        values = {}
+        for path, distribution in draws.items():
+            try:
+                values[path] = distribution.value(generator(seed, f"draw/{name}", path, unit))
+            except ValueError as error:
+                raise ValueError(f"draw.{path}: {error}") from None
+        units.append(values)
+    return tuple(units)
 
 
 def _in_unit(reading: Reading, like: Reading) -> float:

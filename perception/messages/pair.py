@@ -332,7 +332,8 @@ class _PairReader:
     def _share(self, packet: _Packet | None, shift: float) -> Array:
         if packet is None:
             return np.ones(len(self._samples))
-        return self._shares(packet.word, np.array([packet.start + shift]), np.array([packet.drift]))[0]
+        shares = self._shares(packet.word, np.array([packet.start + shift]), np.array([packet.drift]))
+        return np.asarray(shares[0])
 
     def _lit_but_one(self, packet: _Packet) -> Array:
         """Return the shares of exposures that a packet of one dark bit lights, for each bit of a frame."""

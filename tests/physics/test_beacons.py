@@ -102,6 +102,7 @@ def test_a_filter_leaves_of_850_nm_its_leak_alone() -> None:
         assert beacons is not None
         passed.append(float(response(camera, beacons["one"])(0.0) / response(plain, beacons["one"])(0.0)))
     assert camera.filter is not None
+    assert camera.filter.blocking_od is not None
     assert passed[0] == pytest.approx(10.0**-camera.filter.blocking_od, rel=1e-6)
     tan2 = (np.arange(4000) + 0.5) / 4000 / 16.0
     centre_nm = 940.0 * np.sqrt(1.0 - tan2 / (1.0 + tan2) / 4.0)

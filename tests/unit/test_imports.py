@@ -27,7 +27,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.camera": ("timing", "sensor", "optics"),
     "nir_render.light": (),
     "nir_render.scene": ("documents", "text"),
-    "nir_render.scene.documents": ("ambient", "times"),
+    "nir_render.scene.documents": ("ambient", "times", "spectral"),
     "nir_render.truth": (),
     "nir_render.spectra": (),
     "nir_render.randomness": (),

@@ -59,7 +59,7 @@ def response(camera: Camera, emitter: Emitter, node: Node = ONE_NODE) -> Respons
     InputError
         The quantum efficiency does not cover the whole spectrum of the emitter.
     """
-    return _response(_optics(camera), _kind(emitter), None if node.is_alone else node)
+    return _response(optics_alone(camera), kind_alone(emitter), None if node.is_alone else node)
 
 
 def response_map(camera: Camera, emitter: Emitter, node: Node = ONE_NODE) -> NDArray[np.float64]:
@@ -67,10 +67,10 @@ def response_map(camera: Camera, emitter: Emitter, node: Node = ONE_NODE) -> NDA
 
     Ω is the pixel's solid angle; outside a fisheye's image circle there is no light.
     """
-    return _response_map(_optics(camera), _kind(emitter), None if node.is_alone else node)
+    return _response_map(optics_alone(camera), kind_alone(emitter), None if node.is_alone else node)
 
 
-def _optics(camera: Camera) -> Camera:
+def optics_alone(camera: Camera) -> Camera:
     """Return the camera without what its response does not depend on, so that equal ones share a table."""
     return camera.model_copy(
         update={
@@ -86,7 +86,7 @@ def _optics(camera: Camera) -> Camera:
     )
 
 
-def _kind(emitter: Emitter) -> Emitter:
+def kind_alone(emitter: Emitter) -> Emitter:
     """Return the emitter without its place, size, directions, flux and drive, likewise."""
     if isinstance(emitter, Lamp):
         update = {
@@ -142,8 +142,8 @@ def _electrons_per_j(
 ) -> NDArray[np.float64]:
     """Return electrons per joule of parallel light that meets the filter at given cosines, shape (n,)."""
     spectrum = emission_spectrum(emitter)
-    wavelength_m = _merged_grid(spectrum, camera, () if node is None else node.wavelengths_m)
-    efficiency = camera.sensor.efficiency()(wavelength_m)
+    wavelength_m = merged_grid(spectrum, camera, () if node is None else node.wavelengths_m)
+    efficiency = _efficiency(camera, wavelength_m)
     photons_per_j = wavelength_m / (constants.h * constants.c)
     integrand = camera.lens.transmission * spectrum(wavelength_m) * efficiency * photons_per_j
     if node is not None:
@@ -196,11 +196,22 @@ def incidence(
     return cosines.reshape(angle_rad.size, -1), weights
 
 
-def _merged_grid(spectrum: Curve, camera: Camera, nodes_m: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return wavelengths that resolve spectrum, filter's flanks, quantum efficiency and hat functions."""
+def _efficiency(camera: Camera, wavelength_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quantum efficiency; 0 beyond its data, where a filter blocks (what then leaks: `leak`)."""
+    known = camera.sensor.efficiency()
+    if camera.filter is None:
+        return known(wavelength_m)
+    return np.interp(wavelength_m, known.wavelength_m, known.value, 0.0, 0.0)
+
+
+def merged_grid(spectrum: Curve, camera: Camera, nodes_m: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return wavelengths that resolve spectrum, filter's flanks, quantum efficiency and hat functions.
+
+    `nodes_m` are other places to have among them, such as the bends of hat functions.
+    """
     parts = [spectrum.wavelength_m]
     if camera.filter is not None:
-        step_m = camera.filter.fwhm_m / 100.0
+        step_m = camera.filter.step_m
         parts.append(np.arange(spectrum.low_m, spectrum.high_m, step_m))
     efficiency = camera.sensor.efficiency().wavelength_m
     bends = np.concatenate([efficiency, nodes_m])

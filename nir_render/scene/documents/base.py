@@ -31,6 +31,8 @@ from nir_render.scene.text.units import (
 
 _UNIT_SUFFIXES = (
     "_m_per_k",
+    "_k_per_w",
+    "_per_k",
     "_e_per_s",
     "_dn_per_e",
     "_w_per_m3",
@@ -47,6 +49,8 @@ _UNIT_SUFFIXES = (
     "_w",
     "_e",
     "_k",
+    "_a",
+    "_v",
     "_bit",
 )
 _COLOUR_KEYS = {"rgb", "color", "colour", "srgb"}
@@ -255,6 +259,11 @@ Counts = Annotated[float, Unit(units.COUNTS)]
 SystemGain = Annotated[float, Unit(units.SYSTEM_GAIN)]
 DarkCurrent = Annotated[float, Unit(units.DARK_CURRENT)]
 FocusShift = Annotated[float, Unit(units.FOCUS_SHIFT)]
+WavelengthShift = Annotated[float, Unit(units.WAVELENGTH_SHIFT)]
+TemperatureCoefficient = Annotated[float, Unit(units.TEMPERATURE_COEFFICIENT)]
+Current = Annotated[float, Unit(units.CURRENT)]
+Voltage = Annotated[float, Unit(units.VOLTAGE)]
+ThermalResistance = Annotated[float, Unit(units.THERMAL_RESISTANCE)]
 Pixels = Annotated[float, Unit(units.PIXELS)]
 Pixels2 = Annotated[tuple[float, float], Unit(units.PIXELS, 2)]
 Bits = Annotated[float, Unit(units.BITS)]

@@ -18,10 +18,11 @@ from nir_render.scene.documents.base import (
 )
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import PresetDocument
-from nir_render.scene.documents.lens import Bandpass, Lens, check_field, check_focus
+from nir_render.scene.documents.lens import Lens, check_field, check_focus
 from nir_render.scene.documents.point_spread import PointSpread
 from nir_render.scene.documents.sensor import Sensor
 from nir_render.scene.documents.shapes import ShapeDocument
+from nir_render.scene.documents.spectral.bandpass import Bandpass
 from nir_render.scene.documents.times.clocks import CameraClock, OdometryNoise
 
 MOST_GAIN = 64.0

@@ -19,7 +19,6 @@ from nir_render.spectra.illuminants import SILICON_M, gaussian_spectrum
 Points = tuple[tuple[float, float], ...]
 
 _ANGLE_SLACK_RAD = 1e-9
-_CURVE_FORMS = ("constant", "gaussian", "points", "file")
 
 
 class Gaussian(Document):
@@ -36,6 +35,7 @@ class CurveDocument(Document):
     """
 
     read_keys: ClassVar[tuple[str, ...]] = ("file",)
+    forms: ClassVar[tuple[str, ...]] = ("constant", "gaussian", "points", "file")
 
     constant: Annotated[Fraction, NotNegative] | None = None
     gaussian: Gaussian | None = None
@@ -47,10 +47,11 @@ class CurveDocument(Document):
         if isinstance(data, int | float | str) and not isinstance(data, bool):
             return {"constant": data}
         if not isinstance(data, Mapping):
-            raise ValueError("wanted a number, or 'points', 'file' or 'gaussian'")
-        forms = sorted(form for form in _CURVE_FORMS if data.get(form) is not None)
+            raise ValueError(cls._wanted())
+        forms = sorted(form for form in cls.forms if data.get(form) is not None)
         if len(forms) > 1:
-            raise ValueError(f"wanted one of 'constant', 'gaussian', 'points' and 'file', not {forms}")
+            known = ", ".join(map(repr, cls.forms[:-1]))
+            raise ValueError(f"wanted one of {known} and {cls.forms[-1]!r}, not {forms}")
         if "file" in data:
             points = read_csv(resolve_file(str(data["file"]), info), "wavelength_nm,value")
             others = {key: value for key, value in data.items() if key != "file"}
@@ -68,9 +69,14 @@ class CurveDocument(Document):
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
-        if self.constant is None and self.gaussian is None and self.points is None:
-            raise ValueError("wanted a number, or 'points', 'file' or 'gaussian'")
+        if all(getattr(self, form) is None for form in self.forms if form not in self.read_keys):
+            raise ValueError(self._wanted())
         return self
+
+    @classmethod
+    def _wanted(cls) -> str:
+        others = ", ".join(map(repr, cls.forms[4:]))
+        return f"wanted a number, or 'points', 'file'{', ' + others if others else ''} or 'gaussian'"
 
     def curve(self, name: str) -> Curve:
         """Return the curve, which errors call by `name`; a constant holds over what silicon sees."""

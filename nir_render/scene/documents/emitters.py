@@ -23,7 +23,6 @@ from nir_render.scene.documents.base import (
     Power,
 )
 from nir_render.scene.documents.curves import (
-    CurveDocument,
     Points,
     half_turn,
     not_negative,
@@ -33,6 +32,7 @@ from nir_render.scene.documents.curves import (
     write_points,
 )
 from nir_render.scene.documents.files import PresetDocument, resolve_file
+from nir_render.scene.documents.spectral.led import SpectrumDocument, UnitOffset
 from nir_render.scene.documents.times.drives import FULL_DRIVE, SourceDrive
 from nir_render.scene.text.units import ANGLE, FRACTION, format_vector, parse_vector
 
@@ -143,28 +143,33 @@ class PatternDocument(Document):
 class Source(PresetDocument):
     """A 940 nm light source: a sphere, evenly bright over its disc.
 
-    `flux` is the radiant flux over the whole spectrum and all directions, `spectrum` its shape (any scale),
+    `flux` is the radiant flux over the whole spectrum and all directions (of an LED at its reference
+    temperature and current), `spectrum` its shape (any scale),
     `position` the sphere's centre on the robot. Without `pattern` it shines the same in all directions;
     `orientation` turns the pattern's axes on the robot. `drive` is what it sends over time; a calibration
-    speaks of a source that is fully lit.
+    speaks of a source that is fully lit. `unit` is by what this one differs from its type.
     """
 
     preset_folder: ClassVar[str] = "sources"
 
     flux_w: Annotated[Power, Positive]
     radius_m: Annotated[Length, Positive]
-    spectrum: CurveDocument
+    spectrum: SpectrumDocument
     position_m: Position = (0.0, 0.0, 0.0)
     orientation: Orientation = Orientation()
     pattern: PatternDocument | None = None
     drive: SourceDrive = FULL_DRIVE
+    unit: UnitOffset = UnitOffset()
 
-    @field_validator("spectrum")
-    @classmethod
-    def _spectrum_has_an_end(cls, spectrum: CurveDocument) -> CurveDocument:
-        if spectrum.constant is not None:
-            raise ValueError("a spectrum needs a shape; write 'gaussian', 'points' or 'file'")
-        return spectrum
+    @property
+    def of_its_type(self) -> "Source":
+        """The source as its type is: what a calibration speaks of."""
+        return self.model_copy(update={"unit": UnitOffset()})
+
+    @property
+    def sent_flux_w(self) -> float:
+        """The radiant flux that it sends fully lit, at its LED's temperature and current."""
+        return self.flux_w * self.spectrum.relative_power * self.unit.flux
 
 
 def _read_grid(path: Path) -> dict[str, Any]:

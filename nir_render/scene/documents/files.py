@@ -17,7 +17,13 @@ from nir_render.scene.text.yaml_text import parse_yaml, read_yaml
 _MOST_NAME_BYTES = 255  # of a file, in the file systems in use
 # Keys of which a document has one: a change that writes another replaces the first.
 _ALTERNATIVES = (
-    {"constant", "gaussian", "points", "grid", "file"},
+    {"constant", "gaussian", "points", "grid", "file", "led"},
+    {"junction_temperature", "ambient_temperature"},
+    {"centroid", "table"},
+    {"centre", "table"},
+    {"fwhm", "table"},
+    {"peak_transmission", "table"},
+    {"edge", "table"},
     {"extinction", "visibility"},
     {"full_well", "saturation_capacity"},
     {"values", "file"},
@@ -26,6 +32,9 @@ _ALTERNATIVES = (
     {"irradiance", "air"},
     {"auto_exposure", "bracket"},
 )
+
+# What a change of one key takes away with it: what a preset knows of another quantum efficiency, say.
+_GOES_WITH = {"quantum_efficiency": {"efficiency_envelope", "efficiency_taken"}}
 
 
 class PresetDocument(Document):
@@ -134,4 +143,6 @@ def without_alternatives(base: Mapping[str, Any], change: Mapping[str, Any]) -> 
     for forms in _ALTERNATIVES:
         if any(change[key] is not None for key in forms & change.keys()):
             kept = {key: value for key, value in kept.items() if key not in forms}
+    for key in change.keys() & _GOES_WITH.keys():
+        kept = {other: value for other, value in kept.items() if other not in _GOES_WITH[key]}
     return kept

@@ -1,15 +1,14 @@
-"""Models of a camera's lens and of its narrowband filter."""
+"""The model of a camera's lens."""
 
 import math
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field, WithJsonSchema, field_serializer, field_validator, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import (
-    Angle,
     FocusShift,
     Fraction,
     Length,
@@ -20,7 +19,6 @@ from nir_render.scene.documents.curves import Points, parse_points, write_points
 from nir_render.scene.documents.files import PresetDocument
 from nir_render.scene.documents.sensor import Sensor
 from nir_render.scene.text.units import ANGLE
-from nir_render.spectra.bandpass import transmission
 from perception.model.lens import Distortion, LensModel
 
 _COEFFICIENTS = {
@@ -126,41 +124,6 @@ class Lens(PresetDocument):
                 "thermal_focus_shift: without 'focus_distance' all is in focus; give it, such as '3 m'"
             )
         return self
-
-
-class Bandpass(PresetDocument):
-    """An interference filter, in front of the lens or behind it.
-
-    `centre` and `fwhm` hold at normal incidence, `effective_index` sets the blue shift with the angle
-    (λ_c(θ) = λ_0 √(1 − (sin θ / n_eff)²)), `cavities` how steep its flanks are (1: Lorentzian),
-    `blocking_od` the optical density out of band. Behind the lens the angle is that of the chief ray, linear
-    in image height up to `chief_ray_angle_at_corner`, averaged over the lens's cone; in front of it, the
-    field angle.
-    """
-
-    preset_folder: ClassVar[str] = "filters"
-
-    placement: Literal["behind_lens", "in_front_of_lens"]
-    centre_m: Annotated[Length, Positive]
-    fwhm_m: Annotated[Length, Positive]
-    peak_transmission: Annotated[Fraction, Field(gt=0, le=1)]
-    effective_index: Annotated[float, Field(ge=1, le=1e9)]
-    cavities: Annotated[int, Field(ge=1, le=10)] = 3
-    blocking_od: Annotated[float, Field(gt=0, le=100)]
-    chief_ray_angle_at_corner_rad: Annotated[Angle, Field(ge=0, lt=math.pi / 2)] = 0.0
-
-    def transmission(self, wavelength_m: ArrayLike, cos_angle: ArrayLike) -> NDArray[np.float64]:
-        """Return the transmission at wavelengths in vacuum and cosines in air; they broadcast."""
-        return transmission(
-            wavelength_m,
-            cos_angle,
-            centre_m=self.centre_m,
-            fwhm_m=self.fwhm_m,
-            peak=self.peak_transmission,
-            effective_index=self.effective_index,
-            cavities=self.cavities,
-            blocking_od=self.blocking_od,
-        )
 
 
 def principal_point_px(lens: Lens, sensor: Sensor) -> tuple[float, float]:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from nir_render.scene.documents.base import (
 )
 from nir_render.scene.documents.curves import CurveDocument
 from nir_render.scene.documents.files import PresetDocument
+from nir_render.scene.documents.spectral.efficiency import EfficiencyEnvelope, efficiency_bounds
 from nir_render.scene.text.units import Quantity
 from nir_render.spectra.curve import Curve
 
@@ -140,6 +141,8 @@ class Sensor(PresetDocument):
     the temporal variance is largest, or as `full_well`, the charge at which a pixel clips; the other follows.
     `dark_current` holds at `reference_temperature` and doubles every `dark_current_doubling`. `blooming` is
     the share of the charge beyond the full well that spills to the neighbours in the column; the rest drains.
+    `efficiency_envelope` is between what the quantum efficiency lies where it is not published; frames are
+    made with `quantum_efficiency`, or with that end of the envelope which `efficiency_taken` says.
     """
 
     preset_folder: ClassVar[str] = "sensors"
@@ -163,6 +166,8 @@ class Sensor(PresetDocument):
     nonlinearity: Nonlinearity | None = None
     blooming: Annotated[Fraction, Field(ge=0, le=1)] = 0.0
     defects: Defects = Defects()
+    efficiency_envelope: EfficiencyEnvelope | None = None
+    efficiency_taken: Literal["nominal", "low", "high"] = "nominal"
 
     @field_validator("quantum_efficiency")
     @classmethod
@@ -245,9 +250,29 @@ class Sensor(PresetDocument):
             and _variance_grows(capacity_e, self.full_scale_e, self.prnu.total)
         )
 
+    @model_validator(mode="after")
+    def _envelope_holds_the_efficiency(self) -> Self:
+        if self.efficiency_envelope is not None:
+            self.efficiency_envelope.check_holds(self.quantum_efficiency)
+        elif self.efficiency_taken != "nominal":
+            raise ValueError(
+                f"efficiency_taken: there is no 'efficiency_envelope' with a {self.efficiency_taken!r} end; "
+                "give it, or take 'nominal'"
+            )
+        return self
+
     def efficiency(self) -> Curve:
-        """Return the quantum efficiency against wavelength."""
-        return self.quantum_efficiency.curve("quantum_efficiency")
+        """Return the quantum efficiency against wavelength that frames are made with."""
+        envelope, taken = self.efficiency_envelope, self.quantum_efficiency
+        if envelope is not None and self.efficiency_taken != "nominal":
+            taken = envelope.low if self.efficiency_taken == "low" else envelope.high
+        return taken.curve("quantum_efficiency")
+
+    def efficiency_bounds(
+        self, wavelength_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return between what the quantum efficiency is known to lie, at wavelengths of any shape."""
+        return efficiency_bounds(self.quantum_efficiency, self.efficiency_envelope, wavelength_m)
 
     @property
     def full_scale_dn(self) -> int:

@@ -19,6 +19,7 @@ _BASE = frozenset(
         "gram",
         "kelvin",
         "candela",
+        "ampere",
         "radian",
         "electron",
         "digital_number",
@@ -38,6 +39,7 @@ _DERIVED: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
         "newton": (1.0, {"kilogram": 1, "metre": 1, "second": -2}),
         "joule": (1.0, {"newton": 1, "metre": 1}),
         "watt": (1.0, {"joule": 1, "second": -1}),
+        "volt": (1.0, {"watt": 1, "ampere": -1}),
         "lumen": (1.0, {"candela": 1, "steradian": 1}),
         "lux": (1.0, {"lumen": 1, "metre": -2}),
         "percent": (0.01, {}),
@@ -48,7 +50,7 @@ _SYMBOLS = MappingProxyType(
         "m": "metre", "meter": "metre", "s": "second", "sec": "second", "g": "gram", "K": "kelvin",
         "cd": "candela", "rad": "radian", "e": "electron", "DN": "digital_number", "px": "pixel",
         "bits": "bit", "deg": "degree", "sr": "steradian", "min": "minute", "h": "hour", "Hz": "hertz",
-        "N": "newton", "J": "joule", "W": "watt", "lm": "lumen", "lx": "lux",
+        "N": "newton", "J": "joule", "W": "watt", "lm": "lumen", "lx": "lux", "A": "ampere", "V": "volt",
     }
     | {name: name for name in (*_BASE, *_DERIVED)}
 )  # fmt: skip

@@ -42,6 +42,11 @@ COUNTS = Quantity("count", "DN", "64 DN")
 SYSTEM_GAIN = Quantity("system gain", "DN/e", "0.74 DN/e")
 DARK_CURRENT = Quantity("dark current", "e/s", "20 e/s")
 FOCUS_SHIFT = Quantity("focus shift", "m/K", "5 um/K", 1.0)
+WAVELENGTH_SHIFT = Quantity("wavelength shift", "m/K", "0.3 nm/K", 1e-6)
+TEMPERATURE_COEFFICIENT = Quantity("temperature coefficient", "1/K", "-0.3 %/K", 1.0)
+CURRENT = Quantity("current", "A", "100 mA", 1e6)
+VOLTAGE = Quantity("voltage", "V", "1.5 V", 1e6)
+THERMAL_RESISTANCE = Quantity("thermal resistance", "K/W", "450 K/W", 1e6)
 PIXELS = Quantity("length in the image", "px", "0.7 px", 1e6)
 BITS = Quantity("number of bits", "bit", "12 bit", 1e3)
 FRACTION = Quantity("fraction", "", "0.8", 1e12)
@@ -57,8 +62,8 @@ _OTHERS = (
 )
 _KNOWN = (
     LENGTH, TIME, FREQUENCY, ANGLE, POWER, TEMPERATURE, LUMINOUS_FLUX, ILLUMINANCE, ELECTRONS, COUNTS,
-    SYSTEM_GAIN, DARK_CURRENT, FOCUS_SHIFT, PIXELS, BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, SPEED,
-    *_OTHERS,
+    SYSTEM_GAIN, DARK_CURRENT, FOCUS_SHIFT, TEMPERATURE_COEFFICIENT, CURRENT, VOLTAGE, THERMAL_RESISTANCE,
+    PIXELS, BITS, FRACTION, EXTINCTION, SPECTRAL_IRRADIANCE, SPEED, *_OTHERS,
 )  # fmt: skip
 
 _NUMBER = re.compile(

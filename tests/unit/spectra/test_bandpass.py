@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nir_render.scene.documents.lens import Bandpass
+from nir_render.scene.documents.spectral.bandpass import Bandpass
 
 
 def _filter(**changes: object) -> Bandpass:

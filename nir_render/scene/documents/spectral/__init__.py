@@ -1,0 +1,1 @@
+"""Models of what is spectral: LEDs, interference filters, what is known of a quantum efficiency."""
