@@ -88,8 +88,10 @@ def _fields(document: dict[str, Any]) -> set[str]:
     names = set(document)
     for key, value in document.items():
         if isinstance(value, dict) and key not in ("versions", "sha256"):
-            by_camera = key != "ambient" and all(isinstance(inner, dict) for inner in value.values())
-            names |= {one for inner in value.values() for one in inner} if by_camera else _fields(value)
+            listed = [each if isinstance(each, list) else [each] for each in value.values()]
+            records = [record for each in listed for record in each]
+            by_camera = key != "ambient" and all(isinstance(record, dict) for record in records)
+            names |= {one for record in records for one in record} if by_camera else _fields(value)
     return names
 
 
