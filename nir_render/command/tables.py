@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from nir_render.evaluate.metrics import Evaluation, Score
+from nir_render.evaluate.tracks import FEW_SETS
 from nir_render.run.calibrate import CameraCalibration
 from perception.calibration.result import IDEAL_MAE, HeldOut
 
@@ -58,8 +59,15 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
 
 
 def time_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Return a table of tracks where there are any, and one of messages where packets were sent."""
-    followed = {name: numbers for name, numbers in summary["estimators"].items() if "track_hota" in numbers}
+    """Return a table of tracks where there are any, and one of messages where packets were sent.
+
+    None of a run of a few sets, in which tracks have hardly begun.
+    """
+    followed = {
+        name: numbers
+        for name, numbers in summary["estimators"].items()
+        if numbers.get("track_sets", 0) >= FEW_SETS
+    }
     tracks = {
         "track_hota": ("HOTA", "{:.3f}"),
         "track_idf1": ("IDF1", "{:.3f}"),

@@ -52,6 +52,10 @@ class TrackEvaluation:
     by_observer: Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
+FEW_SETS = 10
+"""Tracks begin within three sets: of fewer than these the scores tell nothing, and are not shown."""
+
+
 def evaluate_tracks(
     sets: Sequence[TimedSet],
     truth: Iterable[SourceTruth],
@@ -183,6 +187,7 @@ def _numbers(moments: Sequence[Moment], name: str, ways: TrueWays) -> dict[str, 
         gospas_m.append(gospa_m(apart_m))
     scores = track_scores(instants)
     return {
+        "track_sets": len(moments),
         "track_sources": len(lives),
         "tracks": len(numbers),
         "track_hota": _or_none(scores.hota),

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from nir_render.evaluate.metrics import Evaluation
+from nir_render.evaluate.tracks import FEW_SETS
 from nir_render.report.drawing import Drawing
 from nir_render.report.parts import Table
 from nir_render.report.time.blinks import blink_plot
@@ -47,9 +48,9 @@ class OverTime:
 
 
 def time_section(result: Evaluation, said: Said) -> OverTime | None:
-    """Return the section about a run's tracks; None where there are none."""
+    """Return the section about a run's tracks; None where there are none, or have hardly begun."""
     over_time = result.over_time
-    if over_time is None or not over_time.moments:
+    if over_time is None or len(over_time.moments) < FEW_SETS:
         return None
     moments, names = over_time.moments, list(over_time.summary)
     sights: Counter[str] = Counter()

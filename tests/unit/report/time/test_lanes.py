@@ -87,7 +87,8 @@ def test_what_was_read_has_the_colour_of_its_verdict(wrong: object, colour: str)
 
 
 def test_the_section_has_all_its_plots_and_the_film_moves() -> None:
-    scored = _scored()
+    few = _scored()
+    scored = dataclasses.replace(few, moments=3 * few.moments)
     result = evaluate(KEYS, [], {"r1.front": CAMERA}, {"robust": []})
     summary = {**result.summary, "estimators": {"robust": {**scored.summary["robust"]}}}
     result = dataclasses.replace(result, summary=summary, over_time=scored)
@@ -107,3 +108,6 @@ def test_the_section_has_all_its_plots_and_the_film_moves() -> None:
     assert film is not None
     assert film.startswith(b"GIF")
     assert time_section(dataclasses.replace(result, over_time=None), Said()) is None
+    assert (
+        time_section(dataclasses.replace(result, over_time=few), Said()) is None
+    )  # tracks have hardly begun
