@@ -6,7 +6,7 @@ they have parted.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -67,11 +67,17 @@ def inseparable(expected: Mapping[int, Expected], calibration: Calibration) -> l
 
 
 def sample_of_sum(
-    one: Expected, other: Expected, found: Sequence[Detection], frame: RawFrame, calibration: Calibration
+    one: Expected,
+    other: Expected,
+    found: Sequence[Detection],
+    others: Collection[int],
+    frame: RawFrame,
+    calibration: Calibration,
 ) -> SumSample | None:
     """Return how bright two inseparable sources are together; None where nothing can be said.
 
-    All that was found within their images is theirs; where nothing was, both may be dark: that is measured.
+    All that was found within their images is theirs, but for `others`, which are other tracks', by their
+    places in `found`; where nothing was, both may be dark: that is measured.
     """
     ratio = other.flux_dn / one.flux_dn
     share = ratio / (1.0 + ratio)
@@ -86,7 +92,11 @@ def sample_of_sum(
     reach_px = apart_px + 2.0 * _APART * math.hypot(
         image_width_px(one, calibration), min(between.sigma_px, _SURE_PX)
     )
-    theirs = [hit for hit in found if math.hypot(hit.u_px - between.u_px, hit.v_px - between.v_px) < reach_px]
+    theirs = [
+        hit
+        for number, hit in enumerate(found)
+        if number not in others and math.hypot(hit.u_px - between.u_px, hit.v_px - between.v_px) < reach_px
+    ]
     if not theirs:
         dark = sample_at(between, found, frame, calibration)
         return None if dark is None else SumSample(dark, ratio)
@@ -150,6 +160,7 @@ class PairReader:
         """Return what the pairs say that are still together."""
         heard = [message for tracks, one in self._pairs.items() for message in self._read(robot, tracks, one)]
         self._pairs.clear()
+        self._said.clear()
         return tuple(heard)
 
     def _read(self, robot: str, tracks: Tracks, together: _Together) -> list[Message]:

@@ -248,7 +248,14 @@ class Pipeline:
             for there, frame, found, mixed in zip(places, frames, detections, together, strict=True):
                 for one, other in mixed:
                     calibration = self._calibrations[frame.camera]
-                    total = sample_of_sum(there[one], there[other], found, frame, calibration)
+                    others = {
+                        number
+                        for track in tracks
+                        if track.track not in (one, other)
+                        for camera, index, number in track.detections
+                        if (camera, index) == (frame.camera, frame.index)
+                    }
+                    total = sample_of_sum(there[one], there[other], found, others, frame, calibration)
                     if total is not None:
                         sums.setdefault((one, other), total)
             said += self._pairs.push(self._robot or "", time_s, sums, said)

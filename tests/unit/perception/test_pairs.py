@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from perception import Message, Pipeline
 from perception.messages.uart import encode
-from tests.unit.perception.stage import CAMERAS, EXPOSURE_S, RATE_HZ, frame_of
+from tests.unit.perception.stage import CAMERA, CAMERAS, EXPOSURE_S, RATE_HZ, frame_of
 
 Array = NDArray[np.float64]
 
@@ -28,21 +28,28 @@ def _lit(who: str, time_s: float) -> bool:
     return not 0 <= bit < len(bits) or bool(bits[bit])
 
 
-@pytest.mark.parametrize("silent", [None, "near"])
-def test_both_are_heard_while_they_are_one_light(silent: str | None) -> None:
-    """Each word once, by the track that said it; who is silent is not said to have said anything."""
+@pytest.mark.parametrize(("silent", "beside"), [(None, False), ("near", False), (None, True)])
+def test_both_are_heard_while_they_are_one_light(silent: str | None, beside: bool) -> None:
+    """Each word once, by the track that said it; who is silent, or shines 3 px beside, is not said to have said any."""
     pipeline = Pipeline(CAMERAS, keep_signals=True)
     messages: list[Message] = []
     first: dict[int, str] = {}
     for index in range(540):
         when = index / RATE_HZ + 0.5 * EXPOSURE_S
         lit = [_place_m(who, when) for who in WORDS if who == silent or _lit(who, when)]
+        if beside:
+            lit.append(np.array([2.3, 0.0, 0.1 + 3.0 / CAMERA.fx_px * 2.3]))
         heard = pipeline.push([frame_of(index, lit)])
         messages += heard.messages
         if index == 60:
-            first = {t.track: ("near" if t.position_body_m[0] < 2.35 else "far") for t in heard.tracks}
+            first = {
+                t.track: min(RANGE_M, key=lambda who: abs(RANGE_M[who] - t.position_body_m[0]))
+                for t in heard.tracks
+                if t.position_body_m[2] < 0.12
+            }
     messages += pipeline.finish()
-    assert {track.track for track in heard.tracks} == set(first)
+    assert len(heard.tracks) == 2 + beside
+    assert {track.track for track in heard.tracks} >= set(first)
     said = {first[message.track]: message for message in messages}
     assert len(messages) == len(said)
     assert {who: one.word for who, one in said.items()} == {w: x for w, x in WORDS.items() if w != silent}
