@@ -7,14 +7,21 @@ they have parted.
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from perception.messages.pair import decode_pair
 from perception.messages.settings import DecoderSettings
-from perception.photometry import Expected, Sample, image_width_px, sample_at, sample_of_detection
-from perception.types import Calibration, Detection, Message, RawFrame, Signal
+from perception.photometry import (
+    Expected,
+    Sample,
+    image_width_px,
+    sample_at,
+    sample_of_detection,
+    signal_of,
+)
+from perception.types import Calibration, Detection, Message, RawFrame
 
 UNLIKE = 0.05
 """Standard deviation of a source's flux over what its track predicts, relative, beside the track's own."""
@@ -113,23 +120,12 @@ def sample_of_sum(
     return SumSample(total, ratio)
 
 
-@dataclass
-class _Together:
-    """What was measured of a pair while it was together."""
-
-    samples: list[SumSample] = field(default_factory=list)
-
-    @property
-    def span_s(self) -> float:
-        return self.samples[-1].sample.time_s - self.samples[0].sample.time_s
-
-
 class PairReader:
     """Reads pairs of tracks while no camera tells them apart."""
 
     def __init__(self, settings: DecoderSettings | None = None) -> None:
         self._settings = settings
-        self._pairs: dict[Tracks, _Together] = {}
+        self._pairs: dict[Tracks, list[SumSample]] = {}
         self._said: list[Message] = []
 
     def push(
@@ -143,40 +139,43 @@ class PairReader:
         self._said = [message for message in self._said if time_s - message.end_s < 2.0 * _LONGEST_S]
         self._said += said
         for tracks, sample in sums.items():
-            together = self._pairs.setdefault(tracks, _Together())
-            if not together.samples or sample.sample.time_s > together.samples[-1].sample.time_s:
-                together.samples.append(sample)
+            together = self._pairs.setdefault(tracks, [])
+            if not together or sample.sample.time_s > together[-1].sample.time_s:
+                together.append(sample)
         heard: list[Message] = []
         for tracks in list(self._pairs):
             together = self._pairs[tracks]
-            if time_s - together.samples[-1].sample.time_s > _PARTED_S:
+            if time_s - together[-1].sample.time_s > _PARTED_S:
                 heard += self._read(robot, tracks, self._pairs.pop(tracks))
-            elif together.span_s > _LONGEST_S:
+            elif _span_s(together) > _LONGEST_S:
                 heard += self._read(robot, tracks, together)
-                together.samples = [one for one in together.samples if time_s - one.sample.time_s < _KEPT_S]
+                self._pairs[tracks] = [one for one in together if time_s - one.sample.time_s < _KEPT_S]
         return tuple(heard)
 
-    def finish(self, robot: str) -> tuple[Message, ...]:
-        """Return what the pairs say that are still together."""
+    def finish(self, robot: str, said: Iterable[Message]) -> tuple[Message, ...]:
+        """Return what the pairs say that are still together, and single tracks did not say at last."""
+        self._said += said
         heard = [message for tracks, one in self._pairs.items() for message in self._read(robot, tracks, one)]
         self._pairs.clear()
         self._said.clear()
         return tuple(heard)
 
-    def _read(self, robot: str, tracks: Tracks, together: _Together) -> list[Message]:
-        if together.span_s < _SHORTEST_S:
+    def _read(self, robot: str, tracks: Tracks, together: Sequence[SumSample]) -> list[Message]:
+        if _span_s(together) < _SHORTEST_S:
             return []
-        samples = [one.sample for one in together.samples]
-        ratio = float(np.median([one.ratio for one in together.samples]))
-        columns = np.array([[s.time_s, s.exposure_s, s.level, s.sigma_dark, s.sigma_lit] for s in samples]).T
-        if (columns[2] > 1.0 + ratio - _IDLE_SIGMAS * np.hypot(columns[4], UNLIKE * (1.0 + ratio))).all():
+        ratio = float(np.median([one.ratio for one in together]))
+        signal = signal_of(robot, tracks[0], [one.sample for one in together])
+        sigma = np.hypot(signal.sigma_lit, UNLIKE * (1.0 + ratio))
+        if (signal.level > 1.0 + ratio - _IDLE_SIGMAS * sigma).all():
             return []  # both were lit all the time
-        found = decode_pair(
-            Signal(robot, tracks[0], *columns), (1.0, ratio), (UNLIKE, UNLIKE * ratio), tracks, self._settings
-        )
+        found = decode_pair(signal, (1.0, ratio), (UNLIKE, UNLIKE * ratio), tracks, self._settings)
         new = [message for message in found if not any(_same(message, other) for other in self._said)]
         self._said += new
         return new
+
+
+def _span_s(together: Sequence[SumSample]) -> float:
+    return together[-1].sample.time_s - together[0].sample.time_s
 
 
 def _same(one: Message, other: Message) -> bool:

@@ -18,7 +18,7 @@ from perception.model.flare import PixelBox, flare_image, has_image, image_radiu
 from perception.model.lens import project
 from perception.model.ranging import angular_radius_rad, exposure_towards
 from perception.model.sensor import gain_dn_per_e, noise_floor_e2, saturation_dn
-from perception.types import Calibration, Detection, RawFrame
+from perception.types import Calibration, Detection, RawFrame, Signal
 
 Array = NDArray[np.float64]
 
@@ -197,6 +197,14 @@ def sample_at(
     if not 0.0 < sigma_e < lit_e:
         return None
     return _sample(flux_e / lit_e, sigma_e / lit_e, expected, frame, calibration)
+
+
+def signal_of(robot: str, track: int, samples: Sequence[Sample]) -> Signal:
+    """Return the samples of one track, by time, as a signal."""
+    columns = np.array(
+        [[one.time_s, one.exposure_s, one.level, one.sigma_dark, one.sigma_lit] for one in samples]
+    ).reshape(-1, 5)
+    return Signal(robot, track, *columns.T)
 
 
 def image_width_px(expected: Expected, calibration: Calibration) -> float:

@@ -10,18 +10,22 @@ brightness is measured in every frame, dark or lit (`photometry`), and read (`me
 """
 
 import math
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
-
-import numpy as np
 
 from perception.estimators import Estimator, detect_frames
 from perception.messages.decoder import Decoder
 from perception.messages.paper import PaperDecoder
 from perception.pairs import PairReader, SumSample, inseparable, sample_of_sum
-from perception.photometry import Expected, Sample, expected_image, sample_at, sample_of_detection
+from perception.photometry import (
+    Expected,
+    Sample,
+    expected_image,
+    sample_at,
+    sample_of_detection,
+    signal_of,
+)
 from perception.rig.frame_sets import robot_of, set_time_s
 from perception.rig.measure_set import measure_set
 from perception.track.settings import TrackerSettings
@@ -39,6 +43,9 @@ from perception.types import (
 )
 
 _AS_THE_PAPER = TrackerSettings(filter="paper", association="paper", overlap="paper")
+
+Takers = dict[tuple[str, int, int], set[int]]
+"""The tracks that took each detection, by its camera, frame and place among those of the frame."""
 
 _SET_BACK_S = 1.0
 _AT_ONCE_S = 1e-3
@@ -184,13 +191,16 @@ class Pipeline:
         said = [message for reader in self._readers.values() for message in reader.finish()]
         self._readers.clear()
         if self._pairs is not None:
-            said += self._pairs.push(self._robot or "", self._latest_s, {}, said)
-            said += self._pairs.finish(self._robot or "")
+            said += self._pairs.finish(self._robot or "", said)
         return tuple(said)
 
     def signals(self) -> tuple[Signal, ...]:
         """Return how bright every track was so far; none where they are not kept."""
-        return tuple(self._signal(track, samples) for track, samples in self._samples.items() if samples)
+        return tuple(
+            signal_of(self._robot or "", track, samples)
+            for track, samples in self._samples.items()
+            if samples
+        )
 
     def _listen(
         self,
@@ -216,16 +226,18 @@ class Pipeline:
         by_key = {
             (hit.camera, hit.index, number): hit for found in detections for number, hit in enumerate(found)
         }
-        fed = Counter(key for track in tracks for key in track.detections)
+        takers: Takers = {}
+        for track in tracks:
+            for key in track.detections:
+                takers.setdefault(key, set()).add(track.track)
         places = [self._expected(frame, time_s, tracks, odometry) for frame in frames]
-        resolved = {key for key, count in fed.items() if count == 1}
         together = [
-            _together(there, tracks, frame, resolved, self._calibrations[frame.camera])
+            _together(there, tracks, frame, takers, self._calibrations[frame.camera])
             for there, frame in zip(places, frames, strict=True)
         ]
         for track in tracks:
             samples = [
-                self._sample(track, there.get(track.track), frame, found, by_key, fed, mixed)
+                self._sample(track, there.get(track.track), frame, found, by_key, takers, mixed)
                 for there, frame, found, mixed in zip(places, frames, detections, together, strict=True)
             ]
             known = [sample for sample in samples if sample is not None]
@@ -242,24 +254,32 @@ class Pipeline:
             if track.track not in self._readers:
                 self._readers[track.track] = self._decoder(track.robot, track.track)
             reader = self._readers[track.track]
-            said += reader.push(self._signal(track.track, [best]))
+            said += reader.push(signal_of(self._robot or "", track.track, [best]))
         if self._pairs is not None:
-            sums: dict[tuple[int, int], SumSample] = {}
-            for there, frame, found, mixed in zip(places, frames, detections, together, strict=True):
-                for one, other in mixed:
-                    calibration = self._calibrations[frame.camera]
-                    others = {
-                        number
-                        for track in tracks
-                        if track.track not in (one, other)
-                        for camera, index, number in track.detections
-                        if (camera, index) == (frame.camera, frame.index)
-                    }
-                    total = sample_of_sum(there[one], there[other], found, others, frame, calibration)
-                    if total is not None:
-                        sums.setdefault((one, other), total)
+            sums = self._sums(frames, places, detections, together, takers)
             said += self._pairs.push(self._robot or "", time_s, sums, said)
         return tuple(said)
+
+    def _sums(
+        self,
+        frames: Sequence[RawFrame],
+        places: Sequence[Mapping[int, Expected]],
+        detections: Sequence[Sequence[Detection]],
+        together: Sequence[Collection[tuple[int, int]]],
+        takers: Takers,
+    ) -> dict[tuple[int, int], SumSample]:
+        """Return how bright pairs are that are one image, each in the first frame that says it."""
+        sums: dict[tuple[int, int], SumSample] = {}
+        for there, frame, found, mixed in zip(places, frames, detections, together, strict=True):
+            taken = _taken_in(frame, takers)
+            for pair in mixed:
+                others = {number for number, tracks in taken.items() if not tracks.issubset(pair)}
+                one, other = (there[track] for track in pair)
+                calibration = self._calibrations[frame.camera]
+                total = sample_of_sum(one, other, found, others, frame, calibration)
+                if total is not None:
+                    sums.setdefault(pair, total)
+        return sums
 
     def _expected(
         self, frame: RawFrame, time_s: float, tracks: Sequence[Track], odometry: Sequence[Odometry]
@@ -298,7 +318,7 @@ class Pipeline:
         frame: RawFrame,
         found: Sequence[Detection],
         by_key: Mapping[tuple[str, int, int], Detection],
-        fed: Mapping[tuple[str, int, int], int],
+        takers: Takers,
         together: Collection[tuple[int, int]],
     ) -> Sample | None:
         """Return the brightness of a track in a frame; None where nothing is known of its own light."""
@@ -308,32 +328,28 @@ class Pipeline:
         own = [key for key in track.detections if key[:2] == (frame.camera, frame.index)]
         if own:
             hit = by_key.get(own[0])
-            if hit is None or hit.merged or fed[own[0]] > 1:
+            if hit is None or hit.merged or len(takers[own[0]]) > 1:
                 return None
             return sample_of_detection(hit, expected, frame, calibration)
-        claimed = [(frame.camera, frame.index, number) in fed for number in range(len(found))]
+        claimed = [(frame.camera, frame.index, number) in takers for number in range(len(found))]
         return sample_at(expected, found, frame, calibration, claimed)
 
-    def _signal(self, track: int, samples: Sequence[Sample]) -> Signal:
-        columns = np.array(
-            [[one.time_s, one.exposure_s, one.level, one.sigma_dark, one.sigma_lit] for one in samples]
-        ).reshape(-1, 5)
-        return Signal(self._robot or "", track, *columns.T)
+
+def _taken_in(frame: RawFrame, takers: Takers) -> dict[int, set[int]]:
+    """Return the tracks that took each detection of a frame, by its place among them."""
+    here = (frame.camera, frame.index)
+    return {number: tracks for (camera, index, number), tracks in takers.items() if (camera, index) == here}
 
 
 def _together(
     expected: Mapping[int, Expected],
     tracks: Sequence[Track],
     frame: RawFrame,
-    resolved: Collection[tuple[str, int, int]],
+    takers: Takers,
     calibration: Calibration,
 ) -> list[tuple[int, int]]:
     """Return the pairs of tracks that are one image in a frame: no mirror images, none found as two."""
-    own = {
-        track.track
-        for track in tracks
-        if any(key in resolved and key[:2] == (frame.camera, frame.index) for key in track.detections)
-    }
+    alone = {track for who in _taken_in(frame, takers).values() if len(who) == 1 for track in who}
     robots = {track.track for track in tracks if track.ghost != "yes"}
     of_robots = {number: one for number, one in expected.items() if number in robots}
-    return [pair for pair in inseparable(of_robots, calibration) if not own.issuperset(pair)]
+    return [pair for pair in inseparable(of_robots, calibration) if not alone.issuperset(pair)]

@@ -145,7 +145,7 @@ def evaluate_messages(
             name: tuple(message for each in of_name.values() for message in each.wrong)
             for name, of_name in judged.items()
         },
-        {name: _numbers(of_name.values(), in_view) for name, of_name in judged.items()},
+        {name: _numbers(of_name.values(), in_view, len(in_view)) for name, of_name in judged.items()},
         {
             name: {robot: _numbers([each], in_view, packets[robot]) for robot, each in of_name.items()}
             for name, of_name in judged.items()
@@ -240,9 +240,9 @@ def _is_of(message: Message, packet: SentTruth) -> bool:
 
 
 def _numbers(
-    judged: Iterable[_Judged], in_view: Sequence[tuple[str, SentTruth]], packets: int | None = None
+    judged: Iterable[_Judged], in_view: Sequence[tuple[str, SentTruth]], packets: int
 ) -> dict[str, Any]:
-    """Return the numbers of observers together; `packets` is how many they could see, all by default."""
+    """Return the numbers of observers together, of so many packets that they could see."""
     each = list(judged)
     late_s = [
         told.told_s - in_view[k][1].end_s
@@ -250,12 +250,12 @@ def _numbers(
         for k, told in one.heard.items()
         if told.told_s is not None
     ]
-    sent, received = len(in_view) if packets is None else packets, sum(len(one.heard) for one in each)
+    received = sum(len(one.heard) for one in each)
     bits = sum(one.bits for one in each)
     return {
-        "message_sent": sent,
+        "message_sent": packets,
         "message_received": received,
-        "message_missed": sent - received,
+        "message_missed": packets - received,
         "message_wrong": sum(len(one.wrong) for one in each),
         "message_misattributed": sum(one.misattributed for one in each),
         "message_repeated": sum(one.repeated for one in each),

@@ -13,6 +13,8 @@ from perception.types import Track
 
 Values = NDArray[np.float64]
 
+_SINGULAR = 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class Followed:
@@ -130,9 +132,6 @@ def _nees(off: Values, covariance: Values) -> float | None:
     pulls = np.einsum("nji,nj->ni", vectors, off / sigma)[sound]
     found = (pulls**2 / values[sound]).sum(axis=1) / off.shape[1]
     return float(found.mean()) if found.size else None
-
-
-_SINGULAR = 1e-12
 
 
 def _rms(values: Values) -> float | None:

@@ -26,6 +26,9 @@ Values = NDArray[np.float64]
 REACH_M = 1.0
 """Similarity of a track and a source falls from 1 to 0 at this distance."""
 
+FEW_SETS = 10
+"""Tracks begin within three sets: of fewer than these the scores tell nothing, and are not shown."""
+
 _SAME_TIME_S = 1e-3
 """A track stands at the time of its set: as written and as reckoned they may differ."""
 
@@ -50,10 +53,6 @@ class TrackEvaluation:
     moments: tuple[Moment, ...]
     summary: Mapping[str, Mapping[str, Any]]
     by_observer: Mapping[str, Mapping[str, Mapping[str, Any]]]
-
-
-FEW_SETS = 10
-"""Tracks begin within three sets: of fewer than these the scores tell nothing, and are not shown."""
 
 
 def evaluate_tracks(

@@ -1,5 +1,6 @@
 """What a light group sends: its spectrum of unit flux, and how many units of emission."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
@@ -20,6 +21,16 @@ from nir_render.spectra.illuminants import (
 from nir_render.spectra.sunlight import Column, Sunlight, sunlight
 
 Emitter = Source | Lamp | Sun | Skylight
+
+
+def light_groups(
+    spheres: Mapping[str, Source], lamps: Mapping[str, Lamp], sun: Sun | None, skylight: Skylight | None
+) -> dict[str, Emitter]:
+    """Return what each light group is: `robot.source`, `beacons.name`, `lamps.name`, `sun`, `sky`."""
+    known: dict[str, Emitter] = dict(spheres)
+    known |= {f"lamps.{name}": lamp for name, lamp in lamps.items()}
+    known |= {} if sun is None else {"sun": sun}
+    return known if skylight is None else known | {"sky": skylight}
 
 
 def emission_spectrum(emitter: Emitter) -> Curve:

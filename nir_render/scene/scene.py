@@ -14,7 +14,7 @@ from nir_render.scene.checks import check
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.emitters import Source
-from nir_render.scene.emission import Emitter
+from nir_render.scene.emission import Emitter, light_groups
 from nir_render.scene.explain import Places, explain
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
@@ -74,12 +74,10 @@ class Scene:
 
     def emitters(self) -> dict[str, Emitter]:
         """Return what each light group is: `robot.source`, `beacons.name`, `lamps.name`, `sun`, `sky`."""
-        known: dict[str, Emitter] = {name: source for name, (_, source) in self.sources().items()}
-        known |= {f"beacons.{name}": source for name, source in (self.document.beacons or {}).items()}
-        known |= {f"lamps.{name}": lamp for name, lamp in self.document.shining_lamps.items()}
-        known |= {} if self.document.sun is None else {"sun": self.document.sun}
-        skylight = self.document.skylight
-        return known if skylight is None else known | {"sky": skylight}
+        document = self.document
+        spheres = {name: source for name, (_, source) in self.sources().items()}
+        spheres |= {f"beacons.{name}": source for name, source in (document.beacons or {}).items()}
+        return light_groups(spheres, document.shining_lamps, document.sun, document.skylight)
 
     def at(self, time_s: float) -> Snapshot:
         """Return the world of this scene at a time, robots where their motions have brought them.

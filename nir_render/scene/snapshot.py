@@ -26,7 +26,7 @@ from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import MaterialDocument
 from nir_render.scene.documents.shapes import ShapeDocument
 from nir_render.scene.documents.times.drives import Drive, SourceDrive
-from nir_render.scene.emission import Emitter
+from nir_render.scene.emission import Emitter, light_groups
 from nir_render.scene.explain import explain
 from nir_render.scene.motion import Velocity
 from nir_render.scene.pose import Pose, camera_mount, source_mount
@@ -126,10 +126,8 @@ class Snapshot:
     @cached_property
     def emitters(self) -> Mapping[str, Emitter]:
         """What each light group is, by name: `robot.source`, `beacons.name`, `lamps.name`, `sun`, `sky`."""
-        known: dict[str, Emitter] = {name: placed.source for name, placed in self.sources.items()}
-        known |= {f"lamps.{name}": lamp for name, lamp in self.lamps.items()}
-        known |= {} if self.sun is None else {"sun": self.sun}
-        return known if self.skylight is None else known | {"sky": self.skylight}
+        spheres = {name: placed.source for name, placed in self.sources.items()}
+        return light_groups(spheres, self.lamps, self.sun, self.skylight)
 
     @property
     def groups(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from nir_render.errors import InputError, shown
+from nir_render.truth.sources import is_number
 
 _UNIT_SLACK = 1e-3
 
@@ -44,18 +45,14 @@ def parse_pose(record: Mapping[str, Any]) -> PoseTruth:
     problems = []
     if not isinstance(record.get("robot"), str):
         problems.append(f"robot is {shown(record.get('robot'))}; wanted a name")
-    if not _is_number(record.get("time_s")):
+    if not is_number(record.get("time_s")):
         problems.append(f"time_s is {shown(record.get('time_s'))}; wanted a number")
     for name, length in _LENGTHS.items():
         value = record.get(name)
-        if not isinstance(value, list | tuple) or len(value) != length or not all(map(_is_number, value)):
+        if not isinstance(value, list | tuple) or len(value) != length or not all(map(is_number, value)):
             problems.append(f"{name} is {shown(value)}; wanted {length} numbers")
     if not problems and abs(math.hypot(*record["quaternion_xyzw"]) - 1.0) > _UNIT_SLACK:
         problems.append(f"quaternion_xyzw is {shown(record['quaternion_xyzw'])}; wanted one of length 1")
     if problems:
         raise InputError(*problems)
     return PoseTruth(record["robot"], record["time_s"], *(tuple(record[name]) for name in _LENGTHS))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

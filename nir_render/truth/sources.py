@@ -121,7 +121,7 @@ def _checked(name: str, kind: str, value: Any) -> Any:
     if value is None and "None" in kind:
         return value
     if name in _VECTORS:
-        if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(_is_number, value)):
+        if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(is_number, value)):
             raise ValueError(f"{name} is {shown(value)}; wanted a list of three finite numbers")
         if name != "position_body_m" and abs(math.hypot(*value) - 1.0) > _UNIT_SLACK:
             raise ValueError(f"{name} is {shown(value)}; wanted a vector of length 1")
@@ -130,7 +130,7 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         if isinstance(value, str) and value.isprintable():
             return value
         raise ValueError(f"{name} is {shown(value)}; wanted a text of one line")
-    if not _is_number(value) or ("int" in kind and not isinstance(value, int)):
+    if not is_number(value) or ("int" in kind and not isinstance(value, int)):
         wanted = "whole number" if "int" in kind else "finite number"
         raise ValueError(f"{name} is {shown(value)}; wanted a {wanted}")
     least, most = _BOUNDS.get(name, (-_MOST, _MOST))
@@ -139,6 +139,6 @@ def _checked(name: str, kind: str, value: Any) -> Any:
     return value if "int" in kind else float(value)
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
     """Tell whether a value is a number that sums and squares of stay finite."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -_MOST <= value <= _MOST

@@ -188,7 +188,7 @@ def _intrusion(by_edge: Array, foreign: Array, edges: Numbers, ways: Numbers, st
         if way % 2 == 0:
             score = by_edge[after, 0] - by_edge[edge, 1]
         if way < 3:
-            score += by_edge[edge, 2 + (way if way < 2 else 2)]
+            score += by_edge[edge, 2 + way]
         since = max(since + foreign[after] - foreign[edge] - score, 0.0)
         most = max(most, since)
     return most

@@ -126,18 +126,17 @@ def shared_flares(
         rows = np.sort(rows[np.argsort(off2[k, rows], kind="stable")[:_MOST_NEAR]])
         for size in range(2, _MOST_IN_ONE + 1):
             for chosen in itertools.combinations(rows.tolist(), size):
+                if not owners.issubset(chosen):
+                    continue
                 numbers = frozenset(bank.number[list(chosen)].tolist())
                 group = _explained(
                     bank, seen, k, chosen, far_m[k], along[k], time_s, before.get(numbers), clutter, settings
                 )
-                if group is None or not owners <= set(chosen):
+                if group is None:
                     continue
                 together = any(len(numbers & others) >= 2 for others in before)
-                odds = (
-                    group.odds
-                    + (SHARED_ODDS if together else -SHARED_ODDS)
-                    - float(np.sum(gain[list(chosen)]))
-                )
+                odds = group.odds + (SHARED_ODDS if together else -SHARED_ODDS)
+                odds -= float(np.sum(gain[list(chosen)]))
                 if odds > -DOUBT_ODDS:
                     groups.append(group._replace(odds=odds))
     found: list[Shared] = []

@@ -50,10 +50,8 @@ def beaten(rhythm: Mapping[str, Beat], names: Iterable[str], time_s: float) -> d
 
 def _period_s(cameras: Sequence[str], rhythm: Mapping[str, Beat]) -> float:
     """Return the period of the fastest of some cameras; 0 where none is known."""
-    known = [
-        rhythm[name].period_s for name in cameras if name in rhythm and np.isfinite(rhythm[name].period_s)
-    ]
-    return min(known, default=0.0)
+    fastest_s = min((rhythm[name].period_s for name in cameras if name in rhythm), default=np.inf)
+    return fastest_s if np.isfinite(fastest_s) else 0.0
 
 
 class Observations(NamedTuple):
