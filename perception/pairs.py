@@ -16,7 +16,6 @@ from perception.messages.settings import DecoderSettings
 from perception.photometry import (
     Expected,
     Sample,
-    image_width_px,
     sample_at,
     sample_of_detection,
     signal_of,
@@ -58,12 +57,12 @@ class SumSample:
     ratio: float
 
 
-def inseparable(expected: Mapping[int, Expected], calibration: Calibration) -> list[Tracks]:
+def inseparable(expected: Mapping[int, Expected]) -> list[Tracks]:
     """Return the pairs of tracks, by number, whose images in a frame are one, as far as places are known."""
     numbers = list(expected)
     images = list(expected.values())
     place_px = np.array([[one.u_px, one.v_px] for one in images]).reshape(-1, 2)
-    width_px = np.array([image_width_px(one, calibration) for one in images])
+    width_px = np.array([one.width_px for one in images])
     unsure_px = np.array([one.sigma_px for one in images])
     apart_px = np.hypot(*(place_px[:, None] - place_px).transpose(2, 0, 1))
     blurred_px = np.hypot(
@@ -94,11 +93,10 @@ def sample_of_sum(
         sigma_px=max(one.sigma_px, other.sigma_px),
         range_m=one.range_m,
         flux_dn=one.flux_dn,
+        width_px=one.width_px,
     )
     apart_px = math.hypot(one.u_px - other.u_px, one.v_px - other.v_px)
-    reach_px = apart_px + 2.0 * _APART * math.hypot(
-        image_width_px(one, calibration), min(between.sigma_px, _SURE_PX)
-    )
+    reach_px = apart_px + 2.0 * _APART * math.hypot(one.width_px, min(between.sigma_px, _SURE_PX))
     theirs = [
         hit
         for number, hit in enumerate(found)

@@ -65,6 +65,8 @@ class Expected:
         From the lens.
     flux_dn
         Background-subtracted integral if it is lit throughout.
+    width_px
+        Standard deviation of its image, the pixel's own aperture left out.
     """
 
     u_px: float
@@ -72,44 +74,50 @@ class Expected:
     sigma_px: float
     range_m: float
     flux_dn: float
+    width_px: float
 
 
-def expected_image(
+def expected_images(
     position_body_m: Array,
     covariance_m2: Array,
     frame: RawFrame,
     calibration: Calibration,
     extinction_per_m: float | None = None,
-) -> Expected | None:
-    """Return where a source must be in a frame, by its predicted place; None where it is out of view.
+) -> list[Expected | None]:
+    """Return where sources must be in a frame, by their predicted places; None for each out of view.
 
     Parameters
     ----------
     position_body_m, covariance_m2
-        Where it is predicted at the frame's time, in body axes, shape (3,), and how well, shape (3, 3).
+        Where they are predicted at the frame's time, in body axes, shape (sources, 3), and how well, shape
+        (sources, 3, 3).
     extinction_per_m
         Of the fog, as a set told it; without it what the calibration says.
     """
-    towards_m = calibration.rotation_body_camera.T @ (position_body_m - calibration.position_body_m)
-    range_m = float(np.linalg.norm(towards_m))
-    if not towards_m[2] > 0.0:
-        return None
-    u_px, v_px = project(towards_m[None, :], calibration)[0].tolist()
-    inside = -0.5 <= u_px < calibration.width_px - 0.5 and -0.5 <= v_px < calibration.height_px - 0.5
-    if not inside:
-        return None
-    exposed_s = float(exposure_towards(towards_m / range_m, frame.exposure_s, frame.gain, calibration))
-    flux_dn = calibration.range_constant_dn_m2_per_s * exposed_s / range_m**2
+    found: list[Expected | None] = [None] * len(position_body_m)
+    towards_m = (position_body_m - calibration.position_body_m) @ calibration.rotation_body_camera
+    place_px = project(towards_m, calibration)  # NaN behind the lens
+    size_px = (calibration.width_px, calibration.height_px)
+    seen = np.flatnonzero(((place_px >= -0.5) & (place_px < np.subtract(size_px, 0.5))).all(axis=1))
+    if not len(seen):
+        return found
+    place_px, range_m = place_px[seen], np.linalg.norm(towards_m[seen], axis=1)
+    direction = towards_m[seen] / range_m[:, None]
+    exposed_s = exposure_towards(direction, frame.exposure_s, frame.gain, calibration)
     fog_per_m = calibration.extinction_per_m if extinction_per_m is None else extinction_per_m
-    flux_dn *= math.exp(-fog_per_m * range_m)
-    if not flux_dn > 0.0:
-        return None
-    turn = pixel_turn([[u_px, v_px]], calibration)[0]
-    axes = turn / (turn**2).sum(axis=1, keepdims=True) / range_m
-    of_camera = calibration.rotation_body_camera.T @ covariance_m2 @ calibration.rotation_body_camera
-    place_px2 = axes @ of_camera @ axes.T
-    sigma_px = math.sqrt(max(float(np.linalg.eigvalsh(place_px2)[-1]), 0.0))
-    return Expected(u_px, v_px, sigma_px, range_m, flux_dn)
+    flux_dn = calibration.range_constant_dn_m2_per_s * exposed_s / range_m**2 * np.exp(-fog_per_m * range_m)
+    turn = pixel_turn(place_px, calibration)
+    axes = turn / (turn**2).sum(axis=2, keepdims=True) / range_m[:, None, None]
+    axes = axes @ calibration.rotation_body_camera.T
+    place_px2 = axes @ covariance_m2[seen] @ axes.swapaxes(1, 2)
+    sigma_px = np.sqrt(np.maximum(np.linalg.eigvalsh(place_px2)[:, -1], 0.0))
+    disc_rad = angular_radius_rad(range_m, calibration.source_radius_m)
+    width_px = _width_px(place_px[:, 0], place_px[:, 1], disc_rad, calibration)
+    columns = np.column_stack([place_px, sigma_px, range_m, flux_dn, width_px])
+    for index, row, flux in zip(seen.tolist(), columns.tolist(), flux_dn.tolist(), strict=True):
+        if flux > 0.0:
+            found[index] = Expected(*row)
+    return found
 
 
 def sample_of_detection(
@@ -147,7 +155,7 @@ def sample_at(
     None where nothing can be said: a flare lies upon the place, or may be the source after all; pixels are
     clipped; the place is too uncertain and the source too faint for its absence to say that it is dark.
     """
-    width_px = image_width_px(expected, calibration)
+    width_px = expected.width_px
     if width_px > _LARGEST_PX:
         return None
     gain = gain_dn_per_e(frame, calibration)
@@ -172,10 +180,7 @@ def sample_at(
         return None
     # The image of a source whose place is not known well is its mean over where it may be.
     shapes = [_gaussian(expected.u_px, expected.v_px, blurred_px, window)]
-    for hit in found:
-        hit_rad = float(angular_radius_rad(max(hit.range_m, 0.01), calibration.source_radius_m))
-        hit_rad = hit_rad if math.isfinite(hit_rad) else 0.0
-        hit_px = _width_px(hit.u_px, hit.v_px, hit_rad, calibration)
+    for hit, hit_rad, hit_px in _sizes(found, calibration):
         if max(abs(hit.u_px - expected.u_px), abs(hit.v_px - expected.v_px)) < half_px + _REACH * hit_px:
             resolved = hit_rad * calibration.fx_px > _RESOLVED_PX
             if resolved and has_image(hit.u_px, hit.v_px, hit_rad, calibration):
@@ -199,18 +204,23 @@ def sample_at(
     return _sample(flux_e / lit_e, sigma_e / lit_e, expected, frame, calibration)
 
 
+def _sizes(found: Sequence[Detection], calibration: Calibration) -> list[tuple[Detection, float, float]]:
+    """Return detections, each with its angular radius and the standard deviation of its image."""
+    if not found:
+        return []
+    u_px, v_px, range_m = np.array([(hit.u_px, hit.v_px, hit.range_m) for hit in found]).T
+    radius_rad = angular_radius_rad(np.maximum(range_m, 0.01), calibration.source_radius_m)
+    radius_rad = np.where(np.isfinite(radius_rad), radius_rad, 0.0)
+    width_px = _width_px(u_px, v_px, radius_rad, calibration)
+    return list(zip(found, radius_rad.tolist(), width_px.tolist(), strict=True))
+
+
 def signal_of(robot: str, track: int, samples: Sequence[Sample]) -> Signal:
     """Return the samples of one track, by time, as a signal."""
     columns = np.array(
         [[one.time_s, one.exposure_s, one.level, one.sigma_dark, one.sigma_lit] for one in samples]
     ).reshape(-1, 5)
     return Signal(robot, track, *columns.T)
-
-
-def image_width_px(expected: Expected, calibration: Calibration) -> float:
-    """Return the standard deviation of the image of a source, the pixel's own aperture left out."""
-    disc_rad = float(angular_radius_rad(expected.range_m, calibration.source_radius_m))
-    return _width_px(expected.u_px, expected.v_px, disc_rad, calibration)
 
 
 def _chance_missed(
@@ -238,10 +248,10 @@ def _sample(
     return Sample(middle_s, frame.exposure_s, level, sigma_dark, lit)
 
 
-def _width_px(u_px: float, v_px: float, disc_rad: float, calibration: Calibration) -> float:
-    """Return the standard deviation of a source's image, the pixel's own aperture left out."""
-    radius_px = float(image_radius_px(u_px, v_px, disc_rad, calibration)) if disc_rad > 0.0 else 0.0
-    return math.hypot(calibration.psf_sigma_px, 0.5 * radius_px)
+def _width_px(u_px: Array, v_px: Array, disc_rad: Array, calibration: Calibration) -> Array:
+    """Return the standard deviations of images, the pixel's own aperture left out, shape (sources,)."""
+    radius_px = image_radius_px(u_px, v_px, disc_rad, calibration)
+    return np.asarray(np.hypot(calibration.psf_sigma_px, 0.5 * np.where(disc_rad > 0.0, radius_px, 0.0)))
 
 
 def _gaussian(u_px: float, v_px: float, sigma_px: float, window: PixelBox) -> Array:

@@ -14,6 +14,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from perception.estimators import Estimator, detect_frames
 from perception.messages.decoder import Decoder
 from perception.messages.paper import PaperDecoder
@@ -21,7 +23,7 @@ from perception.pairs import PairReader, SumSample, inseparable, sample_of_sum
 from perception.photometry import (
     Expected,
     Sample,
-    expected_image,
+    expected_images,
     sample_at,
     sample_of_detection,
     signal_of,
@@ -232,8 +234,7 @@ class Pipeline:
                 takers.setdefault(key, set()).add(track.track)
         places = [self._expected(frame, time_s, tracks, odometry) for frame in frames]
         together = [
-            _together(there, tracks, frame, takers, self._calibrations[frame.camera])
-            for there, frame in zip(places, frames, strict=True)
+            _together(there, tracks, frame, takers) for there, frame in zip(places, frames, strict=True)
         ]
         for track in tracks:
             samples = [
@@ -286,19 +287,15 @@ class Pipeline:
     ) -> dict[int, Expected]:
         """Return where the tracks in view must be in a frame, and how bright, by number."""
         now = self._at(frame, time_s, tracks, odometry)
-        expected = {}
-        for track in tracks:
-            there = now.get(track.track, track)
-            image = expected_image(
-                there.position_body_m,
-                there.covariance[:3, :3],
-                frame,
-                self._calibrations[frame.camera],
-                self._extinction_per_m,
-            )
-            if image is not None:
-                expected[track.track] = image
-        return expected
+        there = [now.get(track.track, track) for track in tracks]
+        images = expected_images(
+            np.array([track.position_body_m for track in there]).reshape(-1, 3),
+            np.array([track.covariance[:3, :3] for track in there]).reshape(-1, 3, 3),
+            frame,
+            self._calibrations[frame.camera],
+            self._extinction_per_m,
+        )
+        return {track.track: image for track, image in zip(tracks, images, strict=True) if image is not None}
 
     def _at(
         self, frame: RawFrame, time_s: float, tracks: Sequence[Track], odometry: Sequence[Odometry]
@@ -346,10 +343,9 @@ def _together(
     tracks: Sequence[Track],
     frame: RawFrame,
     takers: Takers,
-    calibration: Calibration,
 ) -> list[tuple[int, int]]:
     """Return the pairs of tracks that are one image in a frame: no mirror images, none found as two."""
     alone = {track for who in _taken_in(frame, takers).values() if len(who) == 1 for track in who}
     robots = {track.track for track in tracks if track.ghost != "yes"}
     of_robots = {number: one for number, one in expected.items() if number in robots}
-    return [pair for pair in inseparable(of_robots, calibration) if not alone.issuperset(pair)]
+    return [pair for pair in inseparable(of_robots) if not alone.issuperset(pair)]

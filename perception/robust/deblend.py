@@ -45,6 +45,8 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
     """
     found = list(solutions)
     asking = [index for index, each in enumerate(found) if asks_for_more(each)]
+    if not asking:
+        return found
     asking = sorted(sorted(asking, key=lambda index: -float(found[index].flux_e.max()))[:MOST_WINDOWS])
     lone = [index for index in asking if found[index].count == 1]
     free = _with_spread(camera, "psf_sigma_px", _WIDTH_FREE)
@@ -87,6 +89,8 @@ def asks_for_more(solution: Solution) -> bool:
 
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     """Fit lone flares whose size may be any, whatever their flux says."""
+    if not solutions:
+        return []
     free = _with_spread(camera, "range_constant_dn_m2_per_s", 8.0)
     return solve([solution.again() for solution in solutions], free)
 

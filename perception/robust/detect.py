@@ -13,8 +13,7 @@ from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
 from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
-from perception.robust.search.cutout import ring_median
-from perception.robust.search.frame import filtered
+from perception.robust.search.frame import levels_around
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.types import Calibration, Detection, RawFrame
 
@@ -67,8 +66,8 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         blob
         for component in blobs_at(prepared.lit_at, prepared.lit_e, calibration.width_px)
         for blob in _split(component, prepared)
-        if _stands_above_surroundings(blob, prepared)
     ]
+    blobs = _above_surroundings(blobs, prepared)
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
     measured = measure(clusters(brightest(flares, MOST_FLARES), prepared), prepared)
     measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
@@ -120,41 +119,46 @@ def _in_fog(
         )
 
 
-def _stands_above_surroundings(blob: Blob, prepared: PreparedFrame) -> bool:
-    """Tell whether a blob's peak exceeds the level of a ring around it by more than noise does.
+def _above_surroundings(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Blob]:
+    """Return the blobs whose peak exceeds the level of a ring around them by more than noise does.
 
     The sheen of a lamp on metal, or a wall's lit corner, bends within a cell of the background mesh; on the
     slope that is left, noise alone passes the detection limit. The ring lies just outside the PSF's reach and
-    takes that slope with it. Its median is blind to other flares in less than half of it.
+    takes that slope with it. Its median is blind to other flares in less than half of it. Also returned are
+    those of whose ring the frame's edges leave too little.
 
     Parameters
     ----------
-    blob
-        The blob.
+    blobs
+        What exceeds the detection limit.
     prepared
         The frame it was found in.
-
-    Returns
-    -------
-    True also where the frame's edges leave too little of the ring.
     """
+    boxes = np.array([blob.box.corner_and_size for blob in blobs], dtype=np.int64).reshape(-1, 4)
+    gap_px = math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1
+    levels_e, counts = levels_around(
+        prepared.pixels, prepared.kernel, prepared.bad_at, boxes, gap_px, _RING_PX
+    )
+    kept = []
+    for blob, level_e, count in zip(blobs, levels_e.tolist(), counts.tolist(), strict=True):
+        middle_e = _middle_e(blob, prepared)
+        noise_e = prepared.filtered_noise * math.sqrt(max(level_e + middle_e, 0.0) + prepared.floor_e2)
+        if count < _FEWEST_RING_PIXELS or blob.peak_e - level_e > CONTRAST_SIGMAS * noise_e:
+            kept.append(blob)
+    return kept
+
+
+def _middle_e(blob: Blob, prepared: PreparedFrame) -> float:
+    """Return the background in the middle of a blob's box."""
     box = blob.box
-    inner = box.with_margin(math.ceil(3.0 * prepared.calibration.psf_sigma_px) + 1)
-    outer = inner.with_margin(_RING_PX).inside(prepared.shape)
-    around_e = filtered(prepared.pixels, prepared.kernel, prepared.bad_at, outer.corner_and_size)
-    level_e, count = ring_median(around_e, inner.seen_from(outer).corner_and_size)
-    if count < _FEWEST_RING_PIXELS:
-        return True
-    middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
-    noise_e = prepared.filtered_noise * math.sqrt(max(level_e + middle_e, 0.0) + prepared.floor_e2)
-    return blob.peak_e - level_e > CONTRAST_SIGMAS * noise_e
+    return prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
 
 
 def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
     """Divide a component at maxima that differ by more than their noise."""
-    box = component.box
-    middle_e = prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
-    expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
+    expected_e = np.maximum(
+        component.filtered_e + np.float32(_middle_e(component, prepared)), np.float32(0.0)
+    )
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
     return split_at_peaks(component, noise_e)
 

@@ -119,37 +119,53 @@ def cell_means(
     which pixels of each cell are looked at, shape (cells, samples).
     """
     means = np.empty((len(rows), len(columns)))
-    count_of = np.zeros(1 << 16, dtype=np.uint16)
+    count_of = np.zeros((len(columns), 1 << 16), dtype=np.uint16)
+    lowest, highest = np.empty(len(columns), dtype=np.int64), np.empty(len(columns), dtype=np.int64)
     for down in range(len(rows)):
-        for across in range(len(columns)):
-            lowest, highest = 1 << 16, 0
-            for row in rows[down]:
+        lowest[:], highest[:] = 1 << 16, 0
+        # Along whole rows of the frame, as they lie in memory.
+        for row in rows[down]:
+            for across in range(len(columns)):
+                own, least, most = count_of[across], lowest[across], highest[across]
                 for column in columns[across]:
                     count = int(data_dn[row, column])
-                    count_of[count] += 1
-                    lowest, highest = min(lowest, count), max(highest, count)
-            low, high = lowest, highest
-            kept = rows.shape[1] * columns.shape[1]
-            for clipping in range(CLIP_ROUNDS + 1):
-                # The lower median is itself a sample, so at least it is always kept.
-                median, before = low, int(count_of[low])
-                while before < (kept - 1) // 2 + 1:
-                    median += 1
-                    before += int(count_of[median])
-                if clipping == CLIP_ROUNDS:
-                    break
-                sigma = gain_dn_per_e * math.sqrt(max((median - black_dn) / gain_dn_per_e, 0.0) + floor_e2)
-                low = max(lowest, math.ceil(max(median - CLIP_SIGMA * sigma, 0.0)))
-                high = min(highest, math.floor(min(median + CLIP_SIGMA * sigma, 65535.0)))
-                kept = 0
-                for count in range(low, high + 1):
-                    kept += int(count_of[count])
-            total = 0
-            for count in range(low, high + 1):
-                total += count * int(count_of[count])
-            means[down, across] = total / kept
-            count_of[lowest : highest + 1] = 0
+                    own[count] += 1
+                    least, most = min(least, count), max(most, count)
+                lowest[across], highest[across] = least, most
+        for across in range(len(columns)):
+            means[down, across] = _clipped_mean(
+                count_of[across], lowest[across], highest[across], rows.shape[1] * columns.shape[1],
+                black_dn, gain_dn_per_e, floor_e2,
+            )  # fmt: skip
+            count_of[across, lowest[across] : highest[across] + 1] = 0
     return means
+
+
+@compiled
+def _clipped_mean(
+    count_of: NDArray[np.uint16], lowest: int, highest: int, kept: int,
+    black_dn: float, gain_dn_per_e: float, floor_e2: float,
+) -> float:  # fmt: skip
+    """Return the mean of counts of which there are so many of each, `kept` in all, from lowest to highest."""
+    low, high = lowest, highest
+    for clipping in range(CLIP_ROUNDS + 1):
+        # The lower median is itself a sample, so at least it is always kept.
+        median, before = low, int(count_of[low])
+        while before < (kept - 1) // 2 + 1:
+            median += 1
+            before += int(count_of[median])
+        if clipping == CLIP_ROUNDS:
+            break
+        sigma = gain_dn_per_e * math.sqrt(max((median - black_dn) / gain_dn_per_e, 0.0) + floor_e2)
+        low = max(lowest, math.ceil(max(median - CLIP_SIGMA * sigma, 0.0)))
+        high = min(highest, math.floor(min(median + CLIP_SIGMA * sigma, 65535.0)))
+        kept = 0
+        for count in range(low, high + 1):
+            kept += int(count_of[count])
+    total = 0
+    for count in range(low, high + 1):
+        total += count * int(count_of[count])
+    return total / kept
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""What is looked at of a blob: its light, the ring around it, and the window that is cut out of the frame."""
+"""What is looked at of a blob: its light, and the window that is cut out of the frame."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,20 +12,6 @@ Places = NDArray[np.int64]
 
 OWN, OTHERS, STRAY = 1, 2, 3
 """Whose the light of a lit pixel is: that of a window's flares, of others, or of what is no flare."""
-
-
-@compiled
-def ring_median(image: Float32, inner: tuple[int, int, int, int]) -> tuple[float, int]:
-    """Return the median of an image around an inner (top, left, height, width), and of how many pixels."""
-    top, left, height, width = inner
-    values, count = np.empty(image.size, dtype=np.float32), 0
-    for row in range(image.shape[0]):
-        inside = top <= row < top + height
-        for column in range(image.shape[1]):
-            if not (inside and left <= column < left + width):
-                values[count] = image[row, column]
-                count += 1
-    return (float(np.median(values[:count])) if count else 0.0), count
 
 
 @compiled

@@ -16,6 +16,9 @@ Float32 = NDArray[np.float32]
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
+_LOOKED_AT = 256
+"""So many pixels of a row are counted at once, before any is looked at by itself."""
+
 
 class Pixels(NamedTuple):
     """A frame's counts, how they become electrons, and the background beneath.
@@ -82,6 +85,36 @@ def filtered(pixels: Pixels, kernel: Float32, bad_at: Places, box: tuple[int, in
 
 
 @compiled
+def levels_around(
+    pixels: Pixels, kernel: Float32, bad_at: Places, boxes: Places, gap_px: int, ring_px: int
+) -> tuple[Array, Places]:
+    """Return the median of the filtered frame in a ring around each of some boxes, and of how many pixels.
+
+    Boxes are rows of (top, left, height, width); the ring, so many pixels wide, begins so many beside them.
+    What of it lies beyond the frame does not count; 0 where that is all of it.
+    """
+    rows, columns = pixels.data_dn.shape
+    levels, counts = np.zeros(len(boxes)), np.zeros(len(boxes), dtype=np.int64)
+    for index in range(len(boxes)):
+        top, left, height, width = boxes[index]
+        first_row, first = max(top - gap_px - ring_px, 0), max(left - gap_px - ring_px, 0)
+        end_row = min(top + height + gap_px + ring_px, rows)
+        end = min(left + width + gap_px + ring_px, columns)
+        image = filtered(pixels, kernel, bad_at, (first_row, first, end_row - first_row, end - first))
+        values, count = np.empty(image.size, dtype=np.float32), 0
+        for row in range(first_row, end_row):
+            inside = top - gap_px <= row < top + height + gap_px
+            for column in range(first, end):
+                if not (inside and left - gap_px <= column < left + width + gap_px):
+                    values[count] = image[row - first_row, column - first]
+                    count += 1
+        counts[index] = count
+        if count:
+            levels[index] = np.median(values[:count])
+    return levels, counts
+
+
+@compiled
 def exceeding(
     pixels: Pixels, kernel: Float32, limit_e: Float32, sample_of: Places, sampled: Places
 ) -> tuple[Places, Float32, Float32]:
@@ -111,6 +144,7 @@ def exceeding(
     lowest_e = limit_e
     for by in range(1, half * len(limit_e) // rows + 2):
         lowest_e = np.minimum(np.minimum(lowest_e, _shifted(limit_e, by)), _shifted(limit_e, -by))
+    lowest_e = np.minimum(lowest_e, _shifted(lowest_e, 1))  # a row lies between two of the mesh's
     bright, count_of = np.empty((taps, columns), dtype=np.int64), np.zeros(taps, dtype=np.int64)
     latest = np.full(columns, -1)
     samples = np.empty((sample_of.max() + 1, len(sampled)), dtype=np.float32)
@@ -119,7 +153,7 @@ def exceeding(
         now, row = ahead % taps, ahead - half
         _filter_row(pixels, kernel, none, ahead, 0, padded, across[now])
         one, other, _ = between(min(ahead, rows - 1), rows, len(limit_e))
-        count_of[now] = _brighter(across[now], lowest_e[one], lowest_e[other], bright[now])
+        count_of[now] = _brighter(across[now], lowest_e[one], bright[now])
         if row < 0:
             continue
         if sample_of[row] >= 0:
@@ -144,8 +178,10 @@ def exceeding(
                         values = np.append(values, np.empty(count, dtype=np.float32))
                     places[count], values[count] = row * columns + column, total
                     count += 1
-        order = np.argsort(places[before:count])
-        places[before:count], values[before:count] = places[before:count][order], values[before:count][order]
+        if count > before + 1:
+            order = np.argsort(places[before:count])
+            places[before:count] = places[before:count][order]
+            values[before:count] = values[before:count][order]
     return places[:count].copy(), values[:count].copy(), samples
 
 
@@ -159,15 +195,17 @@ def _shifted(mesh: Float32, by: int) -> Float32:
 
 
 @compiled
-def _brighter(row: Float32, one: Float32, other: Float32, into: Places) -> int:
-    """Write which pixels of a row exceed the lower one of two limits, and return how many do."""
-    if _count_above(row, one, other) == 0:
-        return 0
+def _brighter(row: Float32, limit_e: Float32, into: Places) -> int:
+    """Write which pixels of a row exceed a limit, and return how many do."""
     count = 0
-    for column in range(len(row)):
-        if row[column] > min(one[column], other[column]):
-            into[count] = column
-            count += 1
+    for first in range(0, len(row), _LOOKED_AT):
+        part, least_e = row[first : first + _LOOKED_AT], limit_e[first : first + _LOOKED_AT]
+        if _count_above(part, least_e) == 0:
+            continue
+        for column in range(len(part)):
+            if part[column] > least_e[column]:
+                into[count] = first + column
+                count += 1
     return count
 
 
@@ -212,6 +250,13 @@ def _filter_row(
             column = bad_at[at] - row * columns
             within[column - first] = _ground_dn(pixels, row, column)
             at += 1
+    one, other, share = between(row, rows, len(pixels.ground_e))
+    above, below = pixels.ground_e[one, left : left + width], pixels.ground_e[other, left : left + width]
+    scale, part, rest = np.float32(pixels.e_per_dn), np.float32(share), np.float32(1.0 - share)
+    black_e = np.float32(pixels.black_level_dn * pixels.e_per_dn)
+    if half == 3:
+        _weigh_seven(padded, kernel[half:], scale, black_e, (rest, part), (above, below), into)
+        return
     _weigh(padded[half:][:width], kernel[half], into)
     for step in range(1, half + 1, 3):
         before = (
@@ -225,12 +270,28 @@ def _filter_row(
             padded[half + step + 2 :][:width],
         )
         _add_six(before, behind, kernel[half + step : half + step + 3], into)
-    one, other, share = between(row, rows, len(pixels.ground_e))
-    above, below = pixels.ground_e[one, left : left + width], pixels.ground_e[other, left : left + width]
-    scale, part, rest = np.float32(pixels.e_per_dn), np.float32(share), np.float32(1.0 - share)
-    black_e = np.float32(pixels.black_level_dn * pixels.e_per_dn)
     for column in range(width):
         into[column] = into[column] * scale - black_e - (rest * above[column] + part * below[column])
+
+
+@compiled
+def _weigh_seven(
+    padded: Float32, weights: Float32, scale: np.float32, black_e: np.float32,
+    shares: tuple[np.float32, np.float32], ground_e: tuple[Float32, Float32], into: Float32,
+) -> None:  # fmt: skip
+    """Write a row filtered with seven weights, those of the middle and of one side given, less the ground.
+
+    The kernel of most point spreads is so short; to the bit what the longer way gives, in one go.
+    """
+    (rest, part), (above, below) = shares, ground_e
+    middle, a, b, c = weights[0], weights[1], weights[2], weights[3]
+    for column in range(len(into)):
+        total = middle * padded[column + 3] + (
+            a * (padded[column + 2] + padded[column + 4])
+            + b * (padded[column + 1] + padded[column + 5])
+            + c * (padded[column] + padded[column + 6])
+        )
+        into[column] = total * scale - black_e - (rest * above[column] + part * below[column])
 
 
 @compiled
@@ -277,12 +338,12 @@ def _add_six(
 
 
 @compiled
-def _count_above(row: Float32, one: Float32, other: Float32) -> int:
-    """Count how many pixels of a row exceed the lower one of two limits."""
-    count = 0
+def _count_above(row: Float32, limit_e: Float32) -> int:
+    """Count how many pixels of a row exceed a limit."""
+    count = np.int32(0)  # as wide as the pixels: that halves the time
     for column in range(len(row)):
-        count += row[column] > min(one[column], other[column])
-    return count
+        count += np.int32(row[column] > limit_e[column])
+    return int(count)
 
 
 @compiled

@@ -18,6 +18,13 @@ def point_kernel(psf_sigma_px: float) -> NDArray[np.float64]:
     return np.asarray(share / share.sum())
 
 
+@lru_cache(maxsize=64)
+def point_filter(psf_sigma_px: float) -> tuple[NDArray[np.float64], NDArray[np.float32], float]:
+    """Return a point's image, the same as `frame` wants it, and its noise over that of a pixel, Σh²."""
+    kernel = point_kernel(psf_sigma_px)
+    return kernel, in_threes(kernel), float(np.sum(kernel**2))
+
+
 def in_threes(kernel: NDArray[np.float64]) -> NDArray[np.float32]:
     """Lengthen a kernel by zeros to a multiple of three weights on either side, as `frame` wants it."""
     return np.pad(kernel, -(len(kernel) // 2) % 3).astype(np.float32)

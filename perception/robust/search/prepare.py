@@ -27,7 +27,7 @@ from perception.robust.search.frame import (
     neighbours,
     without,
 )
-from perception.robust.search.limit import in_threes, limit_mesh_of, point_kernel
+from perception.robust.search.limit import limit_mesh_of, point_filter
 from perception.robust.structure import autocorrelation, structure_of
 from perception.types import Calibration, RawFrame
 
@@ -170,9 +170,7 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     PreparedFrame
     """
     floor_e2 = noise_floor_e2(calibration, frame.gain)
-    kernel = point_kernel(calibration.psf_sigma_px)
-    narrow = in_threes(kernel)
-    filtered_noise = float(np.sum(kernel**2))
+    kernel, narrow, filtered_noise = point_filter(calibration.psf_sigma_px)
     # Compiled loops know arrays that may be written and lie in order; others would be compiled for anew.
     frame = replace(frame, data_dn=np.require(frame.data_dn, requirements=("C", "W")))
     mesh_e = background_mesh_e(frame, calibration)
@@ -287,7 +285,7 @@ def _local_contrast(
     import cv2
 
     calibration = prepared.calibration
-    kernel = point_kernel(calibration.psf_sigma_px)
+    kernel, _, of_point = point_filter(calibration.psf_sigma_px)
     side = 2 * len(kernel) - 1
     widened = cv2.dilate((ratio > 1.0).astype(np.uint8), np.ones((3, 3), np.uint8))
     structured = np.asarray(widened).reshape(ratio.shape) > 0
@@ -307,7 +305,7 @@ def _local_contrast(
     padded = np.pad(kernel, side // 2)
     mean = np.convolve(kernel, np.full(side, 1.0 / side))
     of_noise = math.sqrt(float(np.sum((np.outer(padded, padded) - np.outer(mean, mean)) ** 2)))
-    share = np.float32(of_noise / float(np.sum(kernel**2)))
+    share = np.float32(of_noise / of_point)
     rows, columns = (each[part] for each, part in zip(scatter_places(prepared.shape), cells, strict=True))
     samples = contrast_e[np.ix_(rows.ravel() - top, columns.ravel() - left)]
     more = np.ones_like(ratio)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from perception.estimators import detect
-from perception.photometry import Expected, Sample, expected_image, sample_at, sample_of_detection
+from perception.photometry import Expected, Sample, expected_images, sample_at, sample_of_detection
 from perception.types import Calibration, RawFrame
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
@@ -25,7 +25,8 @@ def _place(u_px: float, v_px: float, range_m: float) -> NDArray[np.float64]:
 
 def _expected(u_px: float, v_px: float, range_m: float, sigma_m: float = 1e-3) -> Expected:
     frame = expose(np.zeros((CAMERA.height_px, CAMERA.width_px)), CAMERA, random(0), EXPOSURE_S)
-    found = expected_image(_place(u_px, v_px, range_m), sigma_m**2 * np.eye(3), frame, CAMERA)
+    place_m, covariance_m2 = _place(u_px, v_px, range_m)[None, :], sigma_m**2 * np.eye(3)[None, :, :]
+    (found,) = expected_images(place_m, covariance_m2, frame, CAMERA)
     assert found is not None
     return found
 
@@ -60,8 +61,9 @@ def test_a_source_is_expected_where_it_is_and_as_bright_as_it_is() -> None:
 def test_a_source_out_of_view_is_not_expected() -> None:
     frame = _frame([], 1)
     behind = CAMERA.position_body_m - np.array([1.0, 0.0, 0.0])
-    for place_m in (behind, _place(96.0, 35.0, 4.0), _place(40.0, -1.0, 4.0)):
-        assert expected_image(place_m, np.eye(3) * 1e-6, frame, CAMERA) is None
+    places_m = np.array([behind, _place(96.0, 35.0, 4.0), _place(40.0, -1.0, 4.0), _place(40.0, 35.0, 4.0)])
+    found = expected_images(places_m, np.tile(np.eye(3) * 1e-6, (4, 1, 1)), frame, CAMERA)
+    assert [one is None for one in found] == [True, True, True, False]
 
 
 @pytest.mark.parametrize("sigma_m", [1e-3, 1e-2])

@@ -1,0 +1,112 @@
+"""Sets per second of the whole stack, from four raw frames of 1280 × 960 to tracks and bits: one JSON object.
+
+Robots stand about a rig of four cameras and repeat a word each at 10 Hz; the frames, 30 sets a second, are
+drawn before anything is timed (`tests/unit/perception/simulation.py`) and each is read once, so that it comes
+from memory as a camera leaves it there. Figures are of the sets after the first second: how long a set takes,
+and of that detection by itself; how many tracks there are at the end, and how many messages were read.
+`--seconds 7` and more lets whole packets be heard.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import perception
+from perception import Detection, RawFrame
+from perception.estimators import detect_frames
+from perception.messages.uart import encode
+from tests.unit.perception.rig.world import exposed, means_of, rig
+from tests.unit.perception.simulation import random
+
+FPS, BITS_PER_S, WARM_S = 30.0, 10.0, 1.0
+EXPOSURE_S = 2e-4
+NEAREST_M, FARTHEST_M, APART_RAD = 1.5, 6.0, 0.12
+CAMERAS = rig(own_source=True)
+
+
+def sets_of(robots: int, seconds: float) -> list[list[RawFrame]]:
+    """Return the frames of each set."""
+    rng = random(95, robots)
+    towards: list[np.ndarray] = []
+    while len(towards) < robots:
+        azimuth, height = rng.uniform(-np.pi, np.pi), rng.uniform(-0.4, 0.4)
+        one = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+        if all(one @ other < np.cos(APART_RAD) for other in towards):
+            towards.append(one)
+    places_m = np.array(towards) * rng.uniform(NEAREST_M, FARTHEST_M, (robots, 1))
+    start_s = rng.uniform(0.0, 6.0, robots)
+    dark_e = means_of(CAMERAS, [], EXPOSURE_S)
+    light_e = [_parts(means_of(CAMERAS, [place_m], EXPOSURE_S), dark_e) for place_m in places_m]
+    sets = []
+    for index in range(round(seconds * FPS)):
+        now_s = index / FPS
+        bit = ((now_s - start_s) * BITS_PER_S).astype(int)
+        lit = [encode(k % 128)[b % 55] if b >= 0 else 1 for k, b in enumerate(bit.tolist())]
+        means_e = [mean_e.copy() for mean_e in dark_e]
+        for k in np.flatnonzero(lit):
+            for camera, part, flare_e in light_e[k]:
+                means_e[camera][part] += flare_e
+        frames = exposed(CAMERAS, means_e, random(96, robots, index), EXPOSURE_S)
+        sets.append([replace(frame, index=index, time_s=now_s) for frame in frames])
+    return sets
+
+
+def _parts(
+    means_e: list[np.ndarray], dark_e: list[np.ndarray]
+) -> list[tuple[int, tuple[slice, slice], np.ndarray]]:
+    """Return the part of each camera's frame that a robot lights: camera, rows and columns, electrons."""
+    parts = []
+    for camera, (mean_e, without_e) in enumerate(zip(means_e, dark_e, strict=True)):
+        rows, columns = np.nonzero(mean_e != without_e)
+        if len(rows):
+            part = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+            parts.append((camera, part, (mean_e - without_e)[part]))
+    return parts
+
+
+def timed(robots: int, seconds: float) -> dict[str, float | int]:
+    """Time the whole stack on sets of so many robots, and its parts."""
+    pipeline = perception.Pipeline(CAMERAS)
+    spent: list[tuple[float, float]] = []
+    messages, tracks = 0, 0
+    for frames in sets_of(robots, seconds):
+        started = time.perf_counter()
+        found: list[list[Detection]] = detect_frames(frames, CAMERAS)
+        detected = time.perf_counter()
+        heard = pipeline.follow(frames, found)
+        spent.append((detected - started, time.perf_counter() - detected))
+        messages, tracks = messages + len(heard.messages), len(heard.tracks)
+    settled = [1e3 * np.array(each) for each in spent[round(WARM_S * FPS) :]]
+    whole_ms = [float(each.sum()) for each in settled]
+    return {
+        "sets_per_s": round(1e3 / statistics.median(whole_ms), 1),
+        "median_ms": round(statistics.median(whole_ms), 2),
+        "p99_ms": round(float(np.percentile(whole_ms, 99.0)), 2),
+        "detect_median_ms": round(statistics.median(float(each[0]) for each in settled), 2),
+        "follow_median_ms": round(statistics.median(float(each[1]) for each in settled), 2),
+        "tracks_at_end": tracks,
+        "messages": messages,
+    }
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robots", type=int, nargs="*", default=[5, 20, 100])
+    parser.add_argument("--seconds", type=float, default=2.5)
+    chosen = parser.parse_args()
+    perception.warm_up()
+    figures = {str(robots): timed(robots, chosen.seconds) for robots in chosen.robots}
+    print(json.dumps({"benchmark": "stack", "cameras": len(CAMERAS), "robots": figures}))
+
+
+if __name__ == "__main__":
+    main()
