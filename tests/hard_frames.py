@@ -284,11 +284,11 @@ def textured(
     return {**_counts(scored), "pull_rms_u_v": _rms(pulls)}
 
 
-def lamps(frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
+def lamps(frames: int = 4, estimator: str = "robust", first: int = 0) -> dict[str, Any]:
     """Evenly bright rectangles and discs of 6 to 60 px, a third of them clipped, and nothing else."""
     camera = replace(POINT, bit_depth=12, saturation_dn=4095)
     alarms = count = 0
-    for index in range(frames):
+    for index in range(first, first + frames):
         generator = random(12, index)
         mean_e = np.full((camera.height_px, camera.width_px), BACKGROUND_E)
         rows, columns = np.indices(mean_e.shape)

@@ -21,8 +21,9 @@ from perception.robust.solve import Problem, Solution, solve
 from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
 from perception.robust.verdict import (
     LEAST_RANGE_M,
+    is_border,
+    is_hardly_seen,
     is_no_large_disc,
-    is_on_flank,
     is_one_pixel,
     is_other_size,
 )
@@ -137,7 +138,8 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     # flares would explain better.
     parted = {}
     if prepared.frame.line_time_s == 0.0:
-        parted = _parted([None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)], camera)
+        plain = [None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)]
+        parted = _parted(plain, prepared.shape, camera)
     _retry_without_spill(best, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in best]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
@@ -158,14 +160,20 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     return best
 
 
-def _parted(plain: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
-    """Deblend, and return by index what explains all that is seen: enough flares explain anything by half."""
+def _parted(plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera) -> dict[int, Solution]:
+    """Deblend, and return by index what explains all that is seen: enough flares explain anything by half.
+
+    Flares that would shine where a window does not look explain nothing.
+    """
     tried = [(index, one) for index, one in enumerate(plain) if one is not None]
     more = deblend([one for _, one in tried], camera)
     return {
         index: several
         for (index, one), several in zip(tried, more, strict=True)
-        if several is not one and several.left_over.is_good and several.left_over.structure_e == 0.0
+        if several is not one
+        and several.left_over.is_good
+        and several.left_over.structure_e == 0.0
+        and not any(is_hardly_seen(several, k, shape) for k in range(several.count))
     }
 
 
@@ -253,21 +261,23 @@ def _judged(
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a solution into measurements, if it is one of sources."""
     left = solution.left_over
-    misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
+    misfit = not left.is_good or left.peak_sigmas > RESIDUAL_SIGMAS
     doubted = misfit or cluster.is_clipped
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
     if doubted and left.share > most_left:
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
-    blobs = [member.blob for member in cluster.members]
+    blobs: list[Blob | None] = [member.blob for member in cluster.members]
+    wanted: Sequence[int] = cluster.wanted
     if solution.count != len(blobs):
-        blobs = divide(blobs, solution.u_px, solution.v_px)
-    wanted = cluster.wanted if solution.count == len(cluster.members) else range(solution.count)
+        wanted = range(solution.count)
+        blobs = divide([member.blob for member in cluster.members], solution.u_px, solution.v_px)
     return [
-        (blobs[k], _measurement(solution, k, blobs[k], misfit, prepared))
+        (blob, _measurement(solution, k, blob, misfit, prepared))
         for k in wanted
-        if not is_on_flank(solution, k, prepared.shape)
+        # What nothing lit belongs to only helps to explain what lies around.
+        if (blob := blobs[k]) is not None and not is_border(solution, k, prepared.shape)
     ]
 
 

@@ -24,6 +24,7 @@ _MOST_ASPECT = 1.5
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _LEAST_PX, _LEAST_SHARE = 1.0, 0.15
 _FLANK_PX, _FLANK_SHARE = 3.0, 0.25
+_LEAST_SEEN, _MOST_OFF = 2.0 / 3.0, 0.5
 
 
 def is_one_pixel(solution: Solution) -> bool:
@@ -61,6 +62,11 @@ def _is_one_pixel(
                 of_pixel += (image_e[row, column] - ground) ** 2 / (max(ground, 0.0) + floor_e2)
             of_flare += chi2[row, column]
     return of_pixel < of_flare
+
+
+def is_border(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
+    """Tell whether a flare is only the border of something else, seen or not."""
+    return is_on_flank(solution, index, shape) or is_hardly_seen(solution, index, shape)
 
 
 def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
@@ -101,6 +107,46 @@ def _share_above(
                 count += 1
                 above += image_e[row, column] - flares_e[row, column] - background_e > half_peak
     return above / max(count, 1)
+
+
+def is_hardly_seen(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
+    """Tell whether a flare is seen from one side alone: a third of it falls where its window does not look.
+
+    Beside what is left out of a window, as the rest of a lit patch, anything may seem to be a flare: the
+    little that is seen of it is the patch's border. A column that is left out as charge spilled along it
+    leaves light on either side. `shape` is the frame's: what falls beyond it does not count.
+    """
+    window = solution.window
+    width_px = math.hypot(solution.psf_sigma_px, 0.5 * float(solution.image_radius_px[index]))
+    place = float(solution.u_px[index]), float(solution.v_px[index])
+    share, off_px = _seen(window.state, (window.box.left, window.box.top), place, width_px, shape)
+    return share < _LEAST_SEEN and off_px > _MOST_OFF * width_px
+
+
+@compiled
+def _seen(
+    state: NDArray[np.uint8], corner: tuple[int, int], place: tuple[float, float], width_px: float,
+    shape: tuple[int, int],
+) -> tuple[float, float]:  # fmt: skip
+    """Return how much of a Gaussian falls on usable pixels of a window, and how far off its middle that lies.
+
+    Of what falls on the frame; the distance is that of its centroid from the place.
+    """
+    reach, seen, whole, off_u, off_v = math.ceil(3.0 * width_px), 0.0, 0.0, 0.0, 0.0
+    middle_row, middle = round(place[1]), round(place[0])
+    for row in range(max(middle_row - reach, 0), min(middle_row + reach + 1, shape[0])):
+        for column in range(max(middle - reach, 0), min(middle + reach + 1, shape[1])):
+            u, v = column - place[0], row - place[1]
+            light = math.exp(-0.5 * (u**2 + v**2) / width_px**2)
+            whole += light
+            here, at = row - corner[1], column - corner[0]
+            if 0 <= here < state.shape[0] and 0 <= at < state.shape[1] and state[here, at] != UNUSABLE:
+                seen += light
+                off_u += light * u
+                off_v += light * v
+    if seen == 0.0:
+        return 0.0, math.inf
+    return seen / whole, math.hypot(off_u, off_v) / seen
 
 
 def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) -> bool:

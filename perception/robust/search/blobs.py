@@ -228,15 +228,16 @@ def _grouped(boxes: NDArray[np.int64], within_px: int) -> NDArray[np.int64]:
     return leader
 
 
-def divide(blobs: Sequence[Blob], u_px: NDArray[np.float64], v_px: NDArray[np.float64]) -> list[Blob]:
-    """Divide the pixels of blobs among places, each to the nearest; a place that gets none has its own."""
+def divide(blobs: Sequence[Blob], u_px: NDArray[np.float64], v_px: NDArray[np.float64]) -> list[Blob | None]:
+    """Divide the pixels of blobs among places, each to the nearest; None for a place that gets none."""
     places = np.concatenate([np.argwhere(b.pixels) + np.array([b.box.top, b.box.left]) for b in blobs])
     nearest = np.argmin((places[:, :1] - v_px) ** 2 + (places[:, 1:] - u_px) ** 2, axis=1)
-    divided = []
+    divided: list[Blob | None] = []
     for index in range(len(u_px)):
         mine = places[nearest == index]
         if not len(mine):
-            mine = np.array([[round(float(v_px[index])), round(float(u_px[index]))]])
+            divided.append(None)
+            continue
         top, left = mine.min(axis=0).tolist()
         height, width = (mine.max(axis=0) - (top, left) + 1).tolist()
         pixels = np.zeros((height, width), dtype=bool)
