@@ -36,8 +36,7 @@ class LeftOver:
     chi2, pixels
         Sum of (x - λ)² / (λ + σ² + (ε F S)²) over the pixels where F·S exceeds their noise, and their number.
     residual2_e2, flares2_e2
-        Σ residual² and Σ flares² over these pixels; of the former also that of clipped ones that the flares
-        do not reach.
+        Σ residual² and Σ flares² over these pixels.
     seen_chi2, seen_pixels
         The same χ² where F·S exceeds noise and model error, over pixels that are not clipped.
     peak_sigmas, peak
@@ -162,8 +161,6 @@ def _reckoned(
                 residual2 += left * left
                 flares2 += flare * flare
                 pixels += 1
-            elif state[row, column] == CLIPPED and left > 0.0:
-                residual2 += left * left
             if state[row, column] == SEEN and flare > 0.0 and flare * flare > variance:
                 seen_chi2 += left * left / variance
                 seen_pixels += 1

@@ -68,7 +68,7 @@ class MeasuredFlare:
 
         What only the coarse background made look bright, such as the border of a shadow, does not. On
         texture, which need not be as normal as the fit takes it to be, it must exceed 8 σ; on edges, which
-        never are, and where it does not look like a source, 10 σ.
+        never are, where something is left beside it, and where it does not look like a source, 10 σ.
         """
         least = 10.0 if self.misfit or self.on_edges else 8.0 if self.on_texture else 4.0
         return self.saturated or (self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e)
@@ -261,7 +261,7 @@ def _judged(
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a solution into measurements, if it is one of sources."""
     left = solution.left_over
-    misfit = not left.is_good or left.peak_sigmas > RESIDUAL_SIGMAS
+    misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
     doubted = misfit or cluster.is_clipped
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
     if doubted and left.share > most_left:
@@ -317,7 +317,7 @@ def _measurement(
         saturated=saturated,
         misfit=misfit,
         on_texture=solution.window.structure_e > 0.0,
-        on_edges=solution.window.on_edges,
+        on_edges=solution.window.on_edges or left.peak_sigmas > RESIDUAL_SIGMAS,
     )
 
 
