@@ -113,8 +113,8 @@ def is_hardly_seen(solution: Solution, index: int, shape: tuple[int, int]) -> bo
     """Tell whether a flare is seen from one side alone: a third of it falls where its window does not look.
 
     Beside what is left out of a window, as the rest of a lit patch, anything may seem to be a flare: the
-    little that is seen of it is the patch's border. A column that is left out as charge spilled along it
-    leaves light on either side. `shape` is the frame's: what falls beyond it does not count.
+    little that is seen of it is the patch's border. What falls beyond the frame (`shape`) does not count, nor
+    what falls on columns that are left out whole, because charge spilled along them.
     """
     window = solution.window
     width_px = math.hypot(solution.psf_sigma_px, 0.5 * float(solution.image_radius_px[index]))
@@ -130,23 +130,30 @@ def _seen(
 ) -> tuple[float, float]:  # fmt: skip
     """Return how much of a Gaussian falls on usable pixels of a window, and how far off its middle that lies.
 
-    Of what falls on the frame; the distance is that of its centroid from the place.
+    Of what falls on the frame and on no column that is unusable as a whole; the distance is that of the
+    centroid of what is seen from that of what could be.
     """
-    reach, seen, whole, off_u, off_v = math.ceil(3.0 * width_px), 0.0, 0.0, 0.0, 0.0
+    reach, seen, whole = math.ceil(3.0 * width_px), 0.0, 0.0
+    off_u, off_v, whole_u, whole_v = 0.0, 0.0, 0.0, 0.0
     middle_row, middle = round(place[1]), round(place[0])
     for row in range(max(middle_row - reach, 0), min(middle_row + reach + 1, shape[0])):
         for column in range(max(middle - reach, 0), min(middle + reach + 1, shape[1])):
             u, v = column - place[0], row - place[1]
             light = math.exp(-0.5 * (u**2 + v**2) / width_px**2)
-            whole += light
             here, at = row - corner[1], column - corner[0]
-            if 0 <= here < state.shape[0] and 0 <= at < state.shape[1] and state[here, at] != UNUSABLE:
+            inside = 0 <= here < state.shape[0] and 0 <= at < state.shape[1]
+            if inside and not (state[:, at] != UNUSABLE).any():
+                continue
+            whole += light
+            whole_u += light * u
+            whole_v += light * v
+            if inside and state[here, at] != UNUSABLE:
                 seen += light
                 off_u += light * u
                 off_v += light * v
     if seen == 0.0:
-        return 0.0, math.inf
-    return seen / whole, math.hypot(off_u, off_v) / seen
+        return (0.0, math.inf) if whole > 0.0 else (1.0, 0.0)
+    return seen / whole, math.hypot(off_u / seen - whole_u / whole, off_v / seen - whole_v / whole)
 
 
 def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) -> bool:
