@@ -6,6 +6,7 @@ they have parted.
 """
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -34,9 +35,9 @@ _LONGEST_S, _KEPT_S = 18.0, 7.0
 """Tracks have parted for good; a signal so long is read, and its end is kept: a packet lasts 5.5 s."""
 
 _SHORTEST_S = 2.2
+_IDLE_S = 1.4
+"""Longer than any packet is lit, with a bit to spare: what lies before and after is read by itself."""
 _IDLE_SIGMAS = 5.0
-_SAME_S = 1.1
-"""Two messages with one word are one if their packets begin within a frame of each other."""
 
 Tracks = tuple[int, int]
 
@@ -124,6 +125,7 @@ class PairReader:
     def __init__(self, settings: DecoderSettings | None = None) -> None:
         self._settings = settings
         self._pairs: dict[Tracks, list[SumSample]] = {}
+        self._waiting: list[tuple[Tracks, list[SumSample]]] = []
         self._said: list[Message] = []
 
     def push(
@@ -131,43 +133,63 @@ class PairReader:
     ) -> tuple[Message, ...]:
         """Take the samples of a set, and what single tracks said; return what pairs say.
 
-        A pair is read once it has parted, or when it has been together for long. What one of its tracks was
-        heard to say by itself is not said again.
+        A stretch of a pair is read once it has parted, once both have been idle for longer than any packet
+        is, or when it has been together for long: one stretch a set, for it takes as long as some sets. Where
+        four and more are one light, none of their pairs is read. What one of its tracks was heard to say by
+        itself is not said again.
         """
         self._said = [message for message in self._said if time_s - message.end_s < 2.0 * _LONGEST_S]
         self._said += said
+        members = Counter(track for tracks in sums for track in tracks)
         for tracks, sample in sums.items():
+            if max(members[track] for track in tracks) > 2:
+                continue
             together = self._pairs.setdefault(tracks, [])
             if not together or sample.sample.time_s > together[-1].sample.time_s:
                 together.append(sample)
-        heard: list[Message] = []
         for tracks in list(self._pairs):
             together = self._pairs[tracks]
             if time_s - together[-1].sample.time_s > _PARTED_S:
-                heard += self._read(robot, tracks, self._pairs.pop(tracks))
+                self._waiting.append((tracks, self._pairs.pop(tracks)))
+            elif (idle := _idle_since(together)) is not None:
+                self._waiting.append((tracks, together))
+                self._pairs[tracks] = together[idle:]
             elif _span_s(together) > _LONGEST_S:
-                heard += self._read(robot, tracks, together)
+                self._waiting.append((tracks, together))
                 self._pairs[tracks] = [one for one in together if time_s - one.sample.time_s < _KEPT_S]
-        return tuple(heard)
+        while self._waiting:
+            tracks, together = self._waiting.pop(0)
+            if _is_worth_reading(together):
+                return tuple(self._read(robot, tracks, together))
+        return ()
 
     def finish(self, robot: str, said: Iterable[Message]) -> tuple[Message, ...]:
         """Return what the pairs say that are still together, and single tracks did not say at last."""
         self._said += said
-        heard = [message for tracks, one in self._pairs.items() for message in self._read(robot, tracks, one)]
+        waiting = [*self._waiting, *self._pairs.items()]
+        heard = [
+            message
+            for tracks, together in waiting
+            if _is_worth_reading(together)
+            for message in self._read(robot, tracks, together)
+        ]
+        self._waiting.clear()
         self._pairs.clear()
         self._said.clear()
         return tuple(heard)
 
     def _read(self, robot: str, tracks: Tracks, together: Sequence[SumSample]) -> list[Message]:
-        if _span_s(together) < _SHORTEST_S:
-            return []
-        ratio = float(np.median([one.ratio for one in together]))
+        ratio = np.array([one.ratio for one in together])
         signal = signal_of(robot, tracks[0], [one.sample for one in together])
-        sigma = np.hypot(signal.sigma_lit, UNLIKE * (1.0 + ratio))
-        if (signal.level > 1.0 + ratio - _IDLE_SIGMAS * sigma).all():
-            return []  # both were lit all the time
-        found = decode_pair(signal, (1.0, ratio), (UNLIKE, UNLIKE * ratio), tracks, self._settings)
-        new = [message for message in found if not any(_same(message, other) for other in self._said)]
+        levels, sigmas = np.stack([np.ones(len(ratio)), ratio]), (UNLIKE, UNLIKE * float(ratio.mean()))
+        new: list[Message] = []
+        known = [one for one in self._said if {one.track, one.ambiguous_with} & set(tracks)]
+        for message in decode_pair(signal, levels, sigmas, tracks, self._settings):
+            same = next((one for one in known if _same(message, one)), None)
+            if same is None:
+                new.append(message)
+            else:
+                known.remove(same)
         self._said += new
         return new
 
@@ -176,6 +198,28 @@ def _span_s(together: Sequence[SumSample]) -> float:
     return together[-1].sample.time_s - together[0].sample.time_s
 
 
+def _is_idle(one: SumSample) -> bool:
+    """Tell whether both were lit in a sample, as far as it says."""
+    both = 1.0 + one.ratio
+    return one.sample.level > both - _IDLE_SIGMAS * math.hypot(one.sample.sigma_lit, UNLIKE * both)
+
+
+def _is_worth_reading(together: Sequence[SumSample]) -> bool:
+    return _span_s(together) >= _SHORTEST_S and not all(map(_is_idle, together))
+
+
+def _idle_since(together: Sequence[SumSample]) -> int | None:
+    """Return from which sample on both are idle, after some dark, where that is longer than in any packet."""
+    first = len(together)
+    while first > 0 and _is_idle(together[first - 1]):
+        first -= 1
+    if first == 0 or together[-1].sample.time_s - together[first - 1].sample.time_s < _IDLE_S:
+        return None
+    return first
+
+
 def _same(one: Message, other: Message) -> bool:
-    """Say whether two messages are one that was heard twice."""
-    return one.word == other.word and abs(one.start_s - other.start_s) < _SAME_S
+    """Say whether two messages of a pair's tracks are one that was heard twice, or of other frames."""
+    may_be = one.track == other.track or None not in (one.ambiguous_with, other.ambiguous_with)
+    may_be = may_be or other.track == one.ambiguous_with or one.track == other.ambiguous_with
+    return may_be and one.word == other.word and one.start_s < other.end_s and other.start_s < one.end_s
