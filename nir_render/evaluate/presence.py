@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nir_render.evaluate.match import countable
 from nir_render.evaluate.sets import SAME_PLACE_M, position_body_m
+from nir_render.evaluate.track_errors import TrueWays
 from nir_render.truth.sources import SourceTruth
 from perception.types import Calibration, FrameKey
 
@@ -63,15 +64,21 @@ class _Row:
 
 
 def present_in(
-    sets: Sequence[TimedSet], truth: Iterable[SourceTruth], calibrations: Mapping[str, Calibration]
+    sets: Sequence[TimedSet],
+    truth: Iterable[SourceTruth],
+    calibrations: Mapping[str, Calibration],
+    ways: TrueWays,
 ) -> list[tuple[Present, ...]]:
-    """Return who is there in each set, with the numbers of their lives; each mirror shows its own image."""
+    """Return who is there in each set, with the numbers of their lives; each mirror shows its own image.
+
+    Sources stand where they are at the set's time, as its tracks do, not at each frame's own: by `ways`.
+    """
     of_frame = {key: number for number, (_, _, keys) in enumerate(sets) for key in keys}
+    seen = list(truth)
     rows: dict[tuple[str, SourceName], dict[int, list[_Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in truth:
+    for row, place_m in zip(seen, _at_set_m(seen, sets, of_frame, calibrations, ways), strict=True):
         number = of_frame[row.camera, row.index]
         name = (row.robot, row.source, row.ghost_of)
-        place_m = position_body_m(row, calibrations[row.camera])
         own = _row_at(rows[sets[number][0], name][number], place_m, one_alone=row.ghost_of is None)
         own.places_m.append(place_m)
         own.counts |= countable(row, calibrations[row.camera])
@@ -90,6 +97,27 @@ def present_in(
             for number, one in _lives(name, image, times_s[robot]):
                 present[number].append(one)
     return [tuple(there) for there in present]
+
+
+def _at_set_m(
+    truth: Sequence[SourceTruth],
+    sets: Sequence[TimedSet],
+    of_frame: Mapping[FrameKey, int],
+    calibrations: Mapping[str, Calibration],
+    ways: TrueWays,
+) -> Values:
+    """Return where sources are at the times of their sets, in body axes, shape (n, 3); images as seen."""
+    place_m = np.array([position_body_m(row, calibrations[row.camera]) for row in truth]).reshape(-1, 3)
+    own = [k for k, row in enumerate(truth) if row.ghost_of is None]
+    set_of = [sets[of_frame[truth[k].camera, truth[k].index]] for k in own]
+    place_m[own] = ways.carried_m(
+        place_m[own],
+        [truth[k].robot for k in own],
+        [observer for observer, _, _ in set_of],
+        np.array([truth[k].time_s for k in own]),
+        np.array([time_s for _, time_s, _ in set_of]),
+    )
+    return place_m
 
 
 def _row_at(rows: list[_Row], place_m: Values, *, one_alone: bool) -> _Row:

@@ -47,6 +47,21 @@ class TrueWays:
         velocity = there.velocity_m_per_s + np.cross(there.angular_velocity_rad_per_s, arm_m)
         return np.asarray(np.einsum("nji,nj->ni", seen_from.rotation, velocity))
 
+    def carried_m(
+        self, place_m: Values, robots: Sequence[str], observers: Sequence[str], from_s: Values, to_s: Values
+    ) -> Values:
+        """Return places of robots' sources, in body axes of who sees them, as they are at another time.
+
+        Shape (n, 3); all else has n elements. A place stays as it is where a robot's way is not known.
+        """
+        there, then = self._ways(robots, from_s), self._ways(robots, to_s)
+        seen_from, seen_then = self._ways(observers, from_s), self._ways(observers, to_s)
+        world_m = np.einsum("nij,nj->ni", seen_from.rotation, place_m) + seen_from.position_m
+        arm_m = np.einsum("nji,nj->ni", there.rotation, world_m - there.position_m)
+        world_m = np.einsum("nij,nj->ni", then.rotation, arm_m) + then.position_m
+        carried_m = np.einsum("nji,nj->ni", seen_then.rotation, world_m - seen_then.position_m)
+        return np.where(np.isfinite(carried_m).all(axis=1, keepdims=True), carried_m, place_m)
+
     def _ways(self, robots: Sequence[str], time_s: Values) -> "_Ways":
         """Return poses and velocities of robots at times, one each; NaN where none is known."""
         n = len(robots)

@@ -7,6 +7,7 @@ false alarms. Every observer is one sequence: what several did is taken together
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -73,14 +74,16 @@ def evaluate_tracks(
     tracks
         By estimator.
     poses
-        Where robots truly were, and how fast: without them velocities have no truth.
+        Where robots truly were, and how fast: without them velocities have no truth, and sources are taken to
+        stand at the time of their set where they stood at that of their frame.
 
     Raises
     ------
     InputError
         A track stands at a time at which its observer took no set, or twice at one.
     """
-    present = present_in(sets, truth, calibrations)
+    ways = TrueWays(poses)
+    present = present_in(sets, truth, calibrations, ways)
     said = {name: _in_sets(found, sets, name) for name, found in tracks.items()}
     moments = tuple(
         Moment(
@@ -91,7 +94,6 @@ def evaluate_tracks(
         )
         for number, ((robot, time_s, _), there) in enumerate(zip(sets, present, strict=True))
     )
-    ways = TrueWays(poses)
     observers = list(dict.fromkeys(moment.robot for moment in moments))
     own = {robot: [moment for moment in moments if moment.robot == robot] for robot in observers}
     by_observer = {name: {robot: _numbers(own[robot], name, ways) for robot in observers} for name in tracks}
@@ -157,8 +159,9 @@ def _numbers(moments: Sequence[Moment], name: str, ways: TrueWays) -> dict[str, 
     numbers: dict[tuple[str, int], int] = {}
     instants, gospas_m = [], []
     followed: list[Followed] = []
+    held = _held(moments, name)
     not_told, told = 0, 0
-    for moment in moments:
+    for at, moment in enumerate(moments):
         counted = [one for one in moment.present if one.life is not None]
         apart = {one.name for one in moment.present if one.life is None}
         by_name = {one.name: one for one in counted}
@@ -169,8 +172,9 @@ def _numbers(moments: Sequence[Moment], name: str, ways: TrueWays) -> dict[str, 
                 not_told += track.ghost != "yes"
             elif follows not in apart:
                 kept.append(track)
-                if follows is not None and track.ghost != "yes":
-                    followed.append(Followed(track, follows[0], by_name[follows].position_body_m))
+                whom = held.get((at, track.track), follows)
+                if whom is not None and track.ghost != "yes":
+                    followed.append(Followed(track, whom[0], by_name[whom].position_body_m))
         # What calls itself a mirror image, and is none, is like nobody.
         real = np.array([track.ghost != "yes" for track in kept], dtype=bool)
         apart_m = np.where(real[None, :], _apart_m(counted, kept), np.inf)
@@ -203,6 +207,30 @@ def _numbers(moments: Sequence[Moment], name: str, ways: TrueWays) -> dict[str, 
         "track_ghosts_told": told,
         "track_ghosts_not_told": not_told,
     }
+
+
+def _held(moments: Sequence[Moment], name: str) -> dict[tuple[int, int], SourceName]:
+    """Return whom tracks are on the way of that are too far off to follow anybody, by moment and track.
+
+    That is whom a track followed the last time before and the first time after, if nobody else follows them
+    now. Errors without these would be none above `REACH_M`, and σ that claim too little would look true.
+    """
+    ways: dict[tuple[str, int], list[tuple[int, SourceName | None]]] = {}
+    for at, moment in enumerate(moments):
+        for track, follows in moment.tracks[name]:
+            ways.setdefault((moment.robot, track.track), []).append((at, follows))
+    held = {}
+    for (_, number), way in ways.items():
+        known = [k for k, (_, follows) in enumerate(way) if follows is not None]
+        for before, after in pairwise(known):
+            whom = way[before][1]
+            if whom is None or whom != way[after][1]:
+                continue
+            for at, _ in way[before + 1 : after]:
+                counts = any(one.name == whom and one.life is not None for one in moments[at].present)
+                if counts and all(follows != whom for _, follows in moments[at].tracks[name]):
+                    held[at, number] = whom
+    return held
 
 
 def _or_none(value: float) -> float | None:
