@@ -78,8 +78,16 @@ def _import_file(path: Path, reference: str, error: type[ValueError]) -> dict[st
 
 @contextmanager
 def _importing_from(folder: Path) -> Iterator[None]:
-    """Let modules that lie in a folder be imported; installed ones come first."""
+    """Let modules that lie in a folder be imported; installed ones come first.
+
+    Those of the same names that lay beside another user's file are forgotten: two versions of one's own code
+    may be loaded one after the other, each with its own modules.
+    """
     entry = str(folder.resolve())
+    for beside in folder.resolve().glob("*.py"):
+        known = getattr(sys.modules.get(beside.stem), "__file__", None)
+        if known is not None and str(Path(known).parent) not in {entry, *sys.path}:
+            del sys.modules[beside.stem]
     sys.path.append(entry)
     try:
         yield

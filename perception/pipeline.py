@@ -28,7 +28,7 @@ from perception.photometry import (
     sample_of_detection,
     signal_of,
 )
-from perception.rig.frame_sets import robot_of, set_time_s
+from perception.rig.frame_sets import mid_exposure_s, robot_of, set_time_s
 from perception.rig.measure_set import measure_set
 from perception.track.settings import TrackerSettings
 from perception.track.tracker import Tracker
@@ -122,6 +122,7 @@ class Pipeline:
         self._robot: str | None = None
         self._extinction_per_m: float | None = None
         self._last_s: dict[int, float] = {}
+        self._taken: set[tuple[str, int, float]] = set()
         self._keeps_signals = keep_signals
         self._samples: dict[int, list[Sample]] = {}
 
@@ -150,7 +151,8 @@ class Pipeline:
         Parameters
         ----------
         frames
-            What the robot's cameras took within half a period (`frame_sets`).
+            What the robot's cameras took within half a period (`frame_sets`). Cameras of one time may also
+            come one after the other; a frame that was pushed before is left out.
         odometry
             What it knows of its own motion, from before the last set on to now or beyond; without any it
             stands still.
@@ -182,11 +184,27 @@ class Pipeline:
                 "the frames of one set of one robot"
             )
         (self._robot,) = robots
+        frames, detections = self._new(frames, detections)
+        if not frames:
+            tracks = self._tracker.predicted(self._latest_s, odometry)
+            return Heard(self._latest_s, measure_set([], [], self._calibrations), tracks, ())
         seen = measure_set(frames, detections, self._calibrations)
         time_s = set_time_s(frames)
         tracks = self._tracker.update(time_s, seen.measurements, odometry)
         messages = self._listen(time_s, frames, seen, tracks, odometry)
         return Heard(time_s, seen, tracks, messages)
+
+    def _new(
+        self, frames: Sequence[RawFrame], detections: Sequence[Sequence[Detection]]
+    ) -> tuple[Sequence[RawFrame], Sequence[Sequence[Detection]]]:
+        """Leave out frames that were taken in before: what is pushed twice is no new evidence."""
+        keys = [(frame.camera, frame.index, frame.time_s) for frame in frames]
+        if not self._taken.isdisjoint(keys):
+            new = [k for k, key in enumerate(keys) if key not in self._taken]
+            frames, detections = [frames[k] for k in new], [detections[k] for k in new]
+        latest_s = max(time_s for _, _, time_s in keys)
+        self._taken = {key for key in (*self._taken, *keys) if abs(latest_s - key[2]) < _SET_BACK_S}
+        return frames, detections
 
     def finish(self) -> tuple[Message, ...]:
         """Return the messages that can be told as no more frames will come."""
@@ -219,10 +237,12 @@ class Pipeline:
             self._extinction_per_m = seen.extinction_per_m
         for number in set(self._readers) - {track.track for track in tracks}:
             said += self._readers.pop(number).finish()
+        now = {track.track for track in tracks}
+        self._last_s = {number: last_s for number, last_s in self._last_s.items() if number in now}
         if time_s < self._latest_s - _SET_BACK_S:  # the clock was set back: tracks and signals begin anew
             said += self.finish()
             self._last_s.clear()
-        elif time_s <= self._latest_s:  # what comes late is followed, if the tracker can, but not read
+        elif time_s < self._latest_s:  # what comes late is followed, if the tracker can, but not read
             return tuple(said)
         self._latest_s = time_s
         by_key = {
@@ -301,9 +321,7 @@ class Pipeline:
         self, frame: RawFrame, time_s: float, tracks: Sequence[Track], odometry: Sequence[Odometry]
     ) -> dict[int, Track]:
         """Return where tracks are in the middle of a frame, by number; none where that is the set's time."""
-        middle_s = frame.time_s + 0.5 * (
-            frame.exposure_s + frame.line_time_s * (self._calibrations[frame.camera].height_px - 1)
-        )
+        middle_s = mid_exposure_s(frame, self._calibrations[frame.camera].height_px)
         if not tracks or abs(middle_s - time_s) < _AT_ONCE_S:
             return {}
         return {track.track: track for track in self._tracker.predicted(middle_s, odometry)}

@@ -213,8 +213,11 @@ def _judged(
             and _is_of(message, packet)
         ]
         if meant:
-            found.repeated += meant[0] in found.heard
-            found.heard.setdefault(meant[0], told)
+            # Two may say one word at once, each ambiguous with the other: that is one packet of each.
+            new = [k for k in meant if k not in found.heard]
+            found.repeated += not new
+            if new:
+                found.heard[new[0]] = told
             continue
         right = [packet for packet in sent if _is_of(message, packet) and packet.robot != robot]
         if any((packet.robot, packet.source, None) in sources for packet in right):

@@ -68,15 +68,18 @@ def present_in(
     truth: Iterable[SourceTruth],
     calibrations: Mapping[str, Calibration],
     ways: TrueWays,
+    taken_s: Mapping[FrameKey, float],
 ) -> list[tuple[Present, ...]]:
     """Return who is there in each set, with the numbers of their lives; each mirror shows its own image.
 
-    Sources stand where they are at the set's time, as its tracks do, not at each frame's own: by `ways`.
+    Sources stand where they are at the set's time, as tracks do, not when its frames were taken: by `ways`.
     """
     of_frame = {key: number for number, (_, _, keys) in enumerate(sets) for key in keys}
     seen = list(truth)
     rows: dict[tuple[str, SourceName], dict[int, list[_Row]]] = defaultdict(lambda: defaultdict(list))
-    for row, place_m in zip(seen, _at_set_m(seen, sets, of_frame, calibrations, ways), strict=True):
+    set_of = [sets[of_frame[row.camera, row.index]] for row in seen]
+    places_m = np.array([position_body_m(row, calibrations[row.camera]) for row in seen]).reshape(-1, 3)
+    for row, place_m in zip(seen, _at_set_m(places_m, seen, set_of, ways, taken_s), strict=True):
         number = of_frame[row.camera, row.index]
         name = (row.robot, row.source, row.ghost_of)
         own = _row_at(rows[sets[number][0], name][number], place_m, one_alone=row.ghost_of is None)
@@ -100,24 +103,23 @@ def present_in(
 
 
 def _at_set_m(
+    place_m: Values,
     truth: Sequence[SourceTruth],
-    sets: Sequence[TimedSet],
-    of_frame: Mapping[FrameKey, int],
-    calibrations: Mapping[str, Calibration],
+    set_of: Sequence[TimedSet],
     ways: TrueWays,
+    taken_s: Mapping[FrameKey, float],
 ) -> Values:
     """Return where sources are at the times of their sets, in body axes, shape (n, 3); images as seen."""
-    place_m = np.array([position_body_m(row, calibrations[row.camera]) for row in truth]).reshape(-1, 3)
-    own = [k for k, row in enumerate(truth) if row.ghost_of is None]
-    set_of = [sets[of_frame[truth[k].camera, truth[k].index]] for k in own]
-    place_m[own] = ways.carried_m(
-        place_m[own],
-        [truth[k].robot for k in own],
-        [observer for observer, _, _ in set_of],
-        np.array([truth[k].time_s for k in own]),
-        np.array([time_s for _, time_s, _ in set_of]),
+    known = [k for k, row in enumerate(truth) if row.ghost_of is None and (row.camera, row.index) in taken_s]
+    at_set_m = place_m.copy()
+    at_set_m[known] = ways.carried_m(
+        place_m[known],
+        [truth[k].robot for k in known],
+        [set_of[k][0] for k in known],
+        np.array([taken_s[truth[k].camera, truth[k].index] for k in known]),
+        np.array([set_of[k][1] for k in known]),
     )
-    return place_m
+    return at_set_m
 
 
 def _row_at(rows: list[_Row], place_m: Values, *, one_alone: bool) -> _Row:

@@ -20,7 +20,7 @@ from nir_render.evaluate.track_errors import Followed, TrueWays, error_numbers
 from nir_render.evaluate.track_metrics import Instant, gospa_m, track_scores
 from nir_render.truth.poses import PoseTruth
 from nir_render.truth.sources import SourceTruth
-from perception.types import Calibration, Track
+from perception.types import Calibration, FrameKey, Track
 
 Values = NDArray[np.float64]
 
@@ -62,6 +62,7 @@ def evaluate_tracks(
     calibrations: Mapping[str, Calibration],
     tracks: Mapping[str, Sequence[Track]],
     poses: Iterable[PoseTruth] = (),
+    taken_s: Mapping[FrameKey, float] | None = None,
 ) -> TrackEvaluation:
     """Score the tracks of each estimator.
 
@@ -74,8 +75,10 @@ def evaluate_tracks(
     tracks
         By estimator.
     poses
-        Where robots truly were, and how fast: without them velocities have no truth, and sources are taken to
-        stand at the time of their set where they stood at that of their frame.
+        Where robots truly were, and how fast: without them velocities have no truth.
+    taken_s
+        When each frame was taken, mid-exposure of its middle row, for which `truth` holds: with that and
+        poses, sources stand where they are at the time of their set, as tracks do.
 
     Raises
     ------
@@ -83,7 +86,7 @@ def evaluate_tracks(
         A track stands at a time at which its observer took no set, or twice at one.
     """
     ways = TrueWays(poses)
-    present = present_in(sets, truth, calibrations, ways)
+    present = present_in(sets, truth, calibrations, ways, taken_s or {})
     said = {name: _in_sets(found, sets, name) for name, found in tracks.items()}
     moments = tuple(
         Moment(

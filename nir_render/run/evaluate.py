@@ -36,7 +36,7 @@ from perception import (
     read_frame,
     read_recording,
 )
-from perception.rig.frame_sets import robot_of, set_time_s
+from perception.rig.frame_sets import mid_exposure_s, robot_of, set_time_s
 from perception.types import FrameKey
 
 
@@ -165,7 +165,11 @@ def _with_tracks(
     ]
     poses_path = folder / run_folder.POSES
     poses = parse_lines(poses_path, parse_pose) if poses_path.is_file() else []
-    over_time = evaluate_tracks(sets, truth, recording.calibrations, tracks, poses)
+    taken_s = {
+        (frame.camera, frame.index): mid_exposure_s(frame, recording.calibrations[frame.camera].height_px)
+        for frame in recording.records
+    }
+    over_time = evaluate_tracks(sets, truth, recording.calibrations, tracks, poses, taken_s)
     scored: list[TrackEvaluation | MessageEvaluation] = [over_time]
     heard = None
     if (folder / run_folder.SENT).is_file():

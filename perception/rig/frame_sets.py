@@ -41,6 +41,11 @@ def set_time_s(frames: Sequence[Exposed]) -> float:
     return sum(frame.time_s + 0.5 * frame.exposure_s for frame in frames) / len(frames)
 
 
+def mid_exposure_s(frame: Exposed, rows: int) -> float:
+    """Return when the middle row of a frame of so many rows was in the middle of its exposure."""
+    return frame.time_s + 0.5 * (frame.exposure_s + frame.line_time_s * (rows - 1))
+
+
 def robot_of(camera: str) -> str:
     """Return the robot that carries a camera, `robot.camera`.
 

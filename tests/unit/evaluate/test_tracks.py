@@ -193,3 +193,37 @@ def test_poses_are_read_as_written() -> None:
         parse_pose(broken)
     with pytest.raises(InputError, match=r"position_m is .*; wanted 3 numbers"):
         parse_pose({**pose.record(), "position_m": [1.0, math.nan, 2.0]})
+
+
+def test_sources_stand_where_they_are_at_the_time_of_their_set() -> None:
+    """A frame taken 0.2 s before its set's time: a source that goes 1 m/s to the left of one who turns 0.5 rad/s.
+
+    At the set's time it is at (2, 0.2) m in the world, which has turned by 0.1 rad in body axes.
+    """
+    still, level, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sin(0.05), math.cos(0.05))
+    poses = [
+        PoseTruth("r1", 0.0, still, level, still, (0.0, 0.0, 0.5)),
+        PoseTruth("r1", 0.2, still, turned, still, (0.0, 0.0, 0.5)),
+        PoseTruth("r2", 0.0, (2.0, 0.0, 0.0), level, (0.0, 1.0, 0.0), still),
+        PoseTruth("r2", 0.2, (2.0, 0.2, 0.0), level, (0.0, 1.0, 0.0), still),
+    ]
+    row = _source(0, "r2", 2.0, bearing_body=(1.0, 0.0, 0.0))
+    known = {"r1.front": dataclasses.replace(calibration(), position_body_m=np.zeros(3))}
+    cosine, sine = math.cos(0.1), math.sin(0.1)
+    there = (2.0 * cosine + 0.2 * sine, 0.2 * cosine - 2.0 * sine, 0.0)
+    said = dataclasses.replace(_track(0, 1, there), time_s=0.2)
+    sets = [("r1", 0.2, [("r1.front", 0)])]
+    found = evaluate_tracks(sets, [row], known, {"robust": [said]}, poses, {("r1.front", 0): 0.0})
+    assert found.summary["robust"]["track_position_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    found = evaluate_tracks(sets, [row], known, {"robust": [said]}, poses)
+    assert found.summary["robust"]["track_position_rmse_m"] == pytest.approx(math.dist(there, (2, 0, 0)))
+
+
+def test_an_error_beyond_a_metre_counts_while_its_track_goes_on() -> None:
+    """1.5 m off in the middle of three frames: a miss and a false track, and an error like the others."""
+    rows = [_source(k, "r2", AHEAD) for k in range(3)]
+    tracks = [_track(k, 1, (AHEAD + (1.5 if k == 1 else 0.0), 0, 0)) for k in range(3)]
+    numbers = _scored(rows, tracks, 3).summary["robust"]
+    assert (numbers["track_misses"], numbers["track_false_alarms_per_set"]) == (1, pytest.approx(1 / 3))
+    assert numbers["track_position_rmse_m"] == pytest.approx(1.5 / math.sqrt(3))
+    assert numbers["track_nees"] == pytest.approx(1.5**2 / 0.04 / 3 / 3)

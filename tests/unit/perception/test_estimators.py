@@ -257,3 +257,21 @@ def test_a_function_of_sets_that_fails_gets_one_line(tmp_path: Path, returned: s
         estimator([FRAME, OTHER], {"r1.front": CAMERA})
     assert said in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_two_versions_of_ones_own_code_each_have_their_own_helper(tmp_path: Path) -> None:
+    """`helper.py` beside each says which it is: the second must not run with the first one's."""
+    for version in ("old", "new"):
+        folder = tmp_path / version
+        folder.mkdir()
+        (folder / "own_code_helper.py").write_text(f"NAME = {version!r}\n")
+        (folder / "mine.py").write_text(
+            "from own_code_helper import NAME\ndef find(frame, calibration):\n    raise ValueError(NAME)\n"
+        )
+    loaded = [load_estimator(f"{tmp_path / version / 'mine.py'}:find") for version in ("old", "new")]
+    said = []
+    for one in loaded:
+        with pytest.raises(ValueError) as raised:  # noqa: PT011 (the text says which)
+            one.function(None, None)
+        said.append(str(raised.value))
+    assert said == ["old", "new"]

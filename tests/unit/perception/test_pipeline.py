@@ -140,3 +140,15 @@ def test_a_clock_that_is_set_back_begins_anew_and_is_heard() -> None:
     assert {signal.track: len(signal.time_s) > 5 for signal in pipeline.signals()} == dict.fromkeys(
         (1, 2, 3, 4), True
     )
+
+
+def test_a_set_that_is_pushed_twice_is_evidence_once() -> None:
+    once, twice = Pipeline(CAMERAS), Pipeline(CAMERAS)
+    for index in range(12):
+        frame = _frame(index)
+        (first, second) = (pipeline.push([frame]) for pipeline in (once, twice))
+        again = twice.push([frame])
+        assert again.messages == ()
+        assert [track.track for track in again.tracks] == [track.track for track in first.tracks]
+    for one, other in zip(first.tracks, second.tracks, strict=True):
+        np.testing.assert_array_equal(one.covariance, other.covariance)
