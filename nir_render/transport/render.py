@@ -1,8 +1,8 @@
 """From a scene to the light that reaches one camera."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError
 from nir_render.light.enlarge import Enlargement, part_of
 from nir_render.light.light import DirectTable, Indirect, Light
+from nir_render.light.nodes import over_nodes
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.checks import indivisible_sensor, solid_around
 from nir_render.scene.snapshot import Snapshot
@@ -22,6 +23,7 @@ from nir_render.transport.indirect import groups, sample_plan, stock
 from nir_render.transport.indirect.guide import group_power
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.sharpen import enlargement_of, flare_pilot, sharpened
+from nir_render.transport.wavelengths import carried_wavelengths
 from nir_render.transport.world import mitsuba_scene
 from nir_render.transport.world.facets import facets
 
@@ -40,24 +42,26 @@ def render(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None 
     InputError
         No such camera, or the camera is inside a body.
     """
-    rendering = _rendering(snapshot, camera, seed, cache)
-    samples, short_pixels = rendering.samples()
-    light = rendering.light(samples)
+    parts = _at_nodes(_rendering(snapshot, camera, seed, cache))
+    samples, short_pixels = _most_samples(parts)
+    light = over_nodes([part.light(samples) for part in parts])
     return replace(light, time_s=snapshot.time_s, seed=seed, short_pixels=short_pixels)
 
 
 def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
     """Return the direct light alone that reaches a camera; errors as `render`. It is kept nowhere."""
-    return _rendering(snapshot, camera, seed, None).direct_light()
+    parts = _at_nodes(_rendering(snapshot, camera, seed, None))
+    return over_nodes([part.direct_light() for part in parts])
 
 
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
-    """Return how many samples a pixel of the film gets on average; 0 without indirect light.
+    """Return how many samples a pixel of the film gets on average, all wavelengths together.
 
-    Errors as `render`.
+    0 without indirect light. Errors as `render`.
     """
-    samples, _ = _rendering(snapshot, camera, seed, None).samples()
-    return 0.0 if samples is None else float(np.mean(samples))
+    parts = _at_nodes(_rendering(snapshot, camera, seed, None))
+    samples, _ = _most_samples(parts)
+    return 0.0 if samples is None else len(parts) * float(np.mean(samples))
 
 
 def geometry_of(snapshot: Snapshot, camera: str) -> str:
@@ -72,6 +76,9 @@ class _Rendering:
     site: Site
     seed: int
     cache: LightCache
+    wavelength_m: float = BAND_M
+    whole: str = ""
+    """Of a rendering at one of several wavelengths: the geometry of all, which keys its random numbers."""
 
     def samples(self) -> tuple[Samples | None, int]:
         """Return the samples in each pixel of the film, None where there is no indirect light.
@@ -84,7 +91,7 @@ class _Rendering:
             return None, 0
         if share is None or not backend().vectorised:
             return stock.samples_of(snapshot.render.indirect), 0
-        key = plan_key(self.site, self._geometry, self.seed, _made_by())
+        key = plan_key(self.site, self._geometry, self.seed, self._made_by)
         given, wanted = self.cache.plan(key, lambda: self._planned(share))
         return given, int((given < wanted).sum())
 
@@ -97,7 +104,7 @@ class _Rendering:
         return self._light(None)
 
     def _kept(self, samples: Sampled, rendered: Callable[[], Light], *, counts: bool) -> Light:
-        made_by = _made_by()
+        made_by = self._made_by
         key = light_key(self.site, self._geometry, self.seed, self._power, samples, made_by)
         light = self.cache.get(key, counts=counts)
         if light is None:
@@ -114,12 +121,12 @@ class _Rendering:
 
     def _pilot(self) -> Light:
         site = self.site
-        key = groups.light_seed(self.seed, "pilot", site.name, self._geometry)
+        key = groups.light_seed(self.seed, "pilot", site.name, self._keyed)
         return self._light(groups.pilot(site.snapshot, self._rays, key, self._power))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
-        key = groups.light_seed(self.seed, "flares", site.name, self._geometry)
+        key = groups.light_seed(self.seed, "flares", site.name, self._keyed)
         enlargement = part_of(self._enlargement, pixels)
         scale = site.snapshot.render.indirect.scale
         blocks = sample_plan.flare_blocks(self._light(None), site.camera, scale, enlargement)
@@ -129,7 +136,7 @@ class _Rendering:
         snapshot, name = self.site.snapshot, self.site.name
         if not snapshot.has_indirect_light():
             return None
-        key = groups.light_seed(self.seed, "indirect", name, self._geometry)
+        key = groups.light_seed(self.seed, "indirect", name, self._keyed)
         if not backend().vectorised:
             return stock.indirect(snapshot, name, key, self._direct)
         light = groups.indirect(snapshot, self._rays, key, self._power, samples)
@@ -145,7 +152,7 @@ class _Rendering:
             time_s=snapshot.time_s,
             seed=self.seed,
             groups=snapshot.groups,
-            wavelengths_m=(BAND_M,),
+            wavelengths_m=(self.wavelength_m,),
             direct=self._direct,
             indirect=indirect,
             mirrors=facets(snapshot).name if backend().vectorised else (),
@@ -154,6 +161,16 @@ class _Rendering:
     @cached_property
     def _geometry(self) -> str:
         return geometry_key(self.site)
+
+    @property
+    def _keyed(self) -> str:
+        # Nodes walk the same paths: what differs between them is the materials and no noise.
+        return self.whole or self._geometry
+
+    @property
+    def _made_by(self) -> tuple[str, ...]:
+        own = (self.whole, f"{self.wavelength_m!r} m") if self.whole else ()
+        return (*_made_by(), *own)
 
     @cached_property
     def _rays(self) -> groups.Rays:
@@ -194,6 +211,33 @@ def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | N
         if indivisible is not None:
             raise InputError(f"{snapshot.origin}: {indivisible}")
     return _Rendering(Site(snapshot, camera), seed, LightCache() if cache is None else cache)
+
+
+def _at_nodes(rendering: _Rendering) -> list[_Rendering]:
+    """Return the renderings of the wavelengths at which light is carried: itself where nothing varies."""
+    site = rendering.site
+    if site.snapshot.at_wavelength(BAND_M) is site.snapshot:
+        return [rendering]
+    whole = geometry_key(site)
+    return [
+        replace(
+            rendering,
+            site=Site(site.snapshot.at_wavelength(wavelength_m), site.name),
+            wavelength_m=wavelength_m,
+            whole=whole,
+        )
+        for wavelength_m in carried_wavelengths(site.snapshot, site.name).wavelengths_m
+    ]
+
+
+def _most_samples(parts: Sequence[_Rendering]) -> tuple[Samples | None, int]:
+    """Return the samples of each pixel that suffice at every wavelength, as `_Rendering.samples`."""
+    found = [part.samples() for part in parts]
+    counts = [samples for samples, _ in found if samples is not None]
+    short_pixels = max(short for _, short in found)
+    if not counts:
+        return None, short_pixels
+    return counts[0] if len(counts) == 1 else reduce(np.maximum, counts), short_pixels
 
 
 def _made_by() -> tuple[str, ...]:
