@@ -10,7 +10,8 @@ curve, the products of each two, and powers up to the third.
 """
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_POWERS = 3
-_QUANTILES = 24
+_BOUNCES = 3
+_PLACES = 24  # that are tried for a new node, of those between two others
+_SEARCHED, _EVEN = 48, 9  # products that nodes are searched by, and the nodes that tell which
 _OUTSIDE = 1e-4
-_ROUNDED_M = 1e-12
 _LEAST_F = 1e-3  # of a product's largest value: what is darker errs by that much of the largest at most
 
 
@@ -34,63 +35,53 @@ class Choice:
 
 
 def choose_nodes(
-    wavelength_m: Array, weights: Array, curves: Array, candidates_m: Array, *, error: float, most: int
+    wavelength_m: Array, weights: Array, curves: Array, bends_m: Array, *, error: float, most: int
 ) -> Choice:
     """Return few wavelengths that keep an error, at most so many.
 
     One where one does. Else the ends of what is seen, and between them one after the other where most is
-    missing, by the products' absolute errors, which cannot cancel; those that are not needed go again.
+    missing, by the products' absolute errors, which cannot cancel. Each time all move, in turn, to where the
+    error is least; those without which it is kept go again.
 
     Parameters
     ----------
     wavelength_m
-        A fine grid, increasing, shape (n,).
+        A fine grid, increasing, shape (n,), on which nodes lie.
     weights
         What a camera sees of each emitter at each point of it, shape (emitters, n).
     curves
         Reflectances and transmittances that vary, shape (curves, n).
-    candidates_m
-        Where nodes may lie, beside the quantiles of the weights: between the least and the largest of these.
+    bends_m
+        Where curves bend, where nodes often do most. No node lies below the least or above the largest.
     """
     seen = weights[weights.sum(axis=1) > 0.0]
-    seen = seen / seen.sum(axis=1, keepdims=True)
-    problem = _Problem(wavelength_m, seen, _products(curves))
-    quantiles_m = [_quantiles(wavelength_m, one) for one in seen]
-    places_m = np.unique(np.concatenate([candidates_m, *quantiles_m]).round(12))
-    places_m = places_m[
-        (places_m >= candidates_m.min() - _ROUNDED_M) & (places_m <= candidates_m.max() + _ROUNDED_M)
-    ]
-    alone = [problem.error(np.array([place])) for place in places_m]
-    best = int(np.argmin(alone))
-    if alone[best] <= error or most == 1:
-        return Choice((float(places_m[best]),), alone[best])
-    nodes_m = _ends(places_m, seen, wavelength_m)
-    while problem.error(nodes_m) > error and len(nodes_m) < most:
-        nodes_m = _one_more(problem, nodes_m, places_m)
-    for node in nodes_m.copy():
-        fewer = nodes_m[nodes_m != node]
-        if len(nodes_m) > 1 and problem.error(fewer) <= max(error, problem.error(nodes_m)):
-            nodes_m = fewer
-    return Choice(tuple(float(node) for node in nodes_m), problem.error(nodes_m))
+    seen = np.unique(seen / seen.sum(axis=1, keepdims=True), axis=0)
+    bends = np.unique(np.searchsorted(wavelength_m, bends_m - 0.5 * (wavelength_m[1] - wavelength_m[0])))
+    bends = bends[bends < wavelength_m.size]
+    problem = _Problem(wavelength_m, seen, _products(curves), bends)
+    nodes = problem.alone()
+    if problem.error(nodes) > error and most > 1:
+        spread, hard = problem.ends(), problem.hardest()
+        # More than the most may be had on the way: some of them are needless in the end.
+        while problem.error(nodes) > error and len(spread) < 1.5 * most and max(np.diff(spread)) > 1:
+            spread = hard.moved(hard.one_more(spread), hard.missed)
+            found = hard.moved(spread, hard.error)
+            if problem.error(found) <= error:
+                found = problem.without_needless(found, error)
+            if len(found) <= most:
+                nodes = min(nodes, found, key=problem.error)
+    return Choice(tuple(np.round(wavelength_m[nodes], 12).tolist()), problem.error(nodes))
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is seen of each emitter, sums of 1, and the products that are to be carried."""
+    """What is seen of each emitter, sums of 1, and the products to carry; nodes are indices into the grid."""
 
     wavelength_m: Array
     seen: Array
     products: Array
-
-    def residual(self, nodes_m: Array) -> Array:
-        """Return how far products lie off what nodes make of them, shape (products, n)."""
-        at_nodes = np.array([np.interp(nodes_m, self.wavelength_m, one) for one in self.products])
-        carried = np.array([np.interp(self.wavelength_m, nodes_m, one) for one in at_nodes])
-        return np.asarray(self.products - carried)
-
-    def error(self, nodes_m: Array) -> float:
-        """Return the largest relative error of what is seen of an emitter by way of a product."""
-        return float((np.abs(self.seen @ self.residual(nodes_m).T) / self.scale).max())
+    bends: NDArray[np.int64]
+    known: dict[tuple[int | None, int | None], tuple[Array, Array]] = field(default_factory=dict)
 
     @cached_property
     def scale(self) -> Array:
@@ -98,45 +89,105 @@ class _Problem:
         floor = _LEAST_F * self.products.max(axis=1)
         return np.asarray(np.maximum(self.seen @ self.products.T, floor))
 
+    def alone(self) -> list[int]:
+        """Return the best of single nodes."""
+        low, high = self.bends[0], self.bends[-1] + 1
+        mean = (self.seen @ self.products.T)[:, :, None]
+        errors = np.abs(mean - self.products[None, :, low:high]) / self.scale[:, :, None]
+        return [int(low + np.argmin(errors.max(axis=(0, 1))))]
 
-def _ends(places_m: Array, seen: Array, wavelength_m: Array) -> Array:
-    """Return the outermost places between which all is seen but a ten thousandth of any emitter."""
-    cumulated = np.cumsum(seen, axis=1)
-    first = wavelength_m[(cumulated > _OUTSIDE).any(axis=0)][0]
-    last = wavelength_m[(cumulated < 1.0 - _OUTSIDE).any(axis=0)][-1]
-    low = places_m[max(int(np.searchsorted(places_m, first)) - 1, 0)]
-    high = places_m[min(int(np.searchsorted(places_m, last)), len(places_m) - 1)]
-    return np.array([low] if low == high else [low, high])
+    def hardest(self) -> "_Problem":
+        """Return the problem of those products that even nodes miss most: it is searched faster."""
+        low, high = self.ends()[0], self.ends()[-1]
+        even = sorted({int(node) for node in np.linspace(low, high, _EVEN).round()})
+        missed = np.sum([part for _, part in self.parts(even)], axis=0) / self.scale
+        some = np.argsort(-missed.max(axis=0), kind="stable")[:_SEARCHED]
+        return replace(self, products=self.products[some], known={})
 
+    def ends(self) -> list[int]:
+        """Return the outermost nodes, between which all is seen but a ten thousandth of any emitter."""
+        cumulated = np.cumsum(self.seen, axis=1)
+        first = int(np.flatnonzero((cumulated > _OUTSIDE).any(axis=0))[0])
+        last = int(np.flatnonzero((cumulated < 1.0 - _OUTSIDE).any(axis=0))[-1])
+        first, last = np.clip([first, last], self.bends[0], self.bends[-1])
+        return sorted({int(end) for end in (self.bends[[0, -1]] if first == last else (first, last))})
 
-def _one_more(problem: _Problem, nodes_m: Array, places_m: Array) -> Array:
-    """Return nodes and one more: where the worst product is missed most, the place that helps."""
-    missed = np.abs(problem.residual(nodes_m))
-    emitter, product = np.unravel_index(
-        np.argmax((problem.seen @ missed.T) / problem.scale), problem.scale.shape
-    )
-    interval = np.searchsorted(nodes_m, problem.wavelength_m)
-    parts = np.bincount(interval, problem.seen[emitter] * missed[product], minlength=len(nodes_m) + 1)
-    for worst in np.argsort(-parts):
-        low = nodes_m[worst - 1] if worst > 0 else -np.inf
-        high = nodes_m[worst] if worst < len(nodes_m) else np.inf
-        within = places_m[(places_m > low) & (places_m < high)]
-        if within.size:
-            tried = [np.sort(np.append(nodes_m, place)) for place in within]
-            left = [((problem.seen @ np.abs(problem.residual(one)).T) / problem.scale).max() for one in tried]
-            return tried[int(np.argmin(left))]
-    return nodes_m
+    def error(self, nodes: list[int]) -> float:
+        """Return the largest relative error of what is seen of an emitter by way of a product."""
+        signed = [part for part, _ in self.parts(nodes)]
+        return float((np.abs(np.sum(signed, axis=0)) / self.scale).max())
+
+    def missed(self, nodes: list[int]) -> float:
+        """Return the same where nothing that is missed at one wavelength makes up for another."""
+        return float((np.sum([part for _, part in self.parts(nodes)], axis=0) / self.scale).max())
+
+    def parts(self, nodes: list[int]) -> list[tuple[Array, Array]]:
+        """Return what products miss in each part of the grid, as it is and absolute, (emitters, products)."""
+        ends = list(itertools.pairwise([None, *nodes, None]))
+        for first, last in ends:
+            if (first, last) not in self.known:
+                self.known[first, last] = self._part(first, last)
+        return [self.known[one] for one in ends]
+
+    def _part(self, first: int | None, last: int | None) -> tuple[Array, Array]:
+        part = slice(first, last)
+        wavelength_m, products = self.wavelength_m[part], self.products[:, part]
+        carried: Array
+        if first is None:  # the outermost node stands for all beyond it
+            carried = self.products[:, last, None]
+        elif last is None:
+            carried = self.products[:, first, None]
+        else:
+            share = (wavelength_m - wavelength_m[0]) / (self.wavelength_m[last] - wavelength_m[0])
+            low, high = self.products[:, [first]], self.products[:, [last]]
+            carried = low + (high - low) * share
+        missed, seen = products - carried, self.seen[:, part]
+        return seen @ missed.T, seen @ np.abs(missed).T
+
+    def one_more(self, nodes: list[int]) -> list[int]:
+        """Return nodes and one more: where the worst product is missed most, the place that helps."""
+        absolute = np.array([part for _, part in self.parts(nodes)])
+        worst = np.argmax(absolute.sum(axis=0) / self.scale)
+        of_gaps = absolute.reshape(len(absolute), -1)[1:-1, worst]
+        gap = int(np.argmax(np.where(np.diff(nodes) > 1, of_gaps, -1.0)))
+        places = self._places(nodes[gap], nodes[gap + 1])
+        tried = [[*nodes[: gap + 1], place, *nodes[gap + 1 :]] for place in places]
+        return min(tried, key=self.missed)
+
+    def moved(self, nodes: list[int], by: Callable[[list[int]], float]) -> list[int]:
+        """Return nodes of which each, in turn, has moved between its neighbours if that helps."""
+        for number in range(len(nodes)):
+            low, *_, high = [self.bends[0] - 1, *nodes, self.bends[-1] + 1][number : number + 3]
+            places = self._places(int(low), int(high))
+            tried = [nodes, *([*nodes[:number], place, *nodes[number + 1 :]] for place in places)]
+            nodes = min(tried, key=by)
+        return nodes
+
+    def without_needless(self, nodes: list[int], error: float) -> list[int]:
+        """Return nodes less those without which the error is kept."""
+        for node in tuple(nodes):
+            fewer = [other for other in nodes if other != node]
+            if fewer and self.error(fewer) <= error:
+                nodes = fewer
+        return nodes
+
+    def _places(self, low: int, high: int) -> list[int]:
+        """Return some places between two nodes: bends, and even ones."""
+        bends = self.bends[(self.bends > low) & (self.bends < high)]
+        even = np.linspace(low, high, _PLACES + 2).round().astype(int)[1:-1]
+        places = np.unique(np.concatenate([_some(bends, _PLACES), even]))
+        return [int(place) for place in places if low < place < high]
 
 
 def _products(curves: Array) -> Array:
-    powers = [curve**power for curve in curves for power in range(1, _POWERS + 1)]
-    pairs = [one * other for one, other in itertools.combinations(curves, 2)]
-    products = np.array([*powers, *pairs])
+    curves = np.unique(curves, axis=0)
+    orders = [itertools.combinations_with_replacement(curves, order) for order in range(1, _BOUNCES + 1)]
+    products = np.array([np.prod(some, axis=0) for some in itertools.chain(*orders)])
     return np.asarray(products[products.max(axis=1) > 0.0])
 
 
-def _quantiles(wavelength_m: Array, seen: Array) -> Array:
-    cumulated = np.cumsum(seen)
-    middles = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    shares = np.concatenate([[_OUTSIDE], middles, [1.0 - _OUTSIDE]])
-    return np.asarray(np.interp(shares, cumulated, wavelength_m))
+def _some(places: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return some of many places, evenly."""
+    if len(places) <= most:
+        return places
+    return np.asarray(places[np.linspace(0, len(places) - 1, most).round().astype(int)])

@@ -1,8 +1,8 @@
 """From a scene to the light that reaches one camera."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError
 from nir_render.light.enlarge import Enlargement, part_of
 from nir_render.light.light import DirectTable, Indirect, Light
-from nir_render.light.nodes import over_nodes
+from nir_render.light.nodes import direct_over_nodes, indirect_over_nodes
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.checks import indivisible_sensor, solid_around
 from nir_render.scene.snapshot import Snapshot
@@ -42,16 +42,15 @@ def render(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None 
     InputError
         No such camera, or the camera is inside a body.
     """
-    parts = _at_nodes(_rendering(snapshot, camera, seed, cache))
-    samples, short_pixels = _most_samples(parts)
-    light = over_nodes([part.light(samples) for part in parts])
+    rendering = _rendering(snapshot, camera, seed, cache)
+    samples, short_pixels = rendering.samples()
+    light = rendering.light(samples)
     return replace(light, time_s=snapshot.time_s, seed=seed, short_pixels=short_pixels)
 
 
 def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
     """Return the direct light alone that reaches a camera; errors as `render`. It is kept nowhere."""
-    parts = _at_nodes(_rendering(snapshot, camera, seed, None))
-    return over_nodes([part.direct_light() for part in parts])
+    return _rendering(snapshot, camera, seed, None).direct_light()
 
 
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
@@ -59,9 +58,9 @@ def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
 
     0 without indirect light. Errors as `render`.
     """
-    parts = _at_nodes(_rendering(snapshot, camera, seed, None))
-    samples, _ = _most_samples(parts)
-    return 0.0 if samples is None else len(parts) * float(np.mean(samples))
+    rendering = _rendering(snapshot, camera, seed, None)
+    samples, _ = rendering.samples()
+    return 0.0 if samples is None else len(rendering.wavelengths_m) * float(np.mean(samples))
 
 
 def geometry_of(snapshot: Snapshot, camera: str) -> str:
@@ -76,9 +75,7 @@ class _Rendering:
     site: Site
     seed: int
     cache: LightCache
-    wavelength_m: float = BAND_M
-    whole: str = ""
-    """Of a rendering at one of several wavelengths: the geometry of all, which keys its random numbers."""
+    wavelengths_m: tuple[float, ...]
 
     def samples(self) -> tuple[Samples | None, int]:
         """Return the samples in each pixel of the film, None where there is no indirect light.
@@ -120,29 +117,36 @@ class _Rendering:
         return sample_plan.samples_map(pilot, flares, self.site.snapshot, noise_share, shape)
 
     def _pilot(self) -> Light:
-        site = self.site
-        key = groups.light_seed(self.seed, "pilot", site.name, self._keyed)
-        return self._light(groups.pilot(site.snapshot, self._rays, key, self._power))
+        key = groups.light_seed(self.seed, "pilot", self.site.name, self._geometry)
+        pilots = [groups.pilot(world, self._rays, key, self._power) for world in self._worlds]
+        return self._light(indirect_over_nodes(pilots))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
-        key = groups.light_seed(self.seed, "flares", site.name, self._keyed)
+        key = groups.light_seed(self.seed, "flares", site.name, self._geometry)
         enlargement = part_of(self._enlargement, pixels)
         scale = site.snapshot.render.indirect.scale
         blocks = sample_plan.flare_blocks(self._light(None), site.camera, scale, enlargement)
-        return self._light(flare_pilot(site.snapshot, self._built, self._rays, key, blocks, enlargement))
+        pilots = [
+            flare_pilot(world, self._built_of(world), self._rays, key, blocks, enlargement)
+            for world in self._worlds
+        ]
+        return self._light(indirect_over_nodes(pilots))
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
-        snapshot, name = self.site.snapshot, self.site.name
-        if not snapshot.has_indirect_light():
+        if not self.site.snapshot.has_indirect_light():
             return None
-        key = groups.light_seed(self.seed, "indirect", name, self._keyed)
+        # Nodes walk the same paths: what differs between them is the materials and no noise.
+        key = groups.light_seed(self.seed, "indirect", self.site.name, self._geometry)
+        return indirect_over_nodes([self._indirect_of(world, key, samples) for world in self._worlds])
+
+    def _indirect_of(self, world: Snapshot, key: int, samples: Samples | None) -> Indirect | None:
         if not backend().vectorised:
-            return stock.indirect(snapshot, name, key, self._direct)
-        light = groups.indirect(snapshot, self._rays, key, self._power, samples)
+            return stock.indirect(world, self.site.name, key, self._direct)
+        light = groups.indirect(world, self._rays, key, self._power, samples)
         if light is None:
             return None
-        return sharpened(snapshot, self._built, self._rays, key, light, self._enlargement)
+        return sharpened(world, self._built_of(world), self._rays, key, light, self._enlargement)
 
     def _light(self, indirect: Indirect | None) -> Light:
         site = self.site
@@ -152,7 +156,7 @@ class _Rendering:
             time_s=snapshot.time_s,
             seed=self.seed,
             groups=snapshot.groups,
-            wavelengths_m=(self.wavelength_m,),
+            wavelengths_m=self.wavelengths_m,
             direct=self._direct,
             indirect=indirect,
             mirrors=facets(snapshot).name if backend().vectorised else (),
@@ -163,14 +167,14 @@ class _Rendering:
         return geometry_key(self.site)
 
     @property
-    def _keyed(self) -> str:
-        # Nodes walk the same paths: what differs between them is the materials and no noise.
-        return self.whole or self._geometry
-
-    @property
     def _made_by(self) -> tuple[str, ...]:
-        own = (self.whole, f"{self.wavelength_m!r} m") if self.whole else ()
-        return (*_made_by(), *own)
+        nodes = () if self.wavelengths_m == (BAND_M,) else (f"{self.wavelengths_m!r} m",)
+        return (*versions(backend().variant, backend().compiler), *nodes)
+
+    @cached_property
+    def _worlds(self) -> list[Snapshot]:
+        """The world as it is at each node."""
+        return [self.site.snapshot.at_wavelength(wavelength_m) for wavelength_m in self.wavelengths_m]
 
     @cached_property
     def _rays(self) -> groups.Rays:
@@ -182,7 +186,11 @@ class _Rendering:
 
     @cached_property
     def _built(self) -> DeviceScene:
-        return groups.world_on_device(self.site.snapshot, self._power)
+        return groups.world_on_device(self._worlds[0], self._power)
+
+    def _built_of(self, world: Snapshot) -> DeviceScene:
+        """Return a world on the device; of several only the first stays there."""
+        return self._built if world is self._worlds[0] else groups.world_on_device(world, self._power)
 
     @cached_property
     def _enlargement(self) -> Enlargement:
@@ -194,7 +202,8 @@ class _Rendering:
         snapshot, pose = site.snapshot, site.pose
         what = f"the camera {site.name} at {snapshot.time_s:g} s"
         mitsuba_scene.check_meshes(snapshot, pose.position_m, what)
-        return direct_table(snapshot, pose, specular=backend().vectorised)
+        specular = backend().vectorised
+        return direct_over_nodes([direct_table(world, pose, specular=specular) for world in self._worlds])
 
 
 def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None) -> _Rendering:
@@ -210,35 +219,5 @@ def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | N
         indivisible = indivisible_sensor(camera, placed.camera.sensor, snapshot.render.indirect.scale)
         if indivisible is not None:
             raise InputError(f"{snapshot.origin}: {indivisible}")
-    return _Rendering(Site(snapshot, camera), seed, LightCache() if cache is None else cache)
-
-
-def _at_nodes(rendering: _Rendering) -> list[_Rendering]:
-    """Return the renderings of the wavelengths at which light is carried: itself where nothing varies."""
-    site = rendering.site
-    if site.snapshot.at_wavelength(BAND_M) is site.snapshot:
-        return [rendering]
-    whole = geometry_key(site)
-    return [
-        replace(
-            rendering,
-            site=Site(site.snapshot.at_wavelength(wavelength_m), site.name),
-            wavelength_m=wavelength_m,
-            whole=whole,
-        )
-        for wavelength_m in carried_wavelengths(site.snapshot, site.name).wavelengths_m
-    ]
-
-
-def _most_samples(parts: Sequence[_Rendering]) -> tuple[Samples | None, int]:
-    """Return the samples of each pixel that suffice at every wavelength, as `_Rendering.samples`."""
-    found = [part.samples() for part in parts]
-    counts = [samples for samples, _ in found if samples is not None]
-    short_pixels = max(short for _, short in found)
-    if not counts:
-        return None, short_pixels
-    return counts[0] if len(counts) == 1 else reduce(np.maximum, counts), short_pixels
-
-
-def _made_by() -> tuple[str, ...]:
-    return versions(backend().variant, backend().compiler)
+    wavelengths_m = carried_wavelengths(snapshot, camera).wavelengths_m
+    return _Rendering(Site(snapshot, camera), seed, LightCache() if cache is None else cache, wavelengths_m)

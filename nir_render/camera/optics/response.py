@@ -29,6 +29,7 @@ from nir_render.spectra.nodes import ONE_NODE, Node
 
 _ANGLES = 129
 _COSINES = 257
+_SENSED_ANGLES = 4
 _PUPIL_RINGS = 6
 _PUPIL_SPOKES = 12  # over half the pupil; the other half mirrors it
 
@@ -155,27 +156,23 @@ def _electrons_per_j(
 
 
 def sensed(camera: Camera, emitter: Emitter, wavelength_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how much of an emitter's light each wavelength brings, on the axis and at the corner.
+    """Return how much of an emitter's light each wavelength brings, at angles from the axis to the corner.
 
-    In electrons, of unit sum on an even grid, shape (2, n).
+    In electrons, of unit sum on an even grid, shape (angles, n), less angles at which nothing is seen.
     """
-    return _sensed(optics_alone(camera), kind_alone(emitter), tuple(wavelength_m.tolist()))
-
-
-@lru_cache(maxsize=64)
-def _sensed(camera: Camera, emitter: Emitter, wavelengths_m: tuple[float, ...]) -> NDArray[np.float64]:
-    wavelength_m = np.array(wavelengths_m)
     spectrum = emission_spectrum(emitter)
     density = np.interp(wavelength_m, spectrum.wavelength_m, spectrum.value, 0.0, 0.0)
     efficiency = camera.sensor.efficiency()
     density *= np.interp(wavelength_m, efficiency.wavelength_m, efficiency.value, 0.0, 0.0) * wavelength_m
     if camera.filter is None:
-        passed = np.ones((2, wavelength_m.size))
+        passed = np.ones((1, wavelength_m.size))
     else:
-        rays, weights = incidence(camera, np.array([0.0, intrinsics_of(camera).corner_angle_rad]))
+        angle_rad = np.linspace(0.0, intrinsics_of(camera).corner_angle_rad, _SENSED_ANGLES)
+        rays, weights = incidence(camera, angle_rad)
         passed = np.array([weights @ camera.filter.transmission(wavelength_m, ray[:, None]) for ray in rays])
     seen = passed * density
-    return np.asarray(seen / np.maximum(seen.sum(axis=1, keepdims=True), 1e-300))
+    seen = seen[seen.any(axis=1)]
+    return np.asarray(seen / seen.sum(axis=1, keepdims=True))
 
 
 def vignetting(camera: Camera, angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:

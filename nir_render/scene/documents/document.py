@@ -141,9 +141,9 @@ class IndirectSettings(Document):
 class WavelengthSettings(Document):
     """Wavelengths that light is carried at where materials vary: few that keep `error`, at most `most`."""
 
-    example: ClassVar[str] = "{error: 0.2 %}"
+    example: ClassVar[str] = "{error: 0.1 %}"
 
-    error: Annotated[Fraction, Field(ge=1e-6, le=1)] = 2e-3
+    error: Annotated[Fraction, Field(ge=1e-6, le=1)] = 1e-3
     most: Annotated[int, Field(ge=1, le=64)] = 24
 
 
