@@ -5,8 +5,8 @@ linear between them (`nodes`), a product f errs, in what a camera sees of an emi
 
     ∫ W(λ) [f(λ) − Σ_k φ_k(λ) f(λ_k)] dλ / ∫ W(λ) f(λ) dλ
 
-with W = emitter × filter × quantum efficiency × λ. The error stated is the largest over all W, and over each
-curve, the products of each two, and powers up to the third.
+with W = emitter × filter × quantum efficiency × λ. The error stated is the largest over all W, and over all
+products of up to three curves, of which some may be the same.
 """
 
 import itertools
@@ -55,10 +55,13 @@ def choose_nodes(
         Where curves bend, where nodes often do most. No node lies below the least or above the largest.
     """
     seen = weights[weights.sum(axis=1) > 0.0]
+    products = _products(curves)
+    if not seen.size or not products.size:  # nothing is seen, or nothing reflects
+        return Choice((float(bends_m.min()),), 0.0)
     seen = np.unique(seen / seen.sum(axis=1, keepdims=True), axis=0)
     bends = np.unique(np.searchsorted(wavelength_m, bends_m - 0.5 * (wavelength_m[1] - wavelength_m[0])))
     bends = bends[bends < wavelength_m.size]
-    problem = _Problem(wavelength_m, seen, _products(curves), bends)
+    problem = _Problem(wavelength_m, seen, products, bends)
     nodes = problem.alone()
     if problem.error(nodes) > error and most > 1:
         spread, hard = problem.ends(), problem.hardest()

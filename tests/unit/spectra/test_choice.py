@@ -63,6 +63,12 @@ def test_nodes_stay_within_what_is_known_however_little_that_is(known_nm: tuple[
     assert error_by_hand(found.wavelengths_m, FLOODED, curve) <= 1.001 * found.error + 1e-12 < 1e3
 
 
+def test_one_node_where_nothing_is_seen_or_reflects() -> None:
+    for seen, curve in ((0.0 * BAND, BAND), (BAND, 0.0 * BAND)):
+        found = chosen(seen, [curve])
+        assert (len(found.wavelengths_m), found.error) == (1, 0.0)
+
+
 def scene(**reflectance: Any) -> nr.Scene:
     wall = {
         "type": "rectangle",
