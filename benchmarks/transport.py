@@ -1,6 +1,6 @@
 """How fast and exact light is rendered, side by side with Mitsuba's own integrators: one JSON object.
 
-    python benchmarks/transport.py [--quick] [--only groups,many,scaling,fog,smooth,memory]
+    python benchmarks/transport.py [--quick] [--only groups,many,scaling,fog,smooth,nodes,memory]
 
 Times are medians of five renders of 640 × 480 pixels, 64 samples, depth 6, one after the other in this
 process. Variances are those between seeds (the same number for both sides), median over the pixels; a gain is
@@ -8,7 +8,8 @@ variance × time of Mitsuba over variance × time of ours. Light that comes stra
 field says otherwise. Mitsuba renders all sources at once, into one image; ours gives one array per source.
 `fog_gain_scattered` is of light that fog alone scatters, between black surfaces; `fog_gain_room` of all
 indirect light in the room with its walls; `clear_gain` and `fog_gain` of the light in flares' apertures,
-straight light included.
+straight light included. `nodes_time_ratio_N` is the time of light carried at N wavelengths over that at one,
+the same walls by their values at 940 nm.
 """
 
 import argparse
@@ -294,6 +295,20 @@ def smooth(repeats: int) -> dict[str, float]:
     }
 
 
+def nodes(repeats: int) -> dict[str, float]:
+    """Return what more wavelengths cost: walls that vary over the spectrum against walls of numbers."""
+    plain = build(4, ROOM, 640)
+    dip = [["300 nm", 0.9], ["900 nm", 0.9], ["940 nm", 0.05], ["980 nm", 0.9], ["1100 nm", 0.9]]
+    varied = plain.with_({"materials.white.reflectance": {"points": dip}})
+    scenes = [varied.with_({"render.wavelengths": {"error": 1e-6, "most": most}}) for most in (3, 4, 8)]
+    carried = [len(nr.render(scene, "eye.c").wavelengths_m) for scene in scenes]
+    one_s, *several_s = seconds(
+        *(lambda scene=scene: nr.render(scene, "eye.c") for scene in (plain, *scenes)), repeats=repeats
+    )
+    ratios = {f"nodes_time_ratio_{n}": taken_s / one_s for n, taken_s in zip(carried, several_s, strict=True)}
+    return {"nodes_seconds_1": one_s, **ratios}
+
+
 def memory() -> dict[str, float]:
     """Return the largest resident memory of a process that renders 512 groups at 1280 × 960."""
     code = (
@@ -317,7 +332,7 @@ def main() -> None:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="two repeats and six seeds")
-    parser.add_argument("--only", default="groups,many,scaling,fog,smooth,memory")
+    parser.add_argument("--only", default="groups,many,scaling,fog,smooth,nodes,memory")
     options = parser.parse_args()
     repeats, seeds = (2, 6) if options.quick else (5, 16)
     wanted = set(options.only.split(","))
@@ -351,6 +366,8 @@ def main() -> None:
             }
     if "smooth" in wanted:
         result |= smooth(repeats)
+    if "nodes" in wanted:
+        result |= nodes(repeats)
     if "scaling" in wanted:
         result |= scaling(min(repeats, 3), seeds)
     if "memory" in wanted:

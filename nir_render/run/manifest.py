@@ -150,6 +150,21 @@ def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[s
     return {"refresh": known}
 
 
+def wavelength_facts(scene: Scene) -> dict[str, dict[str, Any]]:
+    """Return, by camera, at which wavelengths light was carried, and the error of what is between them."""
+    from nir_render.transport.wavelengths import carried_wavelengths
+
+    snapshot = scene.at(scene.document.clock.start_s)
+    chosen = {name: carried_wavelengths(snapshot, name) for name in scene.cameras()}
+    return {
+        name: {
+            "nodes_nm": [round(1e9 * wavelength_m, 3) for wavelength_m in one.wavelengths_m],
+            "error": _rounded(one.error),
+        }
+        for name, one in chosen.items()
+    }
+
+
 def spectral_facts(scene: Scene) -> dict[str, list[dict[str, Any]]]:
     """Return, by camera, what it sees of each emitter in band and out of it, on its axis, per joule.
 

@@ -28,6 +28,7 @@ from nir_render.run.manifest import (
     sample_facts,
     spectral_facts,
     versions,
+    wavelength_facts,
 )
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
@@ -283,6 +284,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
         "render_noise": noise,
         "ambient": ambient_facts(scene),
         "spectral": spectral_facts(scene),
+        "wavelengths": wavelength_facts(scene),
         "lights": {"rendered": writer.lights[0], "reused": writer.lights[1]},
     }
 

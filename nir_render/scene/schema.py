@@ -11,12 +11,14 @@ from nir_render.scene.documents.files import PresetDocument, preset_names
 from nir_render.scene.documents.lens import Lens
 from nir_render.scene.documents.sensor import Sensor
 from nir_render.scene.documents.spectral.bandpass import Bandpass
+from nir_render.scene.documents.spectral.led import Led
 from nir_render.scene.text.units import SPEED, VISIBILITY
 
 _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     Source,
     Lens,
     Bandpass,
+    Led,
     Sensor,
     Camera,
     Rig,
@@ -29,6 +31,7 @@ def scene_schema() -> dict[str, Any]:
     """Return the schema (draft 2020-12) of what a person writes: presets by name, includes, unit strings."""
     schema = SceneDocument.model_json_schema(by_alias=True)
     definitions = schema["$defs"]
+    definitions["Led"]["properties"]["power_at_current"] = {"type": "array", "minItems": 2}
     for model in _PRESET_MODELS:
         if model.__name__ in definitions:
             definitions[model.__name__] = _or_preset(definitions[model.__name__], model.preset_folder)
@@ -65,6 +68,7 @@ def _describe_curves(definitions: dict[str, Any]) -> None:
     points = {"type": "array", "items": pair, "minItems": 2}
     headers = {
         "CurveDocument": "wavelength_nm,value",
+        "SpectrumDocument": "wavelength_nm,value",
         "PatternDocument": "polar_deg,azimuth_deg,value",
         "TabulatedPhase": "angle_deg,value",
     }
@@ -73,6 +77,14 @@ def _describe_curves(definitions: dict[str, Any]) -> None:
         properties["file"] = {"type": "string", "description": f"CSV with the header {header}"}
         properties["points"] = points
     definitions["TabulatedPhase"]["required"].remove("points")
+    for name, key in (
+        ("Diffuse", "reflectance"),
+        ("Mirror", "reflectance"),
+        ("Plastic", "reflectance"),
+        ("Pane", "transmission"),
+    ):
+        either = definitions[name]["properties"][key]
+        either["anyOf"] = either.pop("oneOf")  # a curve may be a number too
     definitions["CurveDocument"] = {
         "title": "Curve",
         "anyOf": [{"type": "number"}, definitions["CurveDocument"]],

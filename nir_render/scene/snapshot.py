@@ -23,7 +23,7 @@ from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import RenderSettings, reflects_or_scatters
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.fog import Fog
-from nir_render.scene.documents.materials import MaterialDocument
+from nir_render.scene.documents.materials import MaterialDocument, at_wavelength, curves_of
 from nir_render.scene.documents.shapes import ShapeDocument
 from nir_render.scene.documents.times.drives import Drive, SourceDrive
 from nir_render.scene.emission import Emitter, light_groups
@@ -153,6 +153,13 @@ class Snapshot:
         if self.lamps or self.skylight is not None:
             return True
         return reflects_or_scatters(self.shapes, self.materials, self.fog)
+
+    def at_wavelength(self, wavelength_m: float) -> "Snapshot":
+        """Return the world as it is at one wavelength: materials of numbers alone."""
+        if not any(curves_of(material) for material in self.materials.values()):
+            return self
+        materials = {name: at_wavelength(known, wavelength_m) for name, known in self.materials.items()}
+        return replace(self, materials=materials)
 
     def moved(
         self,

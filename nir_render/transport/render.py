@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nir_render.errors import InputError
 from nir_render.light.enlarge import Enlargement, part_of
 from nir_render.light.light import DirectTable, Indirect, Light
+from nir_render.light.nodes import direct_over_nodes, indirect_over_nodes
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.checks import indivisible_sensor, solid_around
 from nir_render.scene.snapshot import Snapshot
@@ -22,6 +23,7 @@ from nir_render.transport.indirect import groups, sample_plan, stock
 from nir_render.transport.indirect.guide import group_power
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.sharpen import enlargement_of, flare_pilot, sharpened
+from nir_render.transport.wavelengths import carried_wavelengths
 from nir_render.transport.world import mitsuba_scene
 from nir_render.transport.world.facets import facets
 
@@ -52,12 +54,13 @@ def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
 
 
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
-    """Return how many samples a pixel of the film gets on average; 0 without indirect light.
+    """Return how many samples a pixel of the film gets on average, all wavelengths together.
 
-    Errors as `render`.
+    0 without indirect light. Errors as `render`.
     """
-    samples, _ = _rendering(snapshot, camera, seed, None).samples()
-    return 0.0 if samples is None else float(np.mean(samples))
+    rendering = _rendering(snapshot, camera, seed, None)
+    samples, _ = rendering.samples()
+    return 0.0 if samples is None else len(rendering.wavelengths_m) * float(np.mean(samples))
 
 
 def geometry_of(snapshot: Snapshot, camera: str) -> str:
@@ -72,6 +75,7 @@ class _Rendering:
     site: Site
     seed: int
     cache: LightCache
+    wavelengths_m: tuple[float, ...]
 
     def samples(self) -> tuple[Samples | None, int]:
         """Return the samples in each pixel of the film, None where there is no indirect light.
@@ -84,7 +88,7 @@ class _Rendering:
             return None, 0
         if share is None or not backend().vectorised:
             return stock.samples_of(snapshot.render.indirect), 0
-        key = plan_key(self.site, self._geometry, self.seed, _made_by())
+        key = plan_key(self.site, self._geometry, self.seed, self._made_by)
         given, wanted = self.cache.plan(key, lambda: self._planned(share))
         return given, int((given < wanted).sum())
 
@@ -97,7 +101,7 @@ class _Rendering:
         return self._light(None)
 
     def _kept(self, samples: Sampled, rendered: Callable[[], Light], *, counts: bool) -> Light:
-        made_by = _made_by()
+        made_by = self._made_by
         key = light_key(self.site, self._geometry, self.seed, self._power, samples, made_by)
         light = self.cache.get(key, counts=counts)
         if light is None:
@@ -113,9 +117,9 @@ class _Rendering:
         return sample_plan.samples_map(pilot, flares, self.site.snapshot, noise_share, shape)
 
     def _pilot(self) -> Light:
-        site = self.site
-        key = groups.light_seed(self.seed, "pilot", site.name, self._geometry)
-        return self._light(groups.pilot(site.snapshot, self._rays, key, self._power))
+        key = groups.light_seed(self.seed, "pilot", self.site.name, self._geometry)
+        pilots = [groups.pilot(world, self._rays, key, self._power) for world in self._worlds]
+        return self._light(indirect_over_nodes(pilots))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
@@ -123,19 +127,26 @@ class _Rendering:
         enlargement = part_of(self._enlargement, pixels)
         scale = site.snapshot.render.indirect.scale
         blocks = sample_plan.flare_blocks(self._light(None), site.camera, scale, enlargement)
-        return self._light(flare_pilot(site.snapshot, self._built, self._rays, key, blocks, enlargement))
+        pilots = [
+            flare_pilot(world, self._built_of(world), self._rays, key, blocks, enlargement)
+            for world in self._worlds
+        ]
+        return self._light(indirect_over_nodes(pilots))
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
-        snapshot, name = self.site.snapshot, self.site.name
-        if not snapshot.has_indirect_light():
+        if not self.site.snapshot.has_indirect_light():
             return None
-        key = groups.light_seed(self.seed, "indirect", name, self._geometry)
+        # Nodes walk the same paths: what differs between them is the materials and no noise.
+        key = groups.light_seed(self.seed, "indirect", self.site.name, self._geometry)
+        return indirect_over_nodes([self._indirect_of(world, key, samples) for world in self._worlds])
+
+    def _indirect_of(self, world: Snapshot, key: int, samples: Samples | None) -> Indirect | None:
         if not backend().vectorised:
-            return stock.indirect(snapshot, name, key, self._direct)
-        light = groups.indirect(snapshot, self._rays, key, self._power, samples)
+            return stock.indirect(world, self.site.name, key, self._direct)
+        light = groups.indirect(world, self._rays, key, self._power, samples)
         if light is None:
             return None
-        return sharpened(snapshot, self._built, self._rays, key, light, self._enlargement)
+        return sharpened(world, self._built_of(world), self._rays, key, light, self._enlargement)
 
     def _light(self, indirect: Indirect | None) -> Light:
         site = self.site
@@ -145,7 +156,7 @@ class _Rendering:
             time_s=snapshot.time_s,
             seed=self.seed,
             groups=snapshot.groups,
-            wavelengths_m=(BAND_M,),
+            wavelengths_m=self.wavelengths_m,
             direct=self._direct,
             indirect=indirect,
             mirrors=facets(snapshot).name if backend().vectorised else (),
@@ -154,6 +165,16 @@ class _Rendering:
     @cached_property
     def _geometry(self) -> str:
         return geometry_key(self.site)
+
+    @property
+    def _made_by(self) -> tuple[str, ...]:
+        nodes = () if self.wavelengths_m == (BAND_M,) else (f"{self.wavelengths_m!r} m",)
+        return (*versions(backend().variant, backend().compiler), *nodes)
+
+    @cached_property
+    def _worlds(self) -> list[Snapshot]:
+        """The world as it is at each node."""
+        return [self.site.snapshot.at_wavelength(wavelength_m) for wavelength_m in self.wavelengths_m]
 
     @cached_property
     def _rays(self) -> groups.Rays:
@@ -165,7 +186,11 @@ class _Rendering:
 
     @cached_property
     def _built(self) -> DeviceScene:
-        return groups.world_on_device(self.site.snapshot, self._power)
+        return groups.world_on_device(self._worlds[0], self._power)
+
+    def _built_of(self, world: Snapshot) -> DeviceScene:
+        """Return a world on the device; of several only the first stays there."""
+        return self._built if world is self._worlds[0] else groups.world_on_device(world, self._power)
 
     @cached_property
     def _enlargement(self) -> Enlargement:
@@ -177,7 +202,8 @@ class _Rendering:
         snapshot, pose = site.snapshot, site.pose
         what = f"the camera {site.name} at {snapshot.time_s:g} s"
         mitsuba_scene.check_meshes(snapshot, pose.position_m, what)
-        return direct_table(snapshot, pose, specular=backend().vectorised)
+        specular = backend().vectorised
+        return direct_over_nodes([direct_table(world, pose, specular=specular) for world in self._worlds])
 
 
 def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None) -> _Rendering:
@@ -193,8 +219,5 @@ def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | N
         indivisible = indivisible_sensor(camera, placed.camera.sensor, snapshot.render.indirect.scale)
         if indivisible is not None:
             raise InputError(f"{snapshot.origin}: {indivisible}")
-    return _Rendering(Site(snapshot, camera), seed, LightCache() if cache is None else cache)
-
-
-def _made_by() -> tuple[str, ...]:
-    return versions(backend().variant, backend().compiler)
+    wavelengths_m = carried_wavelengths(snapshot, camera).wavelengths_m
+    return _Rendering(Site(snapshot, camera), seed, LightCache() if cache is None else cache, wavelengths_m)

@@ -29,6 +29,7 @@ from nir_render.spectra.nodes import ONE_NODE, Node
 
 _ANGLES = 129
 _COSINES = 257
+_SENSED_ANGLES = 4
 _PUPIL_RINGS = 6
 _PUPIL_SPOKES = 12  # over half the pupil; the other half mirrors it
 
@@ -152,6 +153,26 @@ def _electrons_per_j(
         return np.full(cosines.shape, np.trapezoid(integrand, wavelength_m))
     passed = camera.filter.transmission(wavelength_m, cosines[:, None])
     return np.asarray(np.trapezoid(passed * integrand, wavelength_m, axis=1))
+
+
+def sensed(camera: Camera, emitter: Emitter, wavelength_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much of an emitter's light each wavelength brings, at angles from the axis to the corner.
+
+    In electrons, of unit sum on an even grid, shape (angles, n), less angles at which nothing is seen.
+    """
+    spectrum = emission_spectrum(emitter)
+    density = np.interp(wavelength_m, spectrum.wavelength_m, spectrum.value, 0.0, 0.0)
+    efficiency = camera.sensor.efficiency()
+    density *= np.interp(wavelength_m, efficiency.wavelength_m, efficiency.value, 0.0, 0.0) * wavelength_m
+    if camera.filter is None:
+        passed = np.ones((1, wavelength_m.size))
+    else:
+        angle_rad = np.linspace(0.0, intrinsics_of(camera).corner_angle_rad, _SENSED_ANGLES)
+        rays, weights = incidence(camera, angle_rad)
+        passed = np.array([weights @ camera.filter.transmission(wavelength_m, ray[:, None]) for ray in rays])
+    seen = passed * density
+    seen = seen[seen.any(axis=1)]
+    return np.asarray(seen / seen.sum(axis=1, keepdims=True))
 
 
 def vignetting(camera: Camera, angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:

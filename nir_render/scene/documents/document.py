@@ -23,12 +23,12 @@ from nir_render.errors import shown
 from nir_render.geometry import rectangle_frame
 from nir_render.scene.documents.ambient.lamps import IlluminanceDocument, Lamp
 from nir_render.scene.documents.ambient.sun import Sky, Skylight, Sun
-from nir_render.scene.documents.base import Document, Name, Orientation, Position, Positive, Time
+from nir_render.scene.documents.base import Document, Fraction, Name, Orientation, Position, Positive, Time
 from nir_render.scene.documents.camera import Rig
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import expand_preset, preset_names
 from nir_render.scene.documents.fog import Fog
-from nir_render.scene.documents.materials import Diffuse, MaterialDocument
+from nir_render.scene.documents.materials import MaterialDocument, is_black
 from nir_render.scene.documents.shapes import ShapeDocument
 from nir_render.scene.documents.times.clocks import Clock
 from nir_render.scene.documents.times.motion import Moving, Waypoint
@@ -138,6 +138,15 @@ class IndirectSettings(Document):
         return self
 
 
+class WavelengthSettings(Document):
+    """Wavelengths that light is carried at where materials vary: few that keep `error`, at most `most`."""
+
+    example: ClassVar[str] = "{error: 0.1 %}"
+
+    error: Annotated[Fraction, Field(ge=1e-6, le=1)] = 1e-3
+    most: Annotated[int, Field(ge=1, le=64)] = 24
+
+
 class RenderSettings(Document):
     """How finely the transport of light is sampled.
 
@@ -149,6 +158,7 @@ class RenderSettings(Document):
 
     noise: NoiseTarget | None = None
     indirect: IndirectSettings = IndirectSettings()
+    wavelengths: WavelengthSettings = WavelengthSettings()
     visibility_rays: Annotated[int, Field(ge=16, le=65536)] = 1024
 
     @model_validator(mode="before")
@@ -342,5 +352,5 @@ def reflects_or_scatters(
 ) -> bool:
     """Tell whether any body reflects or passes light, or fog scatters it."""
     used = [materials[name] for name in {shape.material for shape in shapes.values()}]
-    absorbing = all(isinstance(material, Diffuse) and material.reflectance == 0.0 for material in used)
+    absorbing = all(is_black(material) for material in used)
     return not absorbing or (fog is not None and fog.albedo * fog.extinction_per_m > 0.0)

@@ -1,11 +1,13 @@
-"""Models of materials, as they are at 940 nm."""
+"""Models of materials: numbers as they are at 940 nm, or curves over wavelength."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import RGB_REFUSED, Document, Fraction, typed
+from nir_render.scene.documents.curves import CurveDocument
 
 
 def _refuse_rgb(value: Any) -> Any:
@@ -30,9 +32,23 @@ def _smooth_or_rough_enough(roughness: float) -> float:
     return roughness if roughness == 0.0 else _rough_enough(roughness)
 
 
+def _form(value: Any) -> str:
+    return "curve" if isinstance(value, Mapping | CurveDocument) else "number"
+
+
+def _share(curve: CurveDocument) -> CurveDocument:
+    if curve.points is None or max(value for _, value in curve.points) > 1.0:
+        raise ValueError("wanted 'points' or 'file': values from 0 to 1 over wavelength, or one number")
+    return curve
+
+
 _LEAST_ROUGHNESS = 0.02
 _LARGEST_INDEX = 100.0
-Reflectance = Annotated[Fraction, BeforeValidator(_refuse_rgb), Field(ge=0, le=1)]
+_TRACE = 1e-9
+_Number = Annotated[Fraction, Field(ge=0, le=1), Tag("number")]
+_Curve = Annotated[CurveDocument, AfterValidator(_share), Tag("curve")]
+Share = Annotated[_Number | _Curve, Discriminator(_form)]
+Reflectance = Annotated[Share, BeforeValidator(_refuse_rgb)]
 
 
 class Diffuse(Document):
@@ -83,7 +99,7 @@ class Pane(Document):
 
     type: Literal["pane"]
     index: Annotated[float, Field(ge=1, le=_LARGEST_INDEX)] = 1.5
-    transmission: Annotated[Fraction, Field(ge=0, le=1)] = 1.0
+    transmission: Share = 1.0
 
 
 MaterialDocument = Annotated[
@@ -91,3 +107,37 @@ MaterialDocument = Annotated[
     Field(discriminator="type"),
     typed("{type: diffuse, reflectance: 0.5}", Diffuse, RoughConductor, Mirror, Dielectric, Plastic, Pane),
 ]
+
+
+def curves_of(material: MaterialDocument) -> dict[str, CurveDocument]:
+    """Return what of a material varies with the wavelength, by field."""
+    values = {name: getattr(material, name) for name in type(material).model_fields}
+    return {name: value for name, value in values.items() if isinstance(value, CurveDocument)}
+
+
+def at_wavelength(material: MaterialDocument, wavelength_m: float) -> MaterialDocument:
+    """Return a material as it is at one wavelength, or at the nearest at which it is known: all numbers.
+
+    A mirror or pane keeps a trace of light where its curve is 0, so that it shows the same images throughout.
+    """
+    least = _TRACE if isinstance(material, Mirror | Pane) else 0.0
+    numbers = {}
+    for name, written in curves_of(material).items():
+        curve = written.curve(name)
+        value = curve(min(max(wavelength_m, curve.low_m), curve.high_m))
+        numbers[name] = max(float(value), least)
+    return material.model_copy(update=numbers) if numbers else material
+
+
+def number(share: float | CurveDocument) -> float:
+    """Return a value of a material that is known at one wavelength (`at_wavelength`)."""
+    assert isinstance(share, float)
+    return share
+
+
+def is_black(material: MaterialDocument) -> bool:
+    """Tell whether a material reflects and passes nothing at any wavelength."""
+    if not isinstance(material, Diffuse):
+        return False
+    value = material.reflectance
+    return value == 0.0 if isinstance(value, float) else max(one for _, one in value.points or ()) == 0.0

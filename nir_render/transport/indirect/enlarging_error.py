@@ -171,7 +171,7 @@ def _squares(mean: MeanFrame, fluxes: Array, pixels: Numbers, samples: int) -> A
     rays = rays_of(camera, snapshot.camera(light.camera).pose)
     power = group_power(snapshot, camera)
     wanted = {1: pixels, scale: used}
-    renders = rendered_again(snapshot, rays, light.seed, power, wanted, samples)
+    renders = rendered_again(snapshot, rays, light.seed, power, wanted, samples, light.wavelengths_m)
     even = np.ones((camera.sensor.rows, camera.sensor.columns))
     square_e2 = np.ones(len(pixels))
     for radiance_per_w in renders:

@@ -88,6 +88,7 @@ def rendered_again(
     power: NDArray[np.float64],
     pixels: dict[int, NDArray[np.int64]],
     samples: int,
+    wavelengths_m: tuple[float, ...],
 ) -> list[dict[int, NDArray[np.float32]]]:
     """Return the indirect light of some pixels of films, twice, independent of each other and of the light.
 
@@ -99,19 +100,22 @@ def rendered_again(
         Their numbers, row by row, by the scale of the film.
     samples
         In each pixel, a power of two.
+    wavelengths_m
+        The nodes.
 
     Returns
     -------
     By scale, radiance per unit of each group, shape (groups, nodes, pixels).
     """
-    built = groups.world_on_device(snapshot, power)
+    at_nodes = [snapshot.at_wavelength(wavelength_m) for wavelength_m in wavelengths_m]
+    built = [groups.world_on_device(world, power) for world in at_nodes]
     renders: list[dict[int, NDArray[np.float32]]] = []
     for number in range(2):
         radiance = {}
         for scale, some in pixels.items():
             key = groups.light_seed(seed, "again", number, scale)
             counts = np.full(some.size, samples)
-            mean, _ = groups.render_pixels(snapshot, built, rays, key, some, counts, scale)
-            radiance[scale] = mean[:, None]
+            means = [groups.render_pixels(snapshot, one, rays, key, some, counts, scale)[0] for one in built]
+            radiance[scale] = np.stack(means, axis=1)
         renders.append(radiance)
     return renders

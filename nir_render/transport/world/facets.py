@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from nir_render.geometry import rectangle_frame
 from nir_render.scene.bodies import place_of_shape
-from nir_render.scene.documents.materials import Dielectric, MaterialDocument, Mirror, Pane, Plastic
+from nir_render.scene.documents.materials import Dielectric, MaterialDocument, Mirror, Pane, Plastic, number
 from nir_render.scene.documents.shapes import Box, Rectangle, ShapeDocument
 from nir_render.scene.pose import rotation_of
 from nir_render.scene.snapshot import Snapshot
+from nir_render.spectra.nodes import BAND_M
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,7 @@ class Facets:
 
 def facets(snapshot: Snapshot) -> Facets:
     """Return the flat smooth surfaces of a scene: shapes in the document's order, six faces to a box."""
+    snapshot = snapshot.at_wavelength(BAND_M)  # who carries several wavelengths comes with the world at one
     names: list[str] = []
     frames: list[Array] = []
     optics: list[tuple[int, float, float, float, bool]] = []
@@ -143,13 +145,13 @@ def _surface(material: MaterialDocument, shape: ShapeDocument) -> tuple[int, flo
     flat = isinstance(shape, Rectangle | Box)
     match material:
         case Mirror() if flat:
-            return MIRROR, 1.0, material.reflectance, 0.0
+            return MIRROR, 1.0, number(material.reflectance), 0.0
         case Plastic() if flat and material.roughness == 0.0:
             return COAT, material.index, 1.0, 0.0
         case Dielectric() if isinstance(shape, Box):
             return COAT, material.index, 1.0, 0.0
         case Pane() if isinstance(shape, Rectangle):
-            return PANE, material.index, 1.0, material.transmission
+            return PANE, material.index, 1.0, number(material.transmission)
     return None
 
 

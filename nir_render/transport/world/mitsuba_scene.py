@@ -10,6 +10,7 @@ from nir_render.errors import InputError
 from nir_render.geometry import perpendiculars, rectangle_frame
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.ambient.sun import Sun
+from nir_render.scene.documents.curves import CurveDocument
 from nir_render.scene.documents.materials import (
     Dielectric,
     Diffuse,
@@ -18,11 +19,13 @@ from nir_render.scene.documents.materials import (
     Pane,
     Plastic,
     RoughConductor,
+    number,
 )
 from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, ShapeDocument, Sphere
 from nir_render.scene.pose import rotation_of
 from nir_render.scene.snapshot import Snapshot
 from nir_render.scene.text.units import LENGTH, format_vector
+from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.backend.variant import mi
 
 SUN_RADIUS_RAD = Sun.angular_radius_rad
@@ -75,6 +78,7 @@ def described(
     snapshot: Snapshot, emitting: Collection[str] = (), as_point: bool = False, panes: bool = True
 ) -> dict[str, Any]:
     """Return what `build` loads, as Mitsuba's dictionary; any number of groups may be `emitting`."""
+    snapshot = snapshot.at_wavelength(BAND_M)  # who carries several wavelengths comes with the world at one
     bodies: dict[str, Any] = {"type": "scene"}
     for name, shape in snapshot.shapes.items():
         material = snapshot.materials[shape.material]
@@ -173,6 +177,10 @@ def _uniform(value: float) -> dict[str, Any]:
     return {"type": "uniform", "value": float(value)}
 
 
+def _share(value: float | CurveDocument) -> dict[str, Any]:
+    return _uniform(number(value))
+
+
 _BLACK = {"type": "diffuse", "reflectance": _uniform(0.0)}
 
 
@@ -183,7 +191,10 @@ def _area_light(radiance: float) -> dict[str, Any]:
 def _bsdf(material: MaterialDocument) -> dict[str, Any]:
     match material:
         case Diffuse():
-            surface: dict[str, Any] = {"type": "diffuse", "reflectance": _uniform(material.reflectance)}
+            surface: dict[str, Any] = {
+                "type": "diffuse",
+                "reflectance": _share(material.reflectance),
+            }
         case RoughConductor():
             surface = {
                 "type": "roughconductor",
@@ -196,7 +207,7 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
             surface = {
                 "type": "conductor",
                 "material": "none",
-                "specular_reflectance": _uniform(material.reflectance),
+                "specular_reflectance": _share(material.reflectance),
             }
         case Plastic():
             rough = {"type": "roughplastic", "distribution": "ggx", "alpha": material.roughness}
@@ -204,7 +215,7 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
                 **(rough if material.roughness > 0.0 else {"type": "plastic"}),
                 "int_ior": material.index,
                 "ext_ior": 1.0,
-                "diffuse_reflectance": _uniform(material.reflectance),
+                "diffuse_reflectance": _share(material.reflectance),
             }
         case Dielectric():
             return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
@@ -213,7 +224,7 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
                 "type": "thindielectric",
                 "int_ior": material.index,
                 "ext_ior": 1.0,
-                "specular_transmittance": _uniform(material.transmission),
+                "specular_transmittance": _share(material.transmission),
             }
     return {"type": "twosided", "nested": surface}
 
