@@ -14,6 +14,7 @@ import typer
 
 from nir_render.command import recordings, regress, runs, scenes, stress
 from nir_render.command.compare import compare
+from nir_render.command.goniometer import goniometer
 from nir_render.errors import InputError
 
 app = typer.Typer(
@@ -45,6 +46,7 @@ for command in (
     *(runs.run, runs.render, runs.perceive, runs.evaluate, runs.calibrate, runs.report),
     compare,
     stress.stress,
+    goniometer,
     *(scenes.new, scenes.validate, scenes.schema, scenes.doctor),
 ):
     app.command()(command)
