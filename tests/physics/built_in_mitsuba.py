@@ -87,7 +87,8 @@ def intensity_at(
             "sampler": {"type": "independent"},
         }
     )
-    paths = mi.load_dict({"type": "volpath", "max_depth": -1, "rr_depth": 100})
+    # No roulette: where nothing absorbs, it makes the weights of long ways grow.
+    paths = mi.load_dict({"type": "volpath", "max_depth": -1, "rr_depth": 1_000_000})
     image = np.array(mi.render(scene, sensor=camera, integrator=paths, spp=samples, seed=seed))
     return float(image[..., 0].mean()) * 4.0 * half**2 * distance_m**2
 

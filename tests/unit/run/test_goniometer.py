@@ -88,7 +88,7 @@ def test_counts_are_kept_and_found_again(tmp_path: Path, monkeypatch: pytest.Mon
     kept = tmp_path / "kept.json"
     built, settings = load_built("bare"), Settings(photons=60_000)
     first = measure(built, settings, cache=kept)
-    monkeypatch.setattr(measuring.photons, "trace", None)  # nothing is traced again
+    monkeypatch.setattr("nir_render.transport.goniometer.photons.trace", None)  # nothing is traced again
     again = measure(built.model_copy(update={"flux_w": 3.0}), settings, cache=kept)
     assert (first.near == again.near).all()
     assert first.left == again.left
