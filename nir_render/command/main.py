@@ -14,7 +14,6 @@ import typer
 
 from nir_render.command import recordings, regress, runs, scenes, stress
 from nir_render.command.compare import compare
-from nir_render.command.goniometer import goniometer
 from nir_render.errors import InputError
 
 app = typer.Typer(
@@ -46,8 +45,7 @@ for command in (
     *(runs.run, runs.render, runs.perceive, runs.evaluate, runs.calibrate, runs.report),
     compare,
     stress.stress,
-    goniometer,
-    *(scenes.new, scenes.validate, scenes.schema, scenes.doctor),
+    *(scenes.new, scenes.validate, scenes.schema, scenes.goniometer, scenes.doctor),
 ):
     app.command()(command)
 app.command("new-recording")(recordings.new_recording)
