@@ -45,7 +45,7 @@ for command in (
     *(runs.run, runs.render, runs.perceive, runs.evaluate, runs.calibrate, runs.report),
     compare,
     stress.stress,
-    *(scenes.new, scenes.validate, scenes.schema, scenes.doctor),
+    *(scenes.new, scenes.validate, scenes.schema, scenes.goniometer, scenes.doctor),
 ):
     app.command()(command)
 app.command("new-recording")(recordings.new_recording)

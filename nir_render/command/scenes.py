@@ -1,5 +1,9 @@
-"""The commands of scene files and of the machine that renders them: new, validate, schema, doctor."""
+"""The commands of scene files, what stands in them, and the machine that renders them.
 
+They are new, validate, schema, goniometer, doctor.
+"""
+
+import math
 import shlex
 from enum import StrEnum
 from pathlib import Path
@@ -7,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nir_render.command.options import Json
+from nir_render.command.options import Json, Overwrite
 from nir_render.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,6 +102,82 @@ def _schema_of(of: Format) -> "dict[str, Any]":
         Format.DETECTIONS: detections_schema,
     }
     return by_name[of]()
+
+
+def goniometer(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A source as built: bare, diffused, or a .yaml file.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Where it goes; outputs/NAME by default."),
+    ] = None,
+    photons: Annotated[int, typer.Option("--photons", min=1000, help="How many are sent.")] = 4_000_000,
+    step_deg: Annotated[
+        float, typer.Option("--step", metavar="DEG", help="Between polar angles; a whole part of 180.")
+    ] = 5.0,
+    azimuths: Annotated[
+        int, typer.Option("--azimuths", help="Around the axis, of what is not the same all around it.")
+    ] = 24,
+    distance_m: Annotated[
+        float, typer.Option("--distance", metavar="M", help="From its middle to where it is measured.")
+    ] = 1.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the photons' random numbers.")] = 1,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+) -> None:
+    """Measure a source as it is built over the sphere: an emission pattern that scenes use, and its flux."""
+    from nir_render.command.console import print_json
+    from nir_render.command.progress import progress_bar
+    from nir_render.run.goniometer.measure_into import SOURCE, measure_into
+    from nir_render.transport.goniometer.measure import Settings
+
+    folder = output or Path("outputs") / Path(source).stem
+    settings = Settings(photons, seed, _steps(step_deg), azimuths, distance_m)
+    with progress_bar("goniometer") as progress:
+        figures = measure_into(source, folder, settings, overwrite=overwrite, progress=progress)
+    if as_json:
+        print_json({**figures, "folder": str(folder)})
+        return
+    _show_goniometer(figures)
+    typer.echo(f"{folder / SOURCE} stands for it in scenes; open {folder / 'polar.png'}")
+
+
+def _steps(step_deg: float) -> int:
+    steps = 180.0 / step_deg if math.isfinite(step_deg) and step_deg > 0.0 else 0.0
+    if steps < 2.0 or abs(steps - round(steps)) > 1e-6:
+        raise InputError(f"--step {step_deg:g}: wanted degrees that divide 180 evenly, such as 5")
+    return round(steps)
+
+
+def _show_goniometer(figures: "dict[str, Any]") -> None:
+    from rich.table import Table
+
+    from nir_render.command.tables import print_table
+
+    table = Table(title=f"{figures['source']}, at {figures['distance_m']:g} m", title_justify="left")
+    table.add_column("")
+    table.add_column("as built", justify="right")
+    bare = figures["variation_without_cover"]
+    if bare is not None:
+        table.add_column("without cover", justify="right")
+    own = figures["variation"]
+    reach = f"{own['reach_deg']:g}°"
+    for key, label in (
+        ("peak_to_peak", f"varies over ±{reach} by (max − min)/max"),
+        ("plus_minus", "± about the middle, (max − min)/(max + min)"),
+        ("about_mean", "largest difference from the mean"),
+        ("edge", f"at {reach}, of that on the axis"),
+    ):
+        others = [] if bare is None else [f"{100.0 * bare[key]:.1f} %"]
+        table.add_row(label, f"{100.0 * own[key]:.1f} %", *others)
+    shares = figures["shares"]
+    table.add_row("flux that leaves", f"{1e3 * figures['flux_w']:.4g} mW, {100.0 * shares['left']:.1f} %")
+    taken = f"{100.0 * shares['absorbed_in_board']:.1f} %, {100.0 * shares['absorbed_in_cover']:.2f} %"
+    table.add_row("taken by board, cover", taken)
+    if figures["azimuthal_spread"] is not None:
+        table.add_row(f"± around the axis, within {reach}", f"{100.0 * figures['azimuthal_spread']:.1f} %")
+    print_table(table)
 
 
 def doctor(as_json: Json = False) -> None:

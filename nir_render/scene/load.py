@@ -4,8 +4,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from nir_render.errors import InputError, shown
+from nir_render.scene.documents.built.source import BuiltSource
 from nir_render.scene.documents.files import exists, find_file, merge
+from nir_render.scene.explain import explain
 from nir_render.scene.overrides import apply_overrides
 from nir_render.scene.scene import Scene, parse_scene
 from nir_render.scene.text.yaml_text import read_yaml
@@ -34,6 +38,26 @@ def load_scene(path: str | Path, overrides: Mapping[str, Any] | None = None) -> 
         raise InputError(f"{name}: there is no such scene file; check its name and folder")
     raw = _read_with_includes(file, ())
     return parse_scene(apply_overrides(raw, overrides or {}), file.parent, str(file), overrides or {})
+
+
+def load_built(name: str) -> BuiltSource:
+    """Read a source as it is built: a preset of `data/built`, or a `.yaml` file.
+
+    Raises
+    ------
+    InputError
+        As `load_scene`.
+    """
+    file = Path(name)
+    is_file = name.endswith(".yaml")
+    try:
+        raw = read_yaml(file) if is_file else {"preset": name}
+    except (OSError, ValueError) as error:
+        raise InputError(*str(error).split("\n")) from None
+    try:
+        return BuiltSource.model_validate(raw, context={"folder": file.parent})
+    except ValidationError as error:
+        raise InputError(*explain(error, raw, name)) from None
 
 
 def _read_with_includes(file: Path, trail: tuple[Path, ...]) -> dict[str, Any]:

@@ -93,7 +93,7 @@ def test_constants_of_other_files_tell_compiled_functions_apart() -> None:
     assert contents[0] == contents[1] != contents[2]
 
 
-@pytest.mark.parametrize("name", [*MODULES, *CAMERA_MODULES])
+@pytest.mark.parametrize("name", [*MODULES, *CAMERA_MODULES, "nir_render.transport.goniometer.photons"])
 def test_compiled_functions_call_those_of_their_own_file(name: str) -> None:
     """What is kept of a function on disk does not know when another file changes."""
     functions = [

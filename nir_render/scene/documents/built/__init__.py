@@ -1,0 +1,1 @@
+"""Models of sources as they are built, which a goniometer measures."""

@@ -1,0 +1,1 @@
+"""A source as it is built, and where it shines to: photons are sent through it one by one and counted."""
