@@ -269,9 +269,4 @@ def test_two_versions_of_ones_own_code_each_have_their_own_helper(tmp_path: Path
             "from own_code_helper import NAME\ndef find(frame, calibration):\n    raise ValueError(NAME)\n"
         )
     loaded = [load_estimator(f"{tmp_path / version / 'mine.py'}:find") for version in ("old", "new")]
-    said = []
-    for one in loaded:
-        with pytest.raises(ValueError) as raised:  # noqa: PT011 (the text says which)
-            one.function(None, None)
-        said.append(str(raised.value))
-    assert said == ["old", "new"]
+    assert [one.function.__globals__["NAME"] for one in loaded] == ["old", "new"]
