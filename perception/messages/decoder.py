@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.messages.foreign import foreign_light
 from perception.messages.lattice import STEPS_PER_BIT, Clocks, Lattice, moved_on
-from perception.messages.samples import ROWS, LevelScale, add_samples, usable_samples
+from perception.messages.samples import ROWS, AnyLevels, LevelScale, add_samples, usable_samples
 from perception.messages.settings import DecoderSettings
 from perception.messages.uart import IDLE_BITS, aliases, meaning
 from perception.types import Message, Signal
@@ -33,9 +34,11 @@ _GARBAGE = float(np.log(1e-3))  # log-probability that what starts is no packet
 _LIKELY = 7.0  # a packet's clocks are those whose log-probability is not this far below the best one's
 _CONTRADICTS = 25.0  # log-likelihood of another word in one frame: another's light fell in with its own
 _INTRUDED = 14.0  # the same of any levels in a stretch of bits: an undisturbed packet shows it once in 2·10⁴
+_JOINED = 30.0  # log-likelihood over any levels that a packet needs whose beginning was not seen
 _NEGLIGIBLE = 35.0  # log-probability below another explanation from which one is left out
 _KEPT = 3  # packets that are looked into of those that end in a block
 _NEIGHBOURS = 6  # steps to either side that count as the same packet
+_BEHIND = 2 * _BLOCK  # steps after which it is clear where another's light fell in
 _FORGET_S = 12.0  # a gap after which a signal starts anew
 _BACKWARDS_S = 1.0  # a clock that jumps back by more starts anew; by less, its samples are left out
 
@@ -58,6 +61,7 @@ class Decoder:
     """
 
     def __init__(self, robot: str, track: int, settings: DecoderSettings | None = None) -> None:
+        self._again = True  # what another's light leaves of a packet is read by a decoder that asks no more
         self._robot, self._track = robot, track
         self._settings = DecoderSettings() if settings is None else settings
         self._clocks = Clocks(self._settings)
@@ -76,11 +80,15 @@ class Decoder:
 
     def _restart(self) -> None:
         self._waiting: list[Array] = []
+        self._held: list[Array] = []  # the window's samples
+        self._alone: Decoder | None = None
+        self._touched_s = np.empty(0)  # when another's light may have fallen in
         self._last_s = -np.inf
         self._origin_s: float | None = None  # of step 0
         self._done = 0  # steps by which the window has moved on
         self._table = np.zeros((ROWS, self._size))
         self._scale = LevelScale(self._settings.level_sigma)
+        self._any_levels = AnyLevels()
         # Before the signal: a packet may have been under way, begun at any step with the same probability.
         rates = len(self._clocks.drifts)
         self._before = np.full((rates, self._complete + 1), np.log(0.5 / self._clocks.longest))
@@ -118,6 +126,8 @@ class Decoder:
             messages += self._block()
             for _ in range(_LAST_CHANCE // _BLOCK + 1):
                 messages += self._block()
+            if self._alone is not None:
+                messages += self._new(self._alone.finish())
         self._restart()
         return tuple(messages)
 
@@ -138,12 +148,21 @@ class Decoder:
         assert self._origin_s is not None
         return self._origin_s + (step + self._done) * self._clocks.step_s
 
+    def _step_of(self, time_s: float) -> float:
+        """Return the step of the window at a time."""
+        return (time_s - self._step_s(0)) / self._clocks.step_s
+
     def _block(self) -> list[Message]:
         """Take in the samples of the next block, and say what is now clear."""
         self._learn()
         lattice = Lattice(self._table, self._clocks)
         self._recurse(lattice)
+        alone = self._seen_alone() if self._again else np.empty((5, 0))
         messages = self._settle(lattice)
+        if len(self._touched_s):
+            messages += self._read_alone(alone)
+        else:
+            self._alone = None
         moved_on(self._table, _BLOCK)
         self._before[:, :-_BLOCK] = self._before[:, _BLOCK:]
         top = float(self._idle.max())  # only differences matter
@@ -161,11 +180,14 @@ class Decoder:
         rows = np.concatenate(self._waiting, axis=1)
         now = rows[0] < self._step_s(self._begin_at + _BLOCK)
         self._waiting = [] if now.all() else [rows[:, ~now]]
+        held = [*self._held, rows[:, now]]
+        self._held = [each for each in held if each.size and each[0, -1] > self._step_s(0)]
         time_s, exposure_s, level, dark, lit = rows[:, now]
         samples = usable_samples(time_s, exposure_s, level, dark, lit, self._settings)
         if len(samples):
             amplitude, alone = self._scale.learn(samples), np.zeros((1, len(samples)))
-            add_samples(self._table, samples, amplitude, alone, self._step_s(0), self._clocks.step_s)
+            origin_s, step_s = self._step_s(0), self._clocks.step_s
+            add_samples(self._table, samples, amplitude, alone, origin_s, step_s, self._any_levels)
 
     def _recurse(self, lattice: Lattice) -> None:
         """Go on with the probability of idle at each step, and note the best packet that ends there."""
@@ -234,11 +256,17 @@ class Decoder:
     def _message(self, one: _Candidate, lattice: Lattice) -> Message | None:
         """Return a packet as a message if its probability is high enough."""
         here = one.start - self._done
+        if self._touched(here, here + int(self._clocks.lengths[one.rate])):
+            return None
         if lattice.contradiction(here, one.rate, one.column) > _CONTRADICTS:
             return None
         if lattice.intrusion(here, one.rate, one.column) > _INTRUDED:
             return None
         if not self._phase_known(one, lattice):
+            return None
+        # A frame or two of another rate may look like a word; a packet seen to begin after idle does not.
+        joined = here < self._begin_at - self._done
+        if joined and lattice.over_anything(here, one.rate, one.column) < _JOINED:
             return None
         shift = np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
         # On other clocks the same packet is where the middle of what was seen of it stays.
@@ -278,6 +306,41 @@ class Decoder:
             confidence=confidence,
             frames=len(seen),
         )
+
+    def _seen_alone(self) -> Array:
+        """Return the samples held without those that another's light may have touched, and note these."""
+        rows = np.concatenate(self._held, axis=1) if self._held else np.empty((5, 0))
+        touched = foreign_light(rows, self._scale.value, self._settings)
+        self._touched_s = rows[0, touched]
+        return np.asarray(rows[:, ~touched])
+
+    def _touched(self, start: float, end: float) -> bool:
+        """Return whether another's light may have fallen in between two steps."""
+        after = self._touched_s > self._step_s(start)
+        return bool((after & (self._touched_s < self._step_s(end))).any())
+
+    def _read_alone(self, rows: Array) -> list[Message]:
+        """Return what packets into which another's light fell say by the rest of their samples.
+
+        A decoder of its own reads them, two blocks behind: until then it is clear what was touched.
+        """
+        if self._alone is None:
+            self._alone = Decoder(self._robot, self._track, self._settings)
+            self._alone._again = False
+        until_s = self._step_s(self._complete - _BEHIND)
+        new = rows[:, (rows[0] > self._alone._last_s) & (rows[0] <= until_s)]
+        return self._new(self._alone.push(Signal(self._robot, self._track, *new)))
+
+    def _new(self, said: tuple[Message, ...]) -> list[Message]:
+        """Return messages of packets that were touched, and not said."""
+        messages = []
+        for message in said:
+            first, end = (self._step_of(at_s) for at_s in (message.start_s, message.end_s))
+            new = first + self._done + _MARGIN >= self._spoken_until
+            if new and self._touched(end - self._clocks.longest, first + self._clocks.longest):
+                messages.append(message)
+                self._spoken_until = end + self._done
+        return messages
 
     def _phase_known(self, one: _Candidate, lattice: Lattice) -> bool:
         """Return whether a word cannot be another's rotation, or else where its packet starts.

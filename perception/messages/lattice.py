@@ -109,6 +109,11 @@ class Lattice:
         ends = starts + self._clocks.lengths[rates]
         return np.asarray(self._garbage.take(ends) - self._garbage.take(starts))
 
+    def over_anything(self, start: int, rate: int, column: int) -> float:
+        """Return how much better a packet's word explains its samples than levels in which anything goes."""
+        starts, rates = np.array([start]), np.array([rate])
+        return float((self.word(starts, rates, column) - self.garbage(starts, rates))[0])
+
     def frames_seen(self, start: int, rate: int) -> NDArray[np.bool_]:
         """Return of which repeats each bit was seen, shape (repeats,)."""
         seen = np.diff(self._seen[start + self._clocks.edges[rate]])

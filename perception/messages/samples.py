@@ -16,7 +16,9 @@ ROWS = 8
 # Where an edge may lie about its step, in steps, and how probably: the lattice rounds start, rate and edge.
 _JITTER = np.array([-0.9, -0.35, 0.0, 0.35, 0.9])
 _JITTER_SHARE = np.array([0.1, 0.25, 0.3, 0.25, 0.1])
-_GARBAGE_LEVELS = 5
+_GARBAGE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # levels of what is no packet; any other beside them,
+_GARBAGE_SHARE = np.array([0.35, 0.05, 0.05, 0.05, 0.35, 0.15])  # and how often it turns to each,
+_GARBAGE_STAYS_S = 0.1  # after so long
 
 _OUTLIERS = 1e-3  # share of samples that follow no model (a merger unnoticed, a glint)
 _OUTLIER_SPAN = 3.0  # the levels over which they spread evenly
@@ -37,6 +39,14 @@ class Samples:
         return len(self.time_s)
 
 
+def usable(
+    exposure_s: Array, level: Array, sigma_dark: Array, sigma_lit: Array, settings: DecoderSettings
+) -> NDArray[np.bool_]:
+    """Return which samples are no erasures; what is exposed for longer than half a bit tells no bit."""
+    finite = np.isfinite(level) & np.isfinite(sigma_dark) & np.isfinite(sigma_lit)
+    return np.asarray(finite & (exposure_s <= 0.5 / settings.rate_hz))
+
+
 def usable_samples(
     time_s: Array,
     exposure_s: Array,
@@ -45,12 +55,8 @@ def usable_samples(
     sigma_lit: Array,
     settings: DecoderSettings,
 ) -> Samples:
-    """Return the samples without erasures, the floors added to their variances.
-
-    An exposure longer than half a bit tells no bit from the next and is an erasure too.
-    """
-    keep = np.isfinite(level) & np.isfinite(sigma_dark) & np.isfinite(sigma_lit)
-    keep &= exposure_s <= 0.5 / settings.rate_hz
+    """Return the samples without erasures, the floors added to their variances."""
+    keep = usable(exposure_s, level, sigma_dark, sigma_lit, settings)
     dark = sigma_dark[keep] ** 2 + settings.dark_floor**2
     lit = sigma_lit[keep] ** 2 + settings.lit_floor**2
     return Samples(time_s[keep], np.maximum(exposure_s[keep], 1e-9), level[keep], dark, lit)
@@ -64,8 +70,32 @@ def log_likelihood(samples: Samples, level: Array) -> Array:
     return _log_likelihood(one.level, one.dark_variance, one.lit_variance, flat).reshape(shape)
 
 
+class AnyLevels:
+    """What light may do that is no packet: it turns from one level to any other at any time.
+
+    A Markov chain of levels; each sample is scored by what those before it led to expect. So what blinks at
+    a rate that is not known, or in no rhythm, is explained at the price of its edges.
+    """
+
+    def __init__(self) -> None:
+        self.weights = _GARBAGE_SHARE.copy()
+        self._last_s = -np.inf
+
+    def stays(self, time_s: Array) -> Array:
+        """Return how probably the level stayed since the sample before, shape (n,); times go on."""
+        since_s = np.diff(time_s, prepend=self._last_s)
+        self._last_s = float(time_s[-1])
+        return np.asarray(np.exp(-since_s / _GARBAGE_STAYS_S))
+
+
 def add_samples(
-    table: Array, samples: Samples, amplitude: float, others: Array, origin_s: float, step_s: float
+    table: Array,
+    samples: Samples,
+    amplitude: float,
+    others: Array,
+    origin_s: float,
+    step_s: float,
+    any_levels: AnyLevels | None = None,
 ) -> None:
     """Add samples to a table of shape (8, steps), whose step 0 is at `origin_s`.
 
@@ -73,13 +103,18 @@ def add_samples(
     shape (m, n), with the same probability. The table's rows hold, for an edge at each step: the scores for
     dark of the samples that end before it and after the step before; of those that begin; and of the samples
     that it may cut, their scores with dark on both sides, dark before and lit after, lit before and dark
-    after; the score for being any level up to lit; for being any at all, as another's light makes it; and how
-    many.
+    after; the score for what is no packet, which `any_levels` has followed up to here; for being any level at
+    all, as another's light makes it; and how many.
     """
     one = samples
+    chain = AnyLevels() if any_levels is None else any_levels
+    stays = chain.stays(one.time_s)
     middle = (one.time_s - origin_s) / step_s
     half = 0.5 * one.exposure_s / step_s
-    _add(table, one.level, one.dark_variance, one.lit_variance, middle, half, amplitude, others)
+    _add(
+        table, one.level, one.dark_variance, one.lit_variance, middle, half, amplitude, others,
+        chain.weights, stays,
+    )  # fmt: skip
 
 
 @compiled
@@ -114,16 +149,21 @@ def _mean_density(
 @compiled
 def _add(
     table: Array, level: Array, dark: Array, lit: Array, middle: Array, half: Array, amplitude: float,
-    others: Array,
+    others: Array, weights: Array, stays: Array,
 ) -> None:  # fmt: skip
     steps = table.shape[1]
     for n in range(level.shape[0]):
         of_lit = _mean_density(level[n], dark[n], lit[n], amplitude, others, n, 1.0)
         of_dark = _mean_density(level[n], dark[n], lit[n], amplitude, others, n, 0.0)
-        anything = of_lit + of_dark
-        for k in range(1, _GARBAGE_LEVELS - 1):
-            share = k / (_GARBAGE_LEVELS - 1.0)
-            anything += _mean_density(level[n], dark[n], lit[n], amplitude, others, n, share)
+        anything = 0.0
+        for k in range(weights.shape[0]):
+            density = 1.0 / _OUTLIER_SPAN
+            if k < _GARBAGE.shape[0]:
+                density = _mean_density(level[n], dark[n], lit[n], amplitude, others, n, _GARBAGE[k])
+            weights[k] = (stays[n] * weights[k] + (1.0 - stays[n]) * _GARBAGE_SHARE[k]) * density
+            anything += weights[k]
+        for k in range(weights.shape[0]):
+            weights[k] /= anything
         score = math.log(of_dark / of_lit)
         begun = math.floor(middle[n] - half[n] - 1.0) + 1  # the first edge that may cut it
         ended = math.ceil(middle[n] + half[n] + 1.0)  # the first one after it
@@ -131,7 +171,7 @@ def _add(
             continue
         table[ENDED, ended] += score
         table[BEGUN, begun] += score
-        table[GARBAGE, ended] += math.log(anything / _GARBAGE_LEVELS / of_lit)
+        table[GARBAGE, ended] += math.log(anything / of_lit)
         table[FOREIGN, ended] -= math.log(of_lit * _OUTLIER_SPAN)
         table[SEEN, int(middle[n])] += 1.0
         for edge in range(begun, ended):
