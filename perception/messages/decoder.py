@@ -5,7 +5,7 @@ that was seen so far has a probability: packets at every start, on every clock r
 that began before the signal did or go on after it, and stretches that are neither. A message's confidence is
 the share of the explanations that hold it (forward recursion, and what is still under way). A rotated reading
 of a packet that was joined midway shares its probability with the true one until idle was seen, and is not
-given out.
+given out. Packets into which another's light fell are read by what it left of them, a second later.
 """
 
 from dataclasses import dataclass
@@ -256,17 +256,17 @@ class Decoder:
     def _message(self, one: _Candidate, lattice: Lattice) -> Message | None:
         """Return a packet as a message if its probability is high enough."""
         here = one.start - self._done
-        if self._touched(here, here + int(self._clocks.lengths[one.rate])):
+        idle, end = int(self._clocks.idle[one.rate]), here + int(self._clocks.lengths[one.rate])
+        if self._touched(here - idle, end + idle):  # beside it, too: by that a rotated word is known
             return None
-        if lattice.contradiction(here, one.rate, one.column) > _CONTRADICTS:
-            return None
-        if lattice.intrusion(here, one.rate, one.column) > _INTRUDED:
+        where = here, one.rate, one.column
+        if lattice.contradiction(*where) > _CONTRADICTS or lattice.intrusion(*where) > _INTRUDED:
             return None
         if not self._phase_known(one, lattice):
             return None
         # A frame or two of another rate may look like a word; a packet seen to begin after idle does not.
         joined = here < self._begin_at - self._done
-        if joined and lattice.over_anything(here, one.rate, one.column) < _JOINED:
+        if joined and lattice.over_anything(*where) < _JOINED:
             return None
         shift = np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
         # On other clocks the same packet is where the middle of what was seen of it stays.
