@@ -14,6 +14,7 @@ import typer
 
 from nir_render.command import recordings, regress, runs, scenes, stress
 from nir_render.command.compare import compare
+from nir_render.command.explain import explain
 from nir_render.errors import InputError
 
 app = typer.Typer(
@@ -43,6 +44,7 @@ def options(
 
 for command in (
     *(runs.run, runs.render, runs.perceive, runs.evaluate, runs.calibrate, runs.report),
+    explain,
     compare,
     stress.stress,
     *(scenes.new, scenes.validate, scenes.schema, scenes.goniometer, scenes.doctor),

@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from nir_render.errors import InputError, shown
 from nir_render.scene.documents.built.source import BuiltSource
 from nir_render.scene.documents.files import exists, find_file, merge
-from nir_render.scene.explain import explain
 from nir_render.scene.overrides import apply_overrides
+from nir_render.scene.problems import explain
 from nir_render.scene.scene import Scene, parse_scene
 from nir_render.scene.text.yaml_text import read_yaml
 

@@ -15,9 +15,9 @@ from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.emission import Emitter, light_groups
-from nir_render.scene.explain import Places, explain
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
+from nir_render.scene.problems import Places, explain
 from nir_render.scene.snapshot import PlacedRobot, Snapshot
 
 

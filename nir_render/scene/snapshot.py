@@ -27,9 +27,9 @@ from nir_render.scene.documents.materials import MaterialDocument, at_wavelength
 from nir_render.scene.documents.shapes import ShapeDocument
 from nir_render.scene.documents.times.drives import Drive, SourceDrive
 from nir_render.scene.emission import Emitter, light_groups
-from nir_render.scene.explain import explain
 from nir_render.scene.motion import Velocity
 from nir_render.scene.pose import Pose, camera_mount, source_mount
+from nir_render.scene.problems import explain
 from nir_render.scene.text.units import LENGTH
 
 _SOURCE_DRIVE: TypeAdapter[Drive] = TypeAdapter(SourceDrive)

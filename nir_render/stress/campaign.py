@@ -13,8 +13,8 @@ from pydantic import Field, ValidationError, field_validator
 from nir_render.errors import InputError, shown
 from nir_render.scene.documents.base import Document, document_key
 from nir_render.scene.documents.files import exists
-from nir_render.scene.explain import Places, explain
 from nir_render.scene.load import load_scene
+from nir_render.scene.problems import Places, explain
 from nir_render.scene.scene import Scene
 from nir_render.scene.text.yaml_text import read_yaml
 from nir_render.stress.axes import Axis, AxisDocument, DottedPath

@@ -36,6 +36,39 @@ class FlareLimit:
     range_sigma_m: float
 
 
+@dataclass(frozen=True)
+class RangeCauses:
+    """What each cause brings to the least σ of a range, in metres: in quadrature they add up to it.
+
+    The noise of pixels: shot noise of the flare's own light (`own_light_m`) and of the rest (`background_m`),
+    unequal response (`prnu_m`), read noise, offsets (`dsnu_m`), the ADC's rounding. What the calibration says
+    of its own σ: of the range constant, the source's radius, the point spread's width.
+    """
+
+    own_light_m: float
+    background_m: float
+    prnu_m: float
+    read_noise_m: float
+    dsnu_m: float
+    rounding_m: float
+    range_constant_m: float
+    source_radius_m: float
+    point_spread_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What the pixels that tell anything, shape (pixels,), tell of flares; `inverse` has the priors in it."""
+
+    camera: Camera
+    layout: Layout
+    jacobian: NDArray[np.float64]
+    expected_e: NDArray[np.float64]
+    variance_e2: NDArray[np.float64]
+    telling: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+
+
 def fisher_information(
     jacobian: NDArray[np.float64], variance_e2: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -98,7 +131,7 @@ def _wide_limit(
 
     Its place is not asked for (NaN). A disc that is clipped all over tells nothing.
     """
-    pixels = math.pi * (calibration.fx_px * math.tan(min(angular_radius, 1.5))) ** 2
+    pixels = _pixels_of_disc(calibration, angular_radius)
     if flux_e / pixels + background_e >= clip_level_e(calibration, calibration.black_level_dn):
         return FlareLimit(math.nan, math.nan, math.inf, math.inf)
     lit_e = np.array(flux_e / pixels + max(background_e, 0.0))
@@ -106,6 +139,10 @@ def _wide_limit(
     flux_sigma = math.sqrt(pixels * float(of_pixel_e2))
     relative = math.hypot(flux_sigma / flux_e, Camera(calibration, 1.0, 1.0).flux_spread)
     return FlareLimit(math.nan, math.nan, flux_sigma, 0.5 * range_m * relative)
+
+
+def _pixels_of_disc(calibration: Calibration, angular_radius: float) -> float:
+    return math.pi * (calibration.fx_px * math.tan(min(angular_radius, 1.5))) ** 2
 
 
 def flare_limit(
@@ -173,16 +210,80 @@ def flare_limits(
             else flare_limit(calibration, *flare, background_e, clipped_tell_nothing=clipped_tell_nothing)
             for flare, angle, radius in zip(flares, radius_rad, radius_px, strict=True)
         ]
-    box = limit_box(calibration, flares)
-    nothing = [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(flares)
+    known = _known(calibration, place, background_e, clipped_tell_nothing, structure)
+    if known is None:
+        return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(flares)
+    return _limits(known.camera, known.layout, place, known.inverse)
+
+
+def range_causes(
+    calibration: Calibration, u_px: float, v_px: float, range_m: float, flux_e: float, background_e: float
+) -> RangeCauses | None:
+    """Return the causes of one flare's `range_sigma_m` in `flare_limit`; None where that is infinite.
+
+    The bound is the variance of the efficient estimate, in which a pixel's noise n enters by the weight
+    b C ∂λ/V, C the inverse information and b how range follows from the unknowns: so variances of several
+    causes, V = Σ V_i, enter as Σ (b C ∂λ/V)² V_i. Priors enter as measurements do. A pixel that may be
+    clipped tells less, and counts as one of so much more noise. Parameters as `flare_limit`.
+    """
+    if not (range_m > 0.0 and flux_e > 0.0):
+        raise ValueError(f"range_m and flux_e must be positive, not {[range_m, flux_e]}")
+    if not calibration.range_constant_dn_m2_per_s > 0.0:
+        return None
+    rounding_e2 = 1.0 / (12.0 * calibration.system_gain_dn_per_e**2)
+    floors_e2 = (calibration.read_noise_e**2, calibration.dsnu_e**2, rounding_e2)
+    rest_e = max(background_e, 0.0)
+    angular_radius = float(angular_radius_rad(range_m, calibration.source_radius_m))
+    if float(image_radius_px(u_px, v_px, angular_radius, calibration)) > WIDE_PX:
+        if math.isinf(_wide_limit(calibration, range_m, flux_e, background_e, angular_radius).range_sigma_m):
+            return None
+        pixels = _pixels_of_disc(calibration, angular_radius)
+        lit_e = flux_e / pixels + rest_e
+        parts_e2 = (flux_e / pixels, rest_e, (calibration.prnu * lit_e) ** 2, *floors_e2)
+        noise_m = [0.5 * range_m / flux_e * math.sqrt(pixels * part_e2) for part_e2 in parts_e2]
+        return RangeCauses(*[*noise_m, 0.5 * range_m * Camera(calibration, 1.0, 1.0).flux_spread, 0.0, 0.0])
+    place = np.array([[u_px, v_px, range_m, flux_e]], dtype=np.float64)
+    known = _known(calibration, place, background_e, True, None)
+    if known is None:
+        return None
+    all_e = np.maximum(known.expected_e, 0.0)
+    own_e = np.maximum(all_e - rest_e, 0.0)
+    camera, by_flux = known.camera, 0.5 * known.camera.flux_spread
+    range_row = np.zeros(known.layout.size)
+    range_row[2] = 1.0
+    if known.layout.has_slack:
+        range_row[3] = -(by_flux**2) / camera.tie_spread
+    answer = range_row @ known.inverse
+    per_e2 = (answer @ known.jacobian) ** 2 * known.telling / known.variance_e2**2
+    parts = (own_e, all_e - own_e, (calibration.prnu * all_e) ** 2, *floors_e2)
+    noise = [math.sqrt(float((per_e2 * part_e2).sum())) for part_e2 in parts]
+    constant, radius = by_flux, 0.0
+    if known.layout.has_slack:
+        # Of errors φ in ½ ln K and ρ in ln r the slack is (φ + ρ)/σ_t; (σ_r² φ − σ_φ² ρ)/σ_t² stays open.
+        of_slack, tie = float(answer[3]) / camera.tie_spread, camera.tie_spread
+        constant = by_flux * abs((camera.radius_spread / tie) ** 2 - of_slack)
+        radius = camera.radius_spread * abs((by_flux / tie) ** 2 + of_slack)
+    width = abs(float(answer[known.layout.width])) if known.layout.has_width else 0.0
+    return RangeCauses(*[range_m * share for share in (*noise, constant, radius, width)])
+
+
+def _known(
+    calibration: Calibration,
+    place: NDArray[np.float64],
+    background_e: float,
+    clipped_tell_nothing: bool,
+    structure: Structure | None,
+) -> _Known | None:
+    """Return what is known of flares, shape (flares, 4) as in `flare_limits`; None if nothing is."""
+    box = limit_box(calibration, place)
     camera = Camera(calibration, 1.0, 1.0)
     log_range, pixels = np.log(place[:, 2]), box.height * box.width
     sources, imaged = lay_out(camera, place[:, 0], place[:, 1], log_range)
     if not imaged.all() or pixels == 0:
-        return nothing
+        return None
     clip_e = clip_level_e(calibration, calibration.black_level_dn) if clipped_tell_nothing else math.inf
     known, structure = camera.known(clip_e), structure or even(pixels)
-    layout = known.layout(len(flares), len(structure.columns))
+    layout = known.layout(len(place), len(structure.columns))
     values = np.zeros(layout.size)
     own = layout.of_sources(values)
     own[:, 0], own[:, 1], own[:, 2] = place[:, 0], place[:, 1], log_range
@@ -196,12 +297,17 @@ def flare_limits(
     if clipped_tell_nothing:
         telling = censored_weight(expected_e, variance_e2, clip_e)
     used = telling > _LEAST_TELLING
-    information = fisher_information(jacobian[:, used], variance_e2[used] / telling[used])
-    inverse = covariance(information + layout.prior(structure))
-    return nothing if inverse is None else _limits(camera, layout, place, inverse)
+    jacobian, expected_e = jacobian[:, used], expected_e[used]
+    variance_e2, telling = variance_e2[used], telling[used]
+    inverse = covariance(fisher_information(jacobian, variance_e2 / telling) + layout.prior(structure))
+    if inverse is None:
+        return None
+    return _Known(camera, layout, jacobian, expected_e, variance_e2, telling, inverse)
 
 
-def limit_box(calibration: Calibration, flares: Sequence[tuple[float, float, float, float]]) -> PixelBox:
+def limit_box(
+    calibration: Calibration, flares: Sequence[tuple[float, float, float, float]] | NDArray[np.float64]
+) -> PixelBox:
     """Return the pixels whose light a bound counts: up to 8 σ from the flares, and a rim.
 
     Beyond they tell of the background only, and a rim that wide tells that well enough.

@@ -17,6 +17,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.stress": ("page", "workers"),
     "nir_render.regress": ("stages",),
     "nir_render.compare": (),
+    "nir_render.budget": (),
     "nir_render.run": ("goniometer", "recording"),
     "nir_render.report": ("time",),
     "nir_render.evaluate": (),

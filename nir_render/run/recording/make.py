@@ -14,7 +14,7 @@ from nir_render.run.recording.calibration import Assumed, camera_calibration
 from nir_render.run.recording.document import CameraGiven, KnownRange, Measured, RecordingDocument
 from nir_render.run.recording.pictures import KINDS, Pictures, find_pictures, read_pictures
 from nir_render.run.recording.range_constant import Constant, from_data_sheets, from_known_ranges
-from nir_render.scene.explain import Places, explain
+from nir_render.scene.problems import Places, explain
 from nir_render.scene.text.yaml_text import read_yaml
 from perception import (
     FrameRecord,

@@ -5,7 +5,7 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from nir_render.scene.explain import explain
+from nir_render.scene.problems import explain
 from nir_render.stress.axes import Axis, AxisDocument
 
 

@@ -1,9 +1,18 @@
 import math
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
-from perception.model.fisher import censored_weight, covariance, flare_limit, flare_limits
+from perception.model.fisher import (
+    censored_weight,
+    covariance,
+    flare_limit,
+    flare_limits,
+    range_causes,
+)
+from perception.types import Calibration
 from tests.unit.perception.simulation import calibration, random
 
 
@@ -80,3 +89,71 @@ def test_covariance_of_badly_scaled_information() -> None:
     assert inverse is not None
     np.testing.assert_allclose(inverse @ information, np.eye(2), atol=1e-9)
     assert covariance(np.array([[1.0, 1.0], [1.0, 1.0]])) is None
+
+
+_SIGMAS = {"range_constant_dn_m2_per_s": 0.05, "source_radius_m": 0.02, "psf_sigma_px": 0.03}  # of the values
+
+
+def _with_sigmas(camera: Calibration, factors: Mapping[str, float]) -> Calibration:
+    sigma = {name: share * getattr(camera, name) * factors.get(name, 1.0) for name, share in _SIGMAS.items()}
+    return replace(camera, sigma=sigma)
+
+
+@pytest.mark.parametrize("range_m", [0.05, 0.5, 3.0, 10.0])
+@pytest.mark.parametrize("exact", [True, False])
+def test_causes_add_up_to_the_limit_and_each_is_its_slope(range_m: float, exact: bool) -> None:
+    """The bound's square is homogeneous in all variances, so a cause's share is its variance times the slope."""
+    # Dark as it is no pixel clips: what clipping hides depends on the noise in another way.
+    camera = calibration(prnu=0.0, dsnu_e=3.0, saturation_dn=10**9, sigma={})
+    camera = camera if exact else _with_sigmas(camera, {})
+    flux_e, background_e = 4e4 / range_m**2, 30.0
+
+    def square(changed: Calibration, background: float = background_e) -> float:
+        return flare_limit(changed, 640.0, 480.0, range_m, flux_e, background).range_sigma_m ** 2
+
+    found = range_causes(camera, 640.0, 480.0, range_m, flux_e, background_e)
+    assert found is not None
+    causes_m = asdict(found)
+    assert math.hypot(*causes_m.values()) == pytest.approx(math.sqrt(square(camera)), rel=1e-9)
+    step = 1e-3  # of a variance: half of it of a σ
+
+    def slope(more: Calibration, less: Calibration, of: tuple[float, float] = (background_e,) * 2) -> float:
+        return (square(more, of[0]) - square(less, of[1])) / (2.0 * step)
+
+    for cause, field in (("read_noise_m", "read_noise_e"), ("dsnu_m", "dsnu_e")):
+        more, less = (
+            replace(camera, **{field: getattr(camera, field) * math.sqrt(1.0 + sign * step)})
+            for sign in (1, -1)
+        )
+        assert causes_m[cause] ** 2 == pytest.approx(slope(more, less), rel=2e-3, abs=1e-7 * square(camera))
+    around = (background_e * (1.0 + step), background_e * (1.0 - step))
+    assert causes_m["background_m"] ** 2 == pytest.approx(
+        slope(camera, camera, around), rel=2e-3, abs=1e-7 * square(camera)
+    )
+    if exact:
+        return
+    names = {
+        "range_constant_m": "range_constant_dn_m2_per_s",
+        "source_radius_m": "source_radius_m",
+        "point_spread_m": "psf_sigma_px",
+    }
+    for cause, field in names.items():
+        more, less = (_with_sigmas(camera, {field: math.sqrt(1.0 + sign * step)}) for sign in (1, -1))
+        assert causes_m[cause] ** 2 == pytest.approx(slope(more, less), rel=5e-3, abs=1e-6 * square(camera))
+
+
+def test_causes_of_a_bright_point_are_its_own_light() -> None:
+    """σ_d = d/2 √F/F of its own light alone; with a PRNU of 1 % another 0.005 d √(Σ S²)."""
+    camera = calibration(
+        psf_sigma_px=2.0, source_radius_m=0.0, read_noise_e=0.0, system_gain_dn_per_e=1e4, saturation_dn=10**9,
+        prnu=0.0, dsnu_e=0.0, sigma={},
+    )  # fmt: skip
+    found = range_causes(camera, 639.7, 479.2, 5.0, 1e6, background_e=0.0)
+    assert found is not None
+    assert found.own_light_m == pytest.approx(2.5e-3, rel=0.01)
+    assert (found.background_m, found.prnu_m, found.read_noise_m) == (0.0, 0.0, 0.0)
+
+
+def test_nothing_has_no_causes() -> None:
+    assert range_causes(calibration(), 639.5, 479.5, 3.0, 1e5, 6000.0) is None
+    assert range_causes(calibration(), -100.0, 50.0, 3.0, 1e4, 2.0) is None

@@ -1,0 +1,1 @@
+"""The photon budget of a scene without rendering: electrons, σ of ranges by cause, eye safety."""

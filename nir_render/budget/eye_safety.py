@@ -1,0 +1,99 @@
+"""Eye safety of infrared sources by IEC 62471:2006, at 0.2 m, for exposures of any length.
+
+Held against the limits of the exempt group for exposures beyond 1000 s: of cornea and lens, 100 W/m² from 780
+to 3000 nm; of the retina behind an eye that no visible light warns, 6000/α W/m²/sr of radiance weighted with
+R(λ), 780 to 1400 nm. Lasers, VCSELs among them, are IEC 60825's and are not judged by these.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.budget.flares import largest_relative_intensity
+from nir_render.scene.documents.emitters import Source
+from nir_render.scene.emission import emission_spectrum
+from nir_render.spectra.bandpass import width_at_half_m
+
+DISTANCE_M = 0.2
+CORNEA_LIMIT_W_PER_M2 = 100.0
+RETINA_LIMIT_W_PER_M_SR = 6000.0  # over α
+LEAST_ANGLE_RAD, LARGEST_ANGLE_RAD = 0.011, 0.1
+_LASER_WIDTH_M = 5e-9
+_CORNEA_M, _RETINA_M = (780e-9, 3000e-9), (780e-9, 1400e-9)
+
+
+@dataclass(frozen=True)
+class EyeSafety:
+    """What a source brings to an eye 0.2 m from its middle, where it is brightest, and the limits.
+
+    `cornea_w_per_m2` and `retina_w_per_m2_sr` are of a source that is lit all the time, `mean_…` with the
+    mean of its drive (None of what sends messages: then as lit). `angle_rad` is the one that limit and
+    field of view go by, `retina_w_per_m2_sr` the mean over a field of 0.011 rad where a source fills less.
+    `narrow_spectrum` is one less than 5 nm wide: perhaps a laser, which is not judged by these.
+    """
+
+    sources: tuple[str, ...]
+    drive_mean: float | None
+    intensity_w_per_sr: float
+    cornea_w_per_m2: float
+    mean_cornea_w_per_m2: float
+    cornea_limit_w_per_m2: float
+    angle_rad: float
+    retina_w_per_m2_sr: float
+    mean_retina_w_per_m2_sr: float
+    retina_limit_w_per_m2_sr: float
+    exempt_lit: bool
+    exempt_mean: bool
+    cornea_limit_at_m: float
+    narrow_spectrum: bool
+
+
+def eye_safety(sources: Sequence[str], source: Source) -> EyeSafety:
+    """Return the eye safety of a source, by its largest intensity and its sphere's even radiance."""
+    spectrum = emission_spectrum(source)
+    wavelength_m, density = spectrum.wavelength_m, spectrum.value
+
+    def weighted(low_m: float, high_m: float, weight: NDArray[np.float64]) -> float:
+        inside = (wavelength_m >= low_m) & (wavelength_m <= high_m)
+        return float(np.trapezoid(np.where(inside, weight * density, 0.0), wavelength_m))
+
+    intensity = source.sent_flux_w / (4.0 * math.pi) * largest_relative_intensity(source)
+    cornea = intensity / DISTANCE_M**2 * weighted(*_CORNEA_M, np.ones_like(density))
+    fills_rad = 2.0 * source.radius_m / DISTANCE_M
+    angle_rad = min(max(fills_rad, LEAST_ANGLE_RAD), LARGEST_ANGLE_RAD)
+    radiance = intensity / (math.pi * source.radius_m**2)
+    retina = radiance * min(1.0, (fills_rad / LEAST_ANGLE_RAD) ** 2)
+    retina *= weighted(*_RETINA_M, retinal_weight(wavelength_m))
+    limit = RETINA_LIMIT_W_PER_M_SR / angle_rad
+    mean = source.drive.mean
+    share = 1.0 if mean is None else mean
+    return EyeSafety(
+        sources=tuple(sources),
+        drive_mean=mean,
+        intensity_w_per_sr=intensity,
+        cornea_w_per_m2=cornea,
+        mean_cornea_w_per_m2=share * cornea,
+        cornea_limit_w_per_m2=CORNEA_LIMIT_W_PER_M2,
+        angle_rad=angle_rad,
+        retina_w_per_m2_sr=retina,
+        mean_retina_w_per_m2_sr=share * retina,
+        retina_limit_w_per_m2_sr=limit,
+        exempt_lit=cornea <= CORNEA_LIMIT_W_PER_M2 and retina <= limit,
+        exempt_mean=share * cornea <= CORNEA_LIMIT_W_PER_M2 and share * retina <= limit,
+        cornea_limit_at_m=DISTANCE_M * math.sqrt(cornea / CORNEA_LIMIT_W_PER_M2),
+        narrow_spectrum=width_at_half_m(wavelength_m, density) < _LASER_WIDTH_M,
+    )
+
+
+def retinal_weight(wavelength_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return R(λ), the burn hazard's weight, from 700 to 1400 nm (IEC 62471:2006, table 4.2).
+
+    10^((700 − λ)/500) up to 1050 nm, 0.2 up to 1150, falling to 0.02 at 1200, and that up to 1400.
+    """
+    nm = 1e9 * np.asarray(wavelength_m, dtype=np.float64)
+    falling = 10.0 ** ((700.0 - np.maximum(nm, 700.0)) / 500.0)
+    beyond = np.clip(0.2 * 10.0 ** (0.02 * (1150.0 - nm)), 0.02, 0.2)
+    return np.where(nm <= 1050.0, falling, beyond)
