@@ -33,7 +33,7 @@ def _smooth_or_rough_enough(roughness: float) -> float:
 
 
 def _form(value: Any) -> str:
-    return "curve" if isinstance(value, Mapping | CurveDocument) else "number"
+    return "dict[curve]" if isinstance(value, Mapping | CurveDocument) else "float"
 
 
 def _share(curve: CurveDocument) -> CurveDocument:
@@ -45,8 +45,8 @@ def _share(curve: CurveDocument) -> CurveDocument:
 _LEAST_ROUGHNESS = 0.02
 _LARGEST_INDEX = 100.0
 _TRACE = 1e-9
-_Number = Annotated[Fraction, Field(ge=0, le=1), Tag("number")]
-_Curve = Annotated[CurveDocument, AfterValidator(_share), Tag("curve")]
+_Number = Annotated[Fraction, Field(ge=0, le=1), Tag("float")]
+_Curve = Annotated[CurveDocument, AfterValidator(_share), Tag("dict[curve]")]
 Share = Annotated[_Number | _Curve, Discriminator(_form)]
 Reflectance = Annotated[Share, BeforeValidator(_refuse_rgb)]
 
