@@ -14,9 +14,14 @@ from tests.paths import ROOT, SCENES
 from tests.system.command import SCENE, nir_render
 
 ALL_SCENES = sorted([*SCENES.glob("*.yaml"), *(SCENES / "regression").glob("*.yaml")])
+QUICK = ("foggy_hall", "one_source", "shutter", "sunlit_yard")
+SOME_SCENES = [
+    pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.verify)
+    for path in ALL_SCENES
+]
 
 
-@pytest.mark.parametrize("path", ALL_SCENES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", SOME_SCENES)
 def test_every_scene_has_a_budget(path: Path) -> None:
     """At two times: robots move, sources blink; what is printed is one JSON object without NaN."""
     if path.stem == "sunlit_yard":

@@ -25,6 +25,7 @@ def witness() -> Any:
     return module
 
 
+@pytest.mark.verify
 def test_the_page_is_what_its_script_makes(tmp_path: Path) -> None:
     """Three rows differ, and say why: a camera of another maker, and the paper's two sources."""
     rows = witness().witnesses(tmp_path)
