@@ -17,23 +17,27 @@ from tests.paths import SCENES
 
 pytestmark = pytest.mark.mitsuba
 
-PRESETS = ["depth_camera_850", "tof_camera_940", "mocap_strobe_850", "remote_control_940"]
+PRESETS = ["depth_camera_850", "tof_camera_940", "mocap_strobe_850", "remote_control_940", "lidar_905"]
 # Mean watts, and peak radiant intensity on the axis: data sheets where they say, else Φ over the lobe.
 MEAN_W = {
     "depth_camera_850": 0.36,
     "tof_camera_940": 0.18,
     "mocap_strobe_850": 0.3,
     "remote_control_940": 0.00957,
+    "lidar_905": 16 * 0.2e-6 / 55.296e-6,  # lasers, their pulse, the time between two
 }
 
 
 def _facing(preset: str, **changes: Any) -> Scene:
-    """Return a scene of a beacon 3 m ahead of the camera, at its height, that shines straight into it."""
+    """Return a scene of a beacon 3 m ahead of the camera, at its height, that shines straight into it.
+
+    A lidar stands upright: its brightest is 90° off its axis.
+    """
     scene = load_scene(SCENES / "one_source.yaml")
     place = scene.at(0.0).camera("r1.front").pose.position_m + np.array([3.0, 0.0, 0.0])
     beacon = {
-        "preset": preset, "position": f"{place.tolist()} m", "orientation": {"yaw": "180 deg", "pitch": "90 deg"},
-        "drive": 1,
+        "preset": preset, "position": f"{place.tolist()} m", "drive": 1,
+        "orientation": {} if preset == "lidar_905" else {"yaw": "180 deg", "pitch": "90 deg"},
     }  # fmt: skip
     return scene.with_(
         {
@@ -46,7 +50,7 @@ def _facing(preset: str, **changes: Any) -> Scene:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_beacon_brings_its_intensity_over_the_square_of_the_distance(preset: str) -> None:
-    """E = I₀ / d², I₀ = Φ / (2π ∫ p sin θ dθ) p(0) by a sum over the preset's own points; electrons E A C t."""
+    """E = I / d², I = Φ / (2π ∫ p sin θ dθ) where p is 1, by a sum over the preset's own points; electrons E A C t."""
     scene = _facing(preset)
     document = scene.document.beacons
     assert document is not None
