@@ -2,6 +2,7 @@
 
 The range constants are those of the sources of the other robots (of its own, where there are no others);
 where these differ, their mean, with their spread as σ. Of fog it says that there may be some, not how much.
+Sources are rendered as black spheres: in clear air they hide all of the background.
 """
 
 import math
@@ -82,6 +83,9 @@ def _with_robot(known: Calibration, world: Scene | Snapshot) -> Calibration:
     sigma = dict(known.sigma)
     if snapshot.fog is not None and snapshot.fog.extinction_per_m > 0.0:
         sigma["extinction_per_m"] = FOG_SIGMA_PER_M
+        # How much of the light beside a source comes from fog before it is anybody's guess: even over 0 to 1.
+        sigma["hidden_background"] = math.sqrt(1.0 / 12.0)
+        known = replace(known, hidden_background=0.5)
     own_sources_body_m = np.array(places, dtype=np.float64).reshape(-1, 3)
     return replace(known, sigma=sigma, own_sources_body_m=own_sources_body_m)
 
@@ -141,6 +145,7 @@ def _without_rail(camera: str, device: Camera, sources: tuple[Source, ...]) -> C
         prnu=device.sensor.prnu.total,
         lens_model=device.lens.model,
         distortion=device.lens.distortion,
+        hidden_background=1.0,
     )
     for field in fields(known):
         if isinstance(array := getattr(known, field.name), np.ndarray):

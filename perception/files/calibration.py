@@ -3,7 +3,8 @@
 {"format": 1, "cameras": {name: {...}}}. Fields are named as in `Calibration`, but for the pose, which stands
 as `quaternion_body_camera_xyzw` and `position_body_m`. An entry whose standard deviation is known is written
 as {"value": v, "sigma": s}; that of the quaternion is an angle in radians. `lens_model` and `distortion` may
-be missing: the lens is then rectilinear; `dsnu_e` and `prnu` too: they are then 0; `own_sources_body_m` too.
+be missing: the lens is then rectilinear; `dsnu_e`, `prnu`, `extinction_per_m` and
+`hidden_background` too: they are then 0; `own_sources_body_m` too.
 """
 
 import math
@@ -77,6 +78,11 @@ CALIBRATION_ENTRIES = (
     Entry(
         "extinction_per_m", "number", "of the fog; 0 is clear air, with a σ where it is not known", 0.0, 1e3,
         default=0.0, sigma=True,
+    ),
+    Entry(
+        "hidden_background", "number",
+        "share of the background's light that a source takes away where it stands before it: 1 if it is "
+        "black, 0 if it sends back as much ambient light as it hides", -10.0, 1.0, default=0.0, sigma=True,
     ),
     Entry(
         "own_sources_body_m", "places", "where the robot's own sources sit, in body axes", -1e6, 1e6,

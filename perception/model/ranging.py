@@ -6,10 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.model.bearing import angle_from_axis_rad, direction_camera
+from perception.model.bearing import angle_from_axis_rad, direction_camera, pixel_turn
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
+
+LEAST_LEFT = 0.05
+"""At least so much of a source's flux is seen, however bright the background that it hides."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,7 @@ def range_from_flux(
     exposure_s: float,
     gain: float,
     calibration: Calibration,
+    background_dn: float = 0.0,
 ) -> Range:
     """Range from the background-subtracted integrated flux F.
 
@@ -90,6 +94,8 @@ def range_from_flux(
         Exposure time, and gain of the frame relative to the calibrated one.
     calibration
         K is `range_constant_dn_m2_per_s`, σ_K its entry in `sigma`.
+    background_dn
+        Of a pixel beside the flare: the flux lacks what the source hides of it (`hidden_share`).
 
     Returns
     -------
@@ -99,6 +105,11 @@ def range_from_flux(
     at_one_metre_dn = float(flux_at_one_metre_dn(u_px, v_px, exposure_s, gain, calibration))
     if not (flux_dn > 0.0 and at_one_metre_dn > 0.0):
         return Range(math.nan, math.nan)
+    hidden, hidden_sigma = (
+        float(hidden_share(np.array([[u_px, v_px]]), background_dn, at_one_metre_dn, hiding, calibration)[0])
+        for hiding in (calibration.hidden_background, calibration.sigma.get("hidden_background", 0.0))
+    )
+    at_one_metre_dn *= max(1.0 - hidden, LEAST_LEFT)
     relative = flux_sigma_dn / flux_dn
     constant_relative = (
         calibration.sigma.get("range_constant_dn_m2_per_s", 0.0) / calibration.range_constant_dn_m2_per_s
@@ -106,7 +117,34 @@ def range_from_flux(
     range_m = math.sqrt(at_one_metre_dn / flux_dn)
     if math.isfinite(relative):
         range_m /= 1.0 + 0.375 * relative**2
-    return Range(range_m, 0.5 * range_m * math.hypot(relative, constant_relative))
+    return Range(range_m, 0.5 * range_m * math.hypot(relative, constant_relative, hidden_sigma))
+
+
+def hidden_share(
+    places_px: Array, background_e: ArrayLike, at_1_m_e: ArrayLike, hiding: float, calibration: Calibration
+) -> Array:
+    """Share of its own flux by which a source dims the background that it stands before, at any range.
+
+    A sphere of radius r stands before π r²/d² of solid angle, of which each pixel, Ω wide, sees B electrons
+    beside it: π r² B / (Ω F₁) of the flux F₁/d², if it is black. 0 where the radius is not known.
+
+    Parameters
+    ----------
+    places_px
+        Where the flares are, shape (n, 2).
+    background_e, at_1_m_e
+        Of a pixel beside each, and the flux that each would have at one metre, in electrons, shape (n,).
+    hiding
+        Share of the background that it takes away (`Calibration.hidden_background`), or its σ.
+    """
+    radius_m = calibration.source_radius_m
+    if hiding == 0.0 or not radius_m > 0.0:
+        return np.zeros(len(places_px))
+    along_u, along_v = pixel_turn(places_px, calibration).swapaxes(0, 1)
+    pixel_sr = np.linalg.norm(np.cross(along_u, along_v), axis=1)
+    behind_e, flux_e = np.maximum(background_e, 0.0), np.asarray(at_1_m_e, dtype=np.float64)
+    share = hiding * math.pi * radius_m**2 * behind_e / pixel_sr / np.where(flux_e > 0.0, flux_e, np.inf)
+    return np.asarray(share)
 
 
 def angular_radius_rad(range_m: ArrayLike, source_radius_m: float) -> Array:

@@ -356,6 +356,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         frame.exposure_s,
         frame.gain,
         calibration,
+        aperture.background * gain,
     )
     u_sigma_px, v_sigma_px = _centroid_sigmas(member, aperture.flux, prepared)
     unknown = math.nan

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from perception.model.flare import PixelBox
 from perception.model.layout import UNUSABLE, Sources, Structure, View, even
 from perception.model.pixels import maximise
+from perception.model.ranging import hidden_share
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.goodness import LeftOver, left_over, residual_e
@@ -25,6 +26,7 @@ _MOST_LAYOUTS = 7
 # How far the range by size may move before images are laid out anew: their shape changes with its square.
 _LAYOUT_KEPT = 0.02
 _LAYOUT_KEPT_PX = 0.05
+_HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
 _PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
 _NEIGHBOURS = 20.0 * 50.0 / (1280.0 * 960.0)  # of twenty flares in a frame, how many lie in those 50 px²
 
@@ -221,6 +223,11 @@ class _Fit:
         return self.layout.of_sources(self.values)
 
     @property
+    def background_e(self) -> Array:
+        """Of a pixel, for each source."""
+        return np.full(self.layout.sources, self.values[self.layout.background])
+
+    @property
     def of_sources(self) -> Array:
         """Their covariances, shape (sources, unknowns of each, unknowns of each)."""
         step = self.layout.per_source
@@ -244,15 +251,22 @@ class _Fit:
 def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
-    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]))
+    background_e = np.concatenate([fit.background_e for fit in fits])
+    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]), background_e)
     reach_px = laid.reach_px
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
         fit.converged = False
         if imaged[first:end].all():
             fit.climb(laid.part(first, end), reach_px[first:end])
-    change = laid.log_range_at - _log_range_by_size(np.concatenate([fit.own for fit in fits]), fits[0])
+    own = np.concatenate([fit.own for fit in fits])
+    change = laid.log_range_at - _log_range_by_size(own, fits[0])
     moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
+    more_e = np.concatenate([fit.background_e for fit in fits]) - background_e
+    at_1_m_e, known = np.exp(laid.log_flux_at_1_m), camera.calibration
+    moved |= (
+        hidden_share(own[:, :2], abs(more_e), at_1_m_e, abs(known.hidden_background), known) > _HIDDEN_KEPT
+    )
     if not moved.any():
         return []
     return [
@@ -277,6 +291,11 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     slack = own[:, 3] if fits[0].layout.has_slack else None
     log_range, log_range_sigma, log_range_common = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
+    hidden_e = np.concatenate([fit.background_e for fit in fits])
+    unsure = camera.calibration.sigma.get("hidden_background", 0.0)
+    at_1_m_e = np.exp(log_flux_at_1_m)
+    hidden = 0.5 * hidden_share(own[:, :2], hidden_e, at_1_m_e, unsure, camera.calibration)
+    log_range_sigma, log_range_common = np.hypot(log_range_sigma, hidden), np.hypot(log_range_common, hidden)
     flux_e = np.exp(log_flux_at_1_m - 2.0 * own[:, 2])
     flux_sigma_e, ranged = 2.0 * sigma[:, 2] * flux_e, log_flux_at_1_m != 0.0
     solutions, first = [], 0

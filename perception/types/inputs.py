@@ -79,6 +79,9 @@ class Calibration:
     extinction_per_m
         Of the fog, 0 in clear air. Where it is not known a σ says so (0.05 /m: anything from clear air to
         a visibility of 40 m): ranges by flux are then no better than that allows.
+    hidden_background
+        Share of the background's light that a source takes away where it stands before it: 1 for a black
+        sphere in clear air, 0 where it sends back as much of the ambient light as it hides.
     own_sources_body_m
         Where the robot's own sources sit, in body axes, shape (n, 3): mirrors show them too.
     sigma
@@ -112,6 +115,7 @@ class Calibration:
     dsnu_e: float = 0.0
     prnu: float = 0.0
     extinction_per_m: float = 0.0
+    hidden_background: float = 0.0
     own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
 
 
