@@ -46,7 +46,7 @@ for command in (
     *(runs.run, runs.render, runs.perceive, runs.evaluate, runs.calibrate, runs.report),
     explain,
     compare,
-    stress.stress,
+    *(stress.stress, stress.experiment),
     *(scenes.new, scenes.validate, scenes.schema, scenes.goniometer, scenes.doctor),
 ):
     app.command()(command)

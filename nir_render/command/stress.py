@@ -1,14 +1,25 @@
-"""The command of campaigns: stress."""
+"""The commands of many runs: stress, over axes of a scene, and experiment, the paper's own over seeds."""
 
+import math
 import shlex
 import signal
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nir_render.command.options import Json, LightFolder, LightLimit, Output, light_limit_bytes
+from nir_render.command.options import (
+    Json,
+    LightFolder,
+    LightLimit,
+    Output,
+    Settings,
+    light_limit_bytes,
+    read_scene,
+)
+from nir_render.errors import InputError
 
 if TYPE_CHECKING:
     from nir_render.stress.campaign import Campaign
@@ -64,6 +75,83 @@ def stress(
     _show(result, as_json)
     if result.failed:
         raise typer.Exit(1)
+
+
+class Experiment(StrEnum):
+    """The paper's experiments that there are."""
+
+    FLOCKING = "flocking"
+
+
+class Law(StrEnum):
+    """By which robots steer."""
+
+    ROBUST = "robust"
+    PAPER = "paper"
+
+
+class Level(StrEnum):
+    """By what they see."""
+
+    FRAMES = "frames"
+    MEASUREMENTS = "measurements"
+    TRUTH = "truth"
+
+
+def experiment(
+    name: Annotated[Experiment, typer.Argument(metavar="NAME", help="Which: flocking.")],
+    output: Output = None,
+    law: Annotated[
+        Law, typer.Option("--law", help="How robots steer: robust, or as the paper says.")
+    ] = Law.ROBUST,
+    level: Annotated[
+        Level,
+        typer.Option(
+            "--level",
+            help="What they see by: frames (hours), measurements drawn at their bound (minutes), or truth.",
+        ),
+    ] = Level.MEASUREMENTS,
+    stack: Annotated[
+        Law, typer.Option("--stack", help="With frames: the perception stack, robust or paper.")
+    ] = Law.ROBUST,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="How many runs, by seeds from 0 on.")] = 20,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="How long each lasts.")] = 120.0,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            "--scene", metavar="SCENE", help="Another arena; its first robot leads, the others follow."
+        ),
+    ] = None,
+    settings: Settings = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="Processes; by default as many as cores, at most 8."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Run an experiment of the paper in closed loop: robots move by what they see."""
+    import os
+
+    from nir_render.command.console import print_json
+    from nir_render.command.progress import progress_bar
+    from nir_render.experiments.flocking import Flocking
+    from nir_render.experiments.outcome import ARENA, outcome_of
+    from nir_render.experiments.page import sentence, write_outcome
+
+    if not (math.isfinite(seconds) and seconds >= 1.0):
+        raise InputError(f"--seconds {seconds:g}: wanted a second or more, such as 120")
+    plan = Flocking(law=law.value, level=level.value, stack=stack.value, lasts_s=seconds)
+    folder = output if output is not None else Path("outputs") / name.value
+    world = read_scene(ARENA if scene is None else scene, settings, None)
+    processes = workers or min(os.cpu_count() or 1, 8)
+    with progress_bar(name.value) as progress:
+        outcome = outcome_of(world, plan, range(seeds), folder, processes, progress)
+    page = write_outcome(outcome, folder)
+    if as_json:
+        print_json({**outcome.record(), "page": str(page)})
+        return
+    typer.echo(sentence(outcome))
+    typer.echo(f"open {page}")
 
 
 def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: bool) -> None:

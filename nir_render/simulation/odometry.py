@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from nir_render.randomness import generator
 from nir_render.scene.documents.times.clocks import OdometryNoise
 from nir_render.scene.motion import robot_pose, robot_velocity
+from nir_render.scene.pose import Pose
 from nir_render.scene.scene import Scene
 from nir_render.simulation.frame_times import frame_span_s
 from nir_render.truth.poses import PoseTruth
@@ -66,41 +67,55 @@ def true_poses(scene: Scene) -> Iterator[PoseTruth]:
             )
 
 
-def odometry_of(scene: Scene, robot: str, seed: int) -> list[Odometry]:
-    """Return what a robot knows of its own way, in a frame that is its body's axes at the first time.
+class DeadReckoning:
+    """What a robot knows of its own way, record by record, in a frame that is its body's axes at the first.
 
     Each step is the true one, in the axes that the robot takes itself to have, and a normal error of the walk
     times the root of its time on top, per axis: a heading that is off bends what follows. Errors of each
     record by itself are laid over it and do not add up. All are in body axes, keyed by seed, robot and step.
     """
-    from scipy.spatial.transform import Rotation
 
-    known = scene.document.robots[robot]
-    noise = known.rig.odometry or OdometryNoise()
-    times_s = pose_times_s(scene)
-    poses = [robot_pose(known, float(time_s)) for time_s in times_s]
-    position_m, rotation = np.zeros(3), np.eye(3)
-    records = []
-    for index, (time_s, pose) in enumerate(zip(times_s, poses, strict=True)):
-        random = generator(seed, "odometry", robot, index)
+    def __init__(self, robot: str, noise: OdometryNoise, seed: int) -> None:
+        self._robot, self._noise, self._seed = robot, noise, seed
+        self._position_m, self._rotation = np.zeros(3), np.eye(3)
+        self._before: tuple[float, Pose] | None = None
+        self._index = 0
+
+    def record(self, time_s: float, pose: Pose) -> Odometry:
+        """Return the next record, of a robot that is truly at a pose."""
+        from scipy.spatial.transform import Rotation
+
+        noise = self._noise
+        random = generator(self._seed, "odometry", self._robot, self._index)
         walked, turned, shaken, tilted = random.standard_normal((4, 3))
-        if index:
-            before, root_s = poses[index - 1], float(np.sqrt(time_s - times_s[index - 1]))
+        if self._before is not None:
+            before_s, before = self._before
+            root_s = float(np.sqrt(time_s - before_s))
             step_m = before.rotation.T @ (pose.position_m - before.position_m)
-            position_m = position_m + rotation @ (step_m + noise.position_walk_m * root_s * walked)
-            turn = Rotation.from_rotvec(noise.rotation_walk_rad * root_s * turned).as_matrix()
-            rotation = rotation @ before.rotation.T @ pose.rotation @ turn
-        tilt = Rotation.from_rotvec(noise.rotation_noise_rad * tilted).as_matrix()
-        records.append(
-            Odometry(
-                robot=robot,
-                time_s=float(time_s),
-                position_m=position_m + rotation @ (noise.position_noise_m * shaken),
-                rotation=rotation @ tilt,
-                position_sigma_m=noise.position_noise_m,
-                rotation_sigma_rad=noise.rotation_noise_rad,
-                position_walk_m_per_sqrt_s=noise.position_walk_m,
-                rotation_walk_rad_per_sqrt_s=noise.rotation_walk_rad,
+            position_m = self._position_m
+            self._position_m = position_m + self._rotation @ (
+                step_m + noise.position_walk_m * root_s * walked
             )
+            turn = Rotation.from_rotvec(noise.rotation_walk_rad * root_s * turned).as_matrix()
+            self._rotation = self._rotation @ before.rotation.T @ pose.rotation @ turn
+        self._before, self._index = (time_s, pose), self._index + 1
+        tilt = Rotation.from_rotvec(noise.rotation_noise_rad * tilted).as_matrix()
+        return Odometry(
+            robot=self._robot,
+            time_s=time_s,
+            position_m=self._position_m + self._rotation @ (noise.position_noise_m * shaken),
+            rotation=self._rotation @ tilt,
+            position_sigma_m=noise.position_noise_m,
+            rotation_sigma_rad=noise.rotation_noise_rad,
+            position_walk_m_per_sqrt_s=noise.position_walk_m,
+            rotation_walk_rad_per_sqrt_s=noise.rotation_walk_rad,
         )
-    return records
+
+
+def odometry_of(scene: Scene, robot: str, seed: int) -> list[Odometry]:
+    """Return what a robot knows of its own way, at the times of poses (`DeadReckoning`)."""
+    known = scene.document.robots[robot]
+    reckoned = DeadReckoning(robot, known.rig.odometry or OdometryNoise(), seed)
+    return [
+        reckoned.record(float(time_s), robot_pose(known, float(time_s))) for time_s in pose_times_s(scene)
+    ]

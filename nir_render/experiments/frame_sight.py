@@ -1,0 +1,80 @@
+"""A robot that sees by frames: rendered, exposed, and read by the whole stack."""
+
+from typing import Any
+
+from nir_render.camera.mean_frame import Rates, electron_rates, exposed_frame
+from nir_render.camera.timing.exposure_control import own_setting
+from nir_render.camera.timing.shutter import mid_exposure_s
+from nir_render.experiments.controllers import neighbours_of
+from nir_render.experiments.sight import Seen
+from nir_render.experiments.world import World
+from nir_render.randomness import RandomKey
+from nir_render.scene.scene import Scene
+from nir_render.scene.snapshot import Snapshot
+from nir_render.simulation.calibration import calibration
+from nir_render.simulation.clock import frame_of
+from nir_render.simulation.refresh import interpolation_error, rates_between
+from perception import Pipeline, RawFrame
+
+_AHEAD_S = 1e-9
+
+
+class FrameSight:
+    """Frames of all cameras of a robot, rendered and exposed, read by the whole stack.
+
+    Light straight from sources is reckoned for every frame. Indirect light is rendered every `refresh_s` and
+    held in between. How far off that was at the end of each stretch, where it is most, is kept in
+    `held_shares`: the mean square over the mean temporal variance of the frame.
+    """
+
+    def __init__(self, scene: Scene, robot: str, seed: int, stack: str, refresh_s: float) -> None:
+        self._robot, self._seed, self._refresh_s = robot, seed, refresh_s
+        self._cameras = scene.document.cameras_of(robot)
+        self._pipeline = Pipeline.of(stack, {name: calibration(scene, name) for name in self._cameras})
+        self._held: dict[str, Rates] = {}
+        self._held_in: Snapshot | None = None
+        self._index = 0
+        self.held_shares: list[float] = []
+
+    def look(self, world: World) -> Seen:
+        """Take a set of frames, and read it."""
+        snapshot = world.snapshot()
+        if not self._held and self._held_in is not None:  # it goes on in another process
+            self._held = {name: self._rendered(name, self._held_in) for name in self._cameras}
+        if self._held_in is None or snapshot.time_s >= self._held_in.time_s + self._refresh_s - _AHEAD_S:
+            self._refresh(snapshot)
+        frames = [self._frame(snapshot, name) for name in self._cameras]
+        self._index += 1
+        heard = self._pipeline.push(frames, world.odometry(self._robot))
+        return Seen(neighbours_of(heard.tracks), heard.messages)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what can be rendered again to the same bits."""
+        return {**self.__dict__, "_held": {}}
+
+    def _refresh(self, snapshot: Snapshot) -> None:
+        fresh = {name: self._rendered(name, snapshot) for name in self._cameras}
+        if self._held_in is not None:
+            before_s = self._held_in.time_s
+            times_s = (before_s, snapshot.time_s, snapshot.time_s + self._refresh_s)
+            for name, held in self._held.items():
+                # Held light is one that does not change: both ends of the interval are the older one.
+                self.held_shares.append(interpolation_error(held, held, fresh[name], times_s).mean_share)
+        self._held, self._held_in = fresh, snapshot
+
+    def _rendered(self, name: str, snapshot: Snapshot) -> Rates:
+        from nir_render.transport.render import render  # Mitsuba loads only where light is rendered
+
+        return electron_rates(render(snapshot, name, self._seed), snapshot)
+
+    def _frame(self, snapshot: Snapshot, name: str) -> RawFrame:
+        from nir_render.transport.render import direct_light
+
+        direct = electron_rates(direct_light(snapshot, name, self._seed), snapshot)
+        rates = rates_between(direct, ((1.0, self._held[name]),))
+        camera = rates.camera
+        setting = own_setting(camera, self._index)
+        begin_s = snapshot.time_s - mid_exposure_s(camera, setting.exposure_s)
+        mean = exposed_frame(rates, setting.exposure_s, begin_s)
+        key = RandomKey(self._seed, "read_out", name, self._index)
+        return frame_of(mean.electrons, camera, setting, begin_s, key)
