@@ -63,6 +63,9 @@ class Calibration:
         has which is not known: they add to the noise of a place, and do not average over frames.
     psf_sigma_px
         Standard deviation of the Gaussian point spread function, without the pixel's own aperture.
+    glare_share, glare_radius_px, glare_exponent
+        What share g of all light the lens scatters far off, and how: w(r) = (γ − 1) / (π r₀²)
+        (1 + (r / r₀)²)^−γ. Flares are fitted without it: what of it they find is in the range constant.
     response_angle_rad, response_relative
         Response (filter, vignetting) against field angle (increasing from 0), relative to the axis, shape
         (n,) each.
@@ -116,6 +119,9 @@ class Calibration:
     prnu: float = 0.0
     extinction_per_m: float = 0.0
     hidden_background: float = 0.0
+    glare_share: float = 0.0
+    glare_radius_px: float = 10.0
+    glare_exponent: float = 2.5
     own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
 
 

@@ -77,7 +77,10 @@ def test_the_fitted_file_is_the_calibration_with_new_constants(rail: Path) -> No
     new = json.loads(text)["cameras"]
     assert old.keys() == new.keys()
     changed = {name for name in old["r1.front"] if old["r1.front"][name] != new["r1.front"][name]}
-    assert changed == {"range_constant_dn_m2_per_s", "range_constant_paper_dn_m2_per_s"}
+    assert changed == {
+        *("range_constant_dn_m2_per_s", "range_constant_paper_dn_m2_per_s"),
+        *("psf_sigma_px", "glare_share"),
+    }
     fitted = parse_calibration_document(json.loads(text))["r1.front"]
     assert fitted.sigma["range_constant_dn_m2_per_s"] > 0.0
     assert {"calibration.fitted.json", "ranges.csv"} <= json.loads((rail / "manifest.json").read_text())[
