@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +30,11 @@ from perception import (
     read_recording,
 )
 from perception.calibration.result import IDEAL_MAE, HeldOut, faults
+from perception.files.offsets import encode_offsets
 from perception.files.ranges import RANGES_FILE
 
 FITTED_FILE = "calibration.fitted.json"
+_OFFSETS = "calibration.fitted.{}.offsets.png"
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,7 @@ class CameraCalibration:
         rows: list[tuple[str, float, float, float]] = []
         names: list[str] = []
         if self.result.dark is not None:
-            names += ["black_level_dn", "read_noise_e", "dsnu_e"]
+            names += ["black_level_dn", "read_noise_e"]
         if self.result.point_spread is not None:
             names += ["psf_sigma_px", "glare_share"]
             if self.result.point_spread.has_glare:
@@ -93,6 +95,9 @@ class CameraCalibration:
             (name, getattr(known, name), known.sigma.get(name, 0.0), getattr(self.before, name))
             for name in names
         ]
+        if (dark := self.result.dark) is not None:
+            rows.append(("dsnu_e", dark.dsnu_e, dark.dsnu_sigma_e, self.before.dsnu_e))
+            rows.append(("dsnu_e, offsets off", known.dsnu_e, 0.0, self.before.dsnu_e))
         if (flat := self.result.flat) is not None:
             was = np.interp(flat.angle_rad, self.before.response_angle_rad, self.before.response_relative)
             at = len(flat.angle_rad) - 2  # the last but one is the frame's corner
@@ -152,9 +157,10 @@ def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibrati
         The folder is no recording, there is nothing to learn from, or frames do not tell what they are for.
     """
     started = time.perf_counter()
-    (folder / FITTED_FILE).unlink(missing_ok=True)
+    for old in (folder / FITTED_FILE, *folder.glob(_OFFSETS.format("*"))):
+        old.unlink(missing_ok=True)
     try:
-        recording = read_recording(folder)
+        recording = _as_taken(read_recording(folder))
         truth = _truth(recording)
         frames = _frames(recording, truth)
         done = {}
@@ -169,11 +175,28 @@ def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibrati
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
     if not any(camera.faults for camera in done.values()):
-        learned = {name: camera.result.calibration for name, camera in done.items()}
+        learned = {name: _with_offsets(folder, camera.result.calibration) for name, camera in done.items()}
         fitted = {**recording.calibrations, **learned}
         run_folder.write_json(folder / FITTED_FILE, calibration_document(fitted.values()))
     note_seconds(folder, "calibrate", started)
     return done
+
+
+def _as_taken(recording: Recording) -> Recording:
+    """Return a recording that leaves the pixels' offsets in its frames: they are learned anew."""
+    plain = {
+        name: replace(known, offset_dn=None, offset_file="") for name, known in recording.calibrations.items()
+    }
+    return replace(recording, calibrations=plain)
+
+
+def _with_offsets(folder: Path, calibration: Calibration) -> Calibration:
+    """Write the pixels' offsets beside the calibration, which then names them."""
+    if calibration.offset_dn is None:
+        return calibration
+    name = _OFFSETS.format(calibration.camera)
+    run_folder.write_file(folder / name, encode_offsets(calibration.offset_dn))
+    return replace(calibration, offset_file=name)
 
 
 def _frames(recording: Recording, truth: list[SourceTruth]) -> dict[str, CalibrationFrames]:

@@ -12,12 +12,16 @@ from perception.calibration.result import RailCalibration
 from perception.calibration.spread import PointSpreadCalibration, calibrate_point_spread
 from perception.calibration.veil import Glare
 from perception.files.fields import RecordingError
+from perception.model.sensor import without_offsets
 from perception.types import Calibration, RawFrame
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFrames:
-    """The frames of one camera by what they were taken of: indices, the known ranges, and what reads one."""
+    """The frames of one camera by what they were taken of: indices, the known ranges, and what reads one.
+
+    They are read as the sensor gave them: offsets that were known before are not off.
+    """
 
     load: Callable[[int], RawFrame]
     dark: Sequence[int] = ()
@@ -65,7 +69,7 @@ def calibrate_camera(
             "dark, flat or rail, and write the ranges of rail frames into ranges.csv"
         )
     dark = flat = spread = rail = None
-    known = calibration
+    known = replace(calibration, offset_dn=None, offset_file="")
     if frames.dark:
         dark = calibrate_dark(map(frames.load, frames.dark), known)
         known = dark.calibration
@@ -73,7 +77,8 @@ def calibrate_camera(
 
     def load(index: int) -> RawFrame:
         frame = frames.load(index)
-        return replace(frame, black_level_dn=frame.black_level_dn + moved_dn)
+        frame = replace(frame, black_level_dn=frame.black_level_dn + moved_dn)
+        return without_offsets(frame, known)
 
     if frames.ranges_m:
         spread = calibrate_point_spread(frames.ranges_m, load, known, progress)

@@ -28,16 +28,16 @@ class DarkCalibration:
     Attributes
     ----------
     calibration
-        As it was, but for black level, read noise and DSNU, with their σ.
+        As it was, but for black level, read noise and the pixels' offsets; its DSNU is what these leave.
     offset_e, offset_sigma_e
         Offset of each pixel from the mean, shape (rows, columns), as the frames and the spread of all offsets
-        make it likeliest, and the standard deviation of each.
+        make it likeliest, and the standard deviation of each. The calibration has them in whole counts.
     black_level_dn, black_level_sigma_dn
         The mean count of all pixels that are no defects.
     read_noise_e, read_noise_sigma_e
         From frame to frame, without what rounding to whole counts adds; dark current's own noise is in it.
-    dsnu_e
-        Standard deviation of the offsets.
+    dsnu_e, dsnu_sigma_e
+        Standard deviation of the offsets, and its σ, as if each pixel's were drawn by itself.
     frames, defects
         How many frames, and how many pixels that stand out by more than six σ.
     drift
@@ -52,6 +52,7 @@ class DarkCalibration:
     read_noise_e: float
     read_noise_sigma_e: float
     dsnu_e: float
+    dsnu_sigma_e: float
     frames: int
     defects: int
     drift: float
@@ -63,9 +64,10 @@ def calibrate_dark(frames: Iterable[RawFrame], calibration: Calibration) -> Dark
     The black level is the mean count over pixels and frames. Its σ is that of the temporal noise, widened
     where the frames' own means scatter by more: a black level that drifts is known no better than that. The
     read noise is the root of the mean variance of a pixel over time, less 1/12 DN² of rounding (EMVA 1288
-    release 4.0, section 6.5). An offset is the pixel's mean over time less that of all, drawn towards 0 by
-    w = σ_s² / (σ_s² + σ_t² / n), σ_s the spread of the true offsets, σ_t the noise of one frame: of all
-    estimates, the one of least mean square error; its σ is σ_s √(1 − w).
+    release 4.0, section 6.5). An offset is that of its row, of its column, and what the pixel departs from
+    both; each is a mean, drawn towards 0 by w = σ_s² / (σ_s² + σ_n²), σ_s the spread of the true ones, σ_n
+    the noise of that mean: of all estimates, the one of least mean square error, and its σ is σ_s √(1 − w).
+    Rows and columns are known far better than pixels, and what the offsets leave is white. Defects have none.
 
     Parameters
     ----------
@@ -100,23 +102,28 @@ def calibrate_dark(frames: Iterable[RawFrame], calibration: Calibration) -> Dark
     read_e = math.sqrt(max(noise_dn2 - _ROUNDING_DN2, 0.0)) / gain
     read_sigma_e = math.sqrt(0.5 / freedom) * noise_dn2 / (gain**2 * read_e) if read_e > 0.0 else 0.0
     of_mean_dn2 = noise_dn2 / stack.frames
-    spread_dn2 = max(float(np.var(mean_dn[kept])) - of_mean_dn2, 0.0)
-    trust = spread_dn2 / (spread_dn2 + of_mean_dn2)
-    offset_e = np.asarray((trust * (mean_dn - black_dn) / gain).astype(np.float32))
+    offset_dn, spread_dn2, left_dn2 = _offsets(mean_dn - black_dn, kept, of_mean_dn2)
     sigma = {**calibration.sigma, "black_level_dn": black_sigma_dn, "read_noise_e": read_sigma_e}
     sigma.pop("dsnu_e", None)
     dsnu_e = math.sqrt(spread_dn2) / gain
+    dsnu_sigma_e = (spread_dn2 + of_mean_dn2) * math.sqrt(0.5 / pixels) / (gain**2 * max(dsnu_e, 1e-12))
     return DarkCalibration(
         calibration=replace(
-            calibration, black_level_dn=black_dn, read_noise_e=read_e, dsnu_e=dsnu_e, sigma=sigma
+            calibration,
+            black_level_dn=black_dn,
+            read_noise_e=read_e,
+            dsnu_e=math.sqrt(left_dn2 + _ROUNDING_DN2 / stack.gain**2) / gain,
+            offset_dn=np.rint(offset_dn / stack.gain).astype(np.int16),
+            sigma=sigma,
         ),
-        offset_e=offset_e,
-        offset_sigma_e=math.sqrt(spread_dn2 * (1.0 - trust)) / gain,
+        offset_e=(offset_dn / gain).astype(np.float32),
+        offset_sigma_e=math.sqrt(left_dn2) / gain,
         black_level_dn=black_dn,
         black_level_sigma_dn=black_sigma_dn,
         read_noise_e=read_e,
         read_noise_sigma_e=read_sigma_e,
         dsnu_e=dsnu_e,
+        dsnu_sigma_e=dsnu_sigma_e,
         frames=stack.frames,
         defects=int(kept.size - pixels),
         drift=drift,
@@ -165,6 +172,31 @@ class _Stack:
             gains[0] if gains else 1.0,
             at_zero / (count * total.size),
         )
+
+
+def _offsets(
+    above_dn: NDArray[np.float64], kept: NDArray[np.bool_], noise_dn2: float
+) -> tuple[NDArray[np.float64], float, float]:
+    """Return offsets of pixels, the variance of the true ones, and that of what the offsets leave of them."""
+    left_dn = np.where(kept, above_dn, 0.0)
+    lines: list[NDArray[np.float64]] = []
+    for axis in (1, 0):
+        count = np.maximum(kept.sum(axis=axis, keepdims=True), 1)
+        lines.append(left_dn.sum(axis=axis, keepdims=True) / count)
+    for line in lines:
+        left_dn = np.where(kept, left_dn - line, 0.0)
+    of_pixels_dn2 = float(np.mean(left_dn[kept] ** 2))
+    spread_dn2 = max(of_pixels_dn2 - noise_dn2, 0.0)
+    trust = spread_dn2 / max(of_pixels_dn2, 1e-300)
+    offset_dn, unknown_dn2 = trust * left_dn, spread_dn2 * (1.0 - trust)
+    for line in lines:
+        seen_dn2 = float(np.var(line))
+        of_line_dn2 = max(seen_dn2 - noise_dn2 * line.size / left_dn.size, 0.0)
+        trust = of_line_dn2 / max(seen_dn2, 1e-300)
+        offset_dn = np.where(kept, offset_dn + trust * line, 0.0)
+        spread_dn2 += of_line_dn2
+        unknown_dn2 += of_line_dn2 * (1.0 - trust)
+    return offset_dn, spread_dn2, unknown_dn2
 
 
 def _no_defects(mean_dn: NDArray[np.float64], variance_dn2: NDArray[np.float64]) -> NDArray[np.bool_]:

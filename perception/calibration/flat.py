@@ -61,7 +61,6 @@ class FlatCalibration:
 def calibrate_flat(
     frames: Iterable[RawFrame],
     calibration: Calibration,
-    offset_e: NDArray[np.float32] | None = None,
     glare: Glare | None = None,
 ) -> FlatCalibration:
     """Learn the response over the field angle from frames of an even surface that fills the field.
@@ -73,11 +72,9 @@ def calibrate_flat(
     Parameters
     ----------
     frames
-        Of one surface; their exposures may differ. Those that clip are left out.
+        Of one surface; their exposures may differ. Those that clip are left out, known offsets are off.
     calibration
         Of the camera: lens, black level, noise and gain.
-    offset_e
-        The pixels' own offsets, shape (rows, columns), where they are known; `dsnu_e` is what they leave.
     glare
         The lens's glare, where it is known.
 
@@ -86,7 +83,7 @@ def calibrate_flat(
     RecordingError
         There are no frames that do not clip, or they are too dark, or the surface is uneven.
     """
-    camera, stack = calibration.camera, _Stack.of(frames, calibration, offset_e)
+    camera, stack = calibration.camera, _Stack.of(frames, calibration)
     if stack.frames == 0:
         raise RecordingError(
             f"{camera}: all of its {stack.clipped} flat frames clip (at {calibration.saturation_dn} DN, in "
@@ -168,9 +165,7 @@ class _Stack:
     most_clipped: float
 
     @staticmethod
-    def of(
-        frames: Iterable[RawFrame], calibration: Calibration, offset_e: NDArray[np.float32] | None
-    ) -> "_Stack":
+    def of(frames: Iterable[RawFrame], calibration: Calibration) -> "_Stack":
         total = np.zeros((calibration.height_px, calibration.width_px))
         used, clipped, most = 0, 0, 0.0
         for frame in frames:
@@ -181,6 +176,4 @@ class _Stack:
             gain = calibration.system_gain_dn_per_e * frame.gain
             total += (frame.data_dn - frame.black_level_dn) / gain
             used += 1
-        if offset_e is not None:
-            total -= used * offset_e
         return _Stack(total, used, clipped, most)

@@ -22,9 +22,15 @@ HALF_WINDOW_PX = 48.0
 """How far from a flare its glare is looked at."""
 
 _CORE_SIGMAS = 8.0
-_MOST_STEPS = 60
+_MOST_STEPS, _FEW_STEPS = 60, 2
 _SETTLED = 1e-3  # of a σ
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e6
+_SHAPE_PRIOR = ((math.log(10.0), 1.0), (math.log(1.5), 0.7))
+"""What is taken of a lens's glare before it is seen, ln r₀ and ln (γ − 1) and their σ.
+
+Far wings look like background: without it a share of 2 % may be one of 20 % that lies beyond the window.
+"""
+
 _SHAPE_BOUNDS = ((math.log(3.0), math.log(300.0)), (math.log(0.05), math.log(9.0)))
 # A disc's middle and a hexagon within it: right for polynomials of degree 5.
 _DISC = np.array(
@@ -74,21 +80,29 @@ class PointSpreadShape:
 
 @dataclass(frozen=True, eq=False)
 class PointSpreadFit:
-    """A fit: the shape, its covariance in ln σ, g, ln r₀, ln (γ − 1), ln growth, and how well it fits."""
+    """A fit: the shape, its covariance in ln σ, g, ln r₀, ln (γ − 1), ln growth, and how well it fits.
+
+    `own` is what each place has for itself: u, v, flux and background.
+    """
 
     shape: PointSpreadShape
     covariance: Array
     chi2: float
     freedom: int
+    own: Sequence[Array]
 
 
 def fit_point_spread(
-    flares: Sequence[StackedFlare], calibration: Calibration, start: PointSpreadShape, free: Sequence[bool]
+    flares: Sequence[StackedFlare],
+    calibration: Calibration,
+    start: PointSpreadShape,
+    free: Sequence[bool],
+    like: PointSpreadFit | None = None,
 ) -> PointSpreadFit:
     """Fit the shape to all flares by Gauss–Newton with damping (Levenberg, Marquardt).
 
     A pixel's variance is that of the model: λ + (PRNU λ)² + floor. Radii of sources have the σ that the
-    calibration states; without one they are exact.
+    calibration states; without one they are exact. The shape of glare has a wide prior.
 
     Parameters
     ----------
@@ -100,15 +114,20 @@ def fit_point_spread(
         Where the fit begins; what is not free stays there.
     free
         Which of ln σ, g, ln r₀, ln (γ − 1), ln growth are to be found.
+    like
+        A fit nearby, whose places and fluxes are begun with: two steps from there are enough.
     """
-    shared = _to_vector(start)
+    shared = to_vector(start)
     free_at = np.flatnonzero(free)
-    radius_share = calibration.sigma.get("source_radius_m", 0.0) / max(calibration.source_radius_m, 1e-12)
-    own = [np.array([one.u_px, one.v_px, *_flux_and_background(one)]) for one in flares]
-    damping, held = _FIRST_DAMPING, None
-    for _ in range(_MOST_STEPS):
+    prior = _prior_of(calibration)
+    if like is None:
+        own = [np.array([one.u_px, one.v_px, *_flux_and_background(one)]) for one in flares]
+    else:
+        own = list(like.own)
+    damping, held = _FIRST_DAMPING if like is None else 0.0, None
+    for _ in range(_MOST_STEPS if like is None else _FEW_STEPS):
         if held is None:
-            held = _normal_equations(flares, own, shared, calibration, radius_share)
+            held = _normal_equations(flares, own, shared, calibration, prior)
         change, own_changes, covariance = held.step(free_at, damping)
         trial = shared.copy()
         trial[free_at] += change
@@ -116,7 +135,7 @@ def fit_point_spread(
             min(max(x, low), high) for x, (low, high) in zip(trial[2:4], _SHAPE_BOUNDS, strict=True)
         ]
         own_trial = [one + by for one, by in zip(own, own_changes, strict=True)]
-        cost = _cost(flares, own_trial, trial, calibration, radius_share, held.variances_e2)
+        cost = _cost(flares, own_trial, trial, calibration, prior, held.variances_e2)
         if cost <= held.chi2 * (1.0 + 1e-12):
             shared, own = trial, own_trial
             sigma = np.sqrt(np.diagonal(covariance))
@@ -128,23 +147,36 @@ def fit_point_spread(
             damping *= 10.0
             if damping > _MOST_DAMPING:
                 break
-    held = _normal_equations(flares, own, shared, calibration, radius_share)
+    held = _normal_equations(flares, own, shared, calibration, prior)
     _, _, found = held.step(free_at, 0.0)
     covariance = np.zeros((5, 5))
     covariance[np.ix_(free_at, free_at)] = found
     pixels = sum(one.sum_e.size for one in flares)
     freedom = pixels - 4 * len(flares) - len(free_at)
-    return PointSpreadFit(_to_shape(shared), covariance, held.chi2, freedom)
+    return PointSpreadFit(to_shape(shared), covariance, held.chi2, freedom, own)
 
 
-def _to_vector(shape: PointSpreadShape) -> Array:
+def _prior_of(calibration: Calibration) -> tuple[Array, Array]:
+    """Return the middle and the precision of what is known beforehand, shape (5,) each."""
+    middle, precision = np.zeros(5), np.zeros(5)
+    for at, (mean, sigma) in enumerate(_SHAPE_PRIOR, start=2):
+        middle[at], precision[at] = mean, 1.0 / sigma**2
+    radius_sigma_m = calibration.sigma.get("source_radius_m", 0.0)
+    if radius_sigma_m > 0.0:
+        precision[4] = (calibration.source_radius_m / radius_sigma_m) ** 2
+    return middle, precision
+
+
+def to_vector(shape: PointSpreadShape) -> Array:
+    """Return what a fit moves: ln σ, g, ln r₀, ln (γ − 1), ln growth."""
     return np.array([
         math.log(shape.sigma_px), shape.glare_share, math.log(shape.glare_radius_px),
         math.log(shape.glare_exponent - 1.0), math.log(shape.growth),
     ])  # fmt: skip
 
 
-def _to_shape(shared: Array) -> PointSpreadShape:
+def to_shape(shared: Array) -> PointSpreadShape:
+    """Return the shape of what a fit moves."""
     width, share, radius, exponent, growth = shared.tolist()
     return PointSpreadShape(
         math.exp(width), share, math.exp(radius), 1.0 + math.exp(exponent), math.exp(growth)
@@ -195,13 +227,12 @@ def _normal_equations(
     own: Sequence[Array],
     shared: Array,
     calibration: Calibration,
-    radius_share: float,
+    prior: tuple[Array, Array],
 ) -> _Equations:
-    prior, prior_slope = np.zeros((5, 5)), np.zeros(5)
-    if radius_share > 0.0:
-        prior[4, 4] = 1.0 / radius_share**2
-        prior_slope[4] = -shared[4] / radius_share**2
-    chi2, found = float(-prior_slope @ shared), _Equations([], [], [], [], [], prior, prior_slope, 0.0, [])
+    middle, precision = prior
+    off = shared - middle
+    chi2 = float(off @ (precision * off))
+    found = _Equations([], [], [], [], [], np.diag(precision), -precision * off, 0.0, [])
     for flare, one in zip(flares, own, strict=True):
         expected_e, jacobian = _expected(flare, one, shared, calibration)
         variance_e2 = _variance_e2(expected_e, flare, calibration)
@@ -223,11 +254,11 @@ def _cost(
     own: Sequence[Array],
     shared: Array,
     calibration: Calibration,
-    radius_share: float,
+    prior: tuple[Array, Array],
     variances_e2: Sequence[Array],
 ) -> float:
     """Return χ² with the variances held."""
-    total = (shared[4] / radius_share) ** 2 if radius_share > 0.0 else 0.0
+    total = float((shared - prior[0]) @ (prior[1] * (shared - prior[0])))
     for flare, one, variance_e2 in zip(flares, own, variances_e2, strict=True):
         expected_e, _ = _expected(flare, one, shared, calibration)
         total += float(((flare.sum_e - expected_e) ** 2 / variance_e2).sum())
@@ -244,7 +275,7 @@ def _expected(
 ) -> tuple[Array, Array]:
     """Return the expected electrons, and their derivatives by shared and own unknowns, shape (9, pixels)."""
     u_px, v_px, flux_e, background_e = own.tolist()
-    shape, box = _to_shape(shared), flare.box
+    shape, box = to_shape(shared), flare.box
     width_px = shape.sigma_px
     radius_rad = float(angular_radius_rad(flare.range_m, calibration.source_radius_m * shape.growth))
     reach_px = 1.5 * calibration.fx_px * math.tan(radius_rad) + _CORE_SIGMAS * width_px + 2.0

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.calibration.glare_shape import averaged_over_glare
 from perception.calibration.point_spread import (
     HALF_WINDOW_PX,
     PointSpreadFit,
@@ -124,7 +125,7 @@ def calibrate_point_spread(
             flares, calibration, of_share.shape, (True, True, True, True, has_radius_sigma)
         )
         if plain.chi2 - full.chi2 > _GLARE_GAIN and full.shape.glare_share > 0.0:
-            best = full
+            best = averaged_over_glare(flares, calibration, full)
     return _told(best, best is not of_share, calibration, flares)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _STEPS_PER_RADIUS = 3.0
+_MARGIN = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,16 +50,18 @@ def veil_of(image_e: Array, glare: Glare) -> Array:
     from scipy.signal import fftconvolve
 
     step = max(int(glare.radius_px / _STEPS_PER_RADIUS), 1)
-    rows, columns = (math.ceil(size / step) for size in image_e.shape)
+    # Some darkness around, for the veil does not end where the frame does.
+    rows, columns = (math.ceil(size / step) + 2 * _MARGIN for size in image_e.shape)
     padded = np.zeros((rows * step, columns * step))
-    padded[: image_e.shape[0], : image_e.shape[1]] = image_e
+    margin = _MARGIN * step
+    padded[margin : margin + image_e.shape[0], margin : margin + image_e.shape[1]] = image_e
     cells_e = padded.reshape(rows, step, columns, step).sum(axis=(1, 3))
     v = step * np.arange(-rows + 1, rows)[:, None]
     u = step * np.arange(-columns + 1, columns)
     away = (u**2 + v**2) / glare.radius_px**2
     density = (glare.exponent - 1.0) / (math.pi * glare.radius_px**2) * (1.0 + away) ** -glare.exponent
-    spread_e = fftconvolve(cells_e, glare.share * density)
-    spread_e = spread_e[rows - 1 : 2 * rows - 1, columns - 1 : 2 * columns - 1]
-    at = [(np.arange(size) + 0.5) / step - 0.5 for size in image_e.shape]
-    places = np.stack(np.meshgrid(*at, indexing="ij"))
-    return np.asarray(map_coordinates(spread_e, places, order=1, mode="nearest"))
+    spread_e = fftconvolve(cells_e, glare.share * density)[
+        rows - 1 : 2 * rows - 1, columns - 1 : 2 * columns - 1
+    ]
+    at = [(np.arange(size) + 0.5) / step - 0.5 + _MARGIN for size in image_e.shape]
+    return np.asarray(map_coordinates(spread_e, np.stack(np.meshgrid(*at, indexing="ij")), order=3))

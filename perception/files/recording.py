@@ -12,8 +12,9 @@ from typing import Any, Self
 from perception.files.calibration import parse_calibration_document
 from perception.files.entries import MOST_INDEX, MOST_TIME_S, Entry, read_record
 from perception.files.fields import Faults, Place, RecordingError, parse_object, read_text, shown
+from perception.files.offsets import read_offsets
 from perception.files.pictures import Picture, read_picture
-from perception.model.sensor import saturation_dn
+from perception.model.sensor import saturation_dn, without_offsets
 from perception.types import Calibration, FrameKey, RawFrame
 
 FRAMES_FILE = "frames.jsonl"
@@ -223,11 +224,11 @@ class Recording:
         return (self.frame(record) for record in self.records)
 
     def frame(self, record: FrameRecord) -> RawFrame:
-        """Read one frame; errors as `frames`."""
-        path = self.folder / record.file
+        """Read one frame, known offsets of pixels taken off; errors as `frames`."""
+        path, calibration = self.folder / record.file, self.calibrations[record.camera]
         picture = read_picture(path)
-        check_picture(picture, self.calibrations[record.camera], record.gain, Place(str(path)))
-        return _raw_frame(record, picture)
+        check_picture(picture, calibration, record.gain, Place(str(path)))
+        return without_offsets(_raw_frame(record, picture), calibration)
 
 
 def read_recording(folder: str | Path) -> Recording:
@@ -379,5 +380,16 @@ def read_calibrations(folder: str | Path) -> dict[str, Calibration]:
 
 
 def read_calibration_file(path: Path) -> dict[str, Calibration]:
-    """Read a file of calibrations, whatever its name; errors as `read_calibrations`."""
-    return parse_calibration_document(parse_object(read_text(path), Place(str(path))), str(path))
+    """Read a file of calibrations, whatever its name, and the offsets beside it.
+
+    Raises
+    ------
+    RecordingError
+        If the file, or one that it names, is missing or broken.
+    """
+    found = parse_calibration_document(parse_object(read_text(path), Place(str(path))), str(path))
+    for name, known in found.items():
+        if known.offset_file:
+            offsets = read_offsets(path.parent / known.offset_file, (known.height_px, known.width_px))
+            found[name] = replace(known, offset_dn=offsets)
+    return found
