@@ -216,27 +216,6 @@ def point_spread_bounds(glare_share: float, dsnu_e: float) -> dict[str, float]:
     return dict(zip(names, np.sqrt(np.diagonal(np.linalg.inv(total))), strict=True))
 
 
-def range_constant_bound(dsnu_e: float) -> float:
-    """Least σ_K / K from every other range, sizes, places and backgrounds unknown: eight flux measurements."""
-    camera, relative = camera_of(0.0, "any"), []
-    floor_e2 = (
-        camera.sensor.read_noise_e**2 + dsnu_e**2 + 1.0 / (12.0 * camera.sensor.system_gain_dn_per_e**2)
-    )
-    for place in range(0, len(RANGES_M), 2):
-        row, column = np.unravel_index(int(rail_e(0.0, place)[0].argmax()), tuple(_SIZE.values()))
-        at = (slice(int(row) - 24, int(row) + 25), slice(int(column) - 24, int(column) + 25))
-        image = rail_e(0.0, place)[0][at]
-        parts = [image, np.ones_like(image)]
-        for name, low, high in (("du", -0.02, 0.02), ("dv", -0.02, 0.02), ("range", 0.99, 1.01)):
-            ends = [rail_e(0.0, place, **{name: value})[0][at] for value in (high, low)]
-            parts.append(ends[0] - ends[1])
-        jacobian = np.array([one.ravel() for one in parts])
-        variance = image + (camera.sensor.prnu.total * image) ** 2 + floor_e2
-        inverse = np.linalg.inv((jacobian / variance.ravel()) @ jacobian.T)
-        relative += [1.0 / inverse[0, 0]] * REPEATS
-    return 1.0 / math.sqrt(sum(relative))
-
-
 def response_bound(glare_share: float, angle_rad: Array, calibration: Calibration, dsnu_e: float) -> Array:
     """Least σ of the response relative to the axis: a cubic spline in θ² of nine parts, and a tilt.
 

@@ -4,6 +4,7 @@ Every other range is fitted; the ranges between them are held out and judge what
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +19,7 @@ from perception.calibration.range_constant import (
 from perception.calibration.result import CONVERGED_CHANGE, HeldOut, RailCalibration
 from perception.estimators import detect
 from perception.files.fields import RecordingError
-from perception.model.fisher import flare_limit
+from perception.model.fisher import flare_limit, range_causes
 from perception.model.ranging import effective_exposure_s
 from perception.model.sensor import at_gain
 from perception.paper import PaperRegression, regress_paper_range_constant
@@ -189,6 +190,8 @@ def _fit_range_constant(
     with its size, from place to place: how much that spreads is found too.
     """
     m, sigma, ranges_m = [], [], []
+    frames_at = Counter(sighting.range_m for sighting in sightings if sighting.detection)
+    fixed_at: dict[float, float] = {}
     for sighting in sightings:
         found = sighting.detection
         if found is None or not math.isfinite(found.range_sigma_m):
@@ -197,7 +200,11 @@ def _fit_range_constant(
             found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration
         )
         m.append(found.flux_dn / effective_s)
-        sigma.append(m[-1] * 2.0 * found.range_sigma_m / found.range_m)  # σ_d / d = ½ σ_F / F
+        # Offsets and responses of pixels are the same in each frame of a place: more frames do not help.
+        if sighting.range_m not in fixed_at:
+            fixed_at[sighting.range_m] = _fixed_share(sighting, found, calibration)
+        together = math.sqrt(1.0 + (frames_at[sighting.range_m] - 1) * fixed_at[sighting.range_m])
+        sigma.append(m[-1] * 2.0 * found.range_sigma_m / found.range_m * together)  # σ_d / d = ½ σ_F / F
         ranges_m.append(sighting.range_m)
     try:
         if calibration.glare_share > 0.0:
@@ -209,6 +216,22 @@ def _fit_range_constant(
             f"fit, and {error}. Look at the frames: is one source in view, alone, not clipped? Is the first "
             "guess of range_constant_dn_m2_per_s within a factor of 2?"
         ) from error
+
+
+def _fixed_share(sighting: _Sighting, found: Detection, calibration: Calibration) -> float:
+    """Return which share of the flux's variance is fixed about the pixels."""
+    camera = replace(at_gain(calibration, sighting.gain), sigma={})
+    gain = camera.system_gain_dn_per_e
+    if not found.flux_dn > 0.0:
+        return 0.0
+    background_e = max(found.background_dn - sighting.black_level_dn, 0.0) / gain
+    flux_e = found.flux_dn / gain
+    causes = range_causes(camera, found.u_px, found.v_px, sighting.range_m, flux_e, background_e)
+    if causes is None:
+        return 0.0
+    fixed = causes.prnu_m**2 + causes.dsnu_m**2
+    other = (causes.own_light_m, causes.background_m, causes.read_noise_m, causes.rounding_m)
+    return fixed / (fixed + sum(part**2 for part in other))
 
 
 def _fit_paper(sightings: Sequence[_Sighting]) -> PaperRegression | None:
