@@ -137,7 +137,9 @@ def regress_with_spread(
     )
     regress_range_constant(m, sigma, distance)  # says what is wrong with them
     ranges_m, place = np.unique(distance, return_inverse=True)
-    usual = np.array([np.median(sigma[place == number]) for number in range(ranges_m.size)])[place]
+    usual = np.array(
+        [np.quantile(sigma[place == number], 0.5, method="lower") for number in range(ranges_m.size)]
+    )[place]
     weight = 1.0 / np.where(sigma < 2.0 * usual, usual, sigma) ** 2
     total = np.bincount(place, weights=weight)
     mean, own = np.bincount(place, weights=weight * m) / total, 1.0 / np.sqrt(total)
