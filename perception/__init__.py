@@ -20,12 +20,16 @@ stand on `model`: lens, bearing, sensor, ranging, the image of a flare, and in `
 could do. `calibration` finds the constants from frames at known ranges. `types` is the contract.
 """
 
+from perception.calibration.camera import CalibratedCamera, CalibrationFrames, calibrate_camera
+from perception.calibration.dark import DarkCalibration, calibrate_dark
+from perception.calibration.flat import FlatCalibration, calibrate_flat
 from perception.calibration.rail import calibrate_rail
 from perception.calibration.range_constant import (
     RangeConstantFit,
     regress_range_constant,
 )
 from perception.calibration.result import RailCalibration
+from perception.calibration.spread import PointSpreadCalibration, calibrate_point_spread
 from perception.command_estimator import CommandEstimator, CommandProcess, load_command
 from perception.estimators import (
     ESTIMATORS,
@@ -92,13 +96,17 @@ from perception.warm_up import warm_up
 
 __all__ = [
     "ESTIMATORS",
+    "CalibratedCamera",
     "Calibration",
+    "CalibrationFrames",
     "CommandEstimator",
     "CommandProcess",
+    "DarkCalibration",
     "Detection",
     "Estimator",
     "EstimatorError",
     "FlareLimit",
+    "FlatCalibration",
     "FrameRecord",
     "Heard",
     "Measurement",
@@ -110,6 +118,7 @@ __all__ = [
     "PaperRegression",
     "Picture",
     "Pipeline",
+    "PointSpreadCalibration",
     "RailCalibration",
     "RangeConstantFit",
     "RawFrame",
@@ -119,6 +128,10 @@ __all__ = [
     "Signal",
     "Track",
     "Tracker",
+    "calibrate_camera",
+    "calibrate_dark",
+    "calibrate_flat",
+    "calibrate_point_spread",
     "calibrate_rail",
     "calibration_document",
     "detect",

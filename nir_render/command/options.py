@@ -52,6 +52,14 @@ OwnDecoder = Annotated[
         "--decoder", metavar="FILE", help="One's own decoder as file.py:function, in place of those built in."
     ),
 ]
+CalibrationFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        metavar="FILE",
+        help="In place of the folder's calibration.json, such as the calibration.fitted.json of 'calibrate'.",
+    ),
+]
 TimeLimit = Annotated[
     float,
     typer.Option(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nir_render.command.options import (
+    CalibrationFile,
     Estimators,
     FolderArgument,
     Json,
@@ -111,6 +112,7 @@ def perceive(
     estimators: Estimators = None,
     tracker: OwnTracker = None,
     decoder: OwnDecoder = None,
+    calibration: CalibrationFile = None,
     time_limit_s: TimeLimit = 60.0,
     as_json: Json = False,
 ) -> None:
@@ -123,7 +125,9 @@ def perceive(
     chosen = chosen_estimators(estimators, time_limit_s)
     own = OwnParts.of(tracker, decoder)
     with progress_bar("perceive") as progress:
-        perceived = perceive_run(folder, estimators=chosen, progress=progress, own=own)
+        perceived = perceive_run(
+            folder, estimators=chosen, progress=progress, own=own, calibration=calibration
+        )
     if as_json:
         failed = {"failed": dict(perceived.failures)} if perceived.failures else {}
         print_json({"folder": str(folder), "detections": dict(perceived.detections), **failed})
@@ -142,10 +146,10 @@ def evaluate(folder: FolderArgument, as_json: Json = False) -> None:
 
 
 def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
-    """Fit the range constants to frames at known ranges; judge them on every other range, held out."""
+    """Learn a camera from frames of darkness, of an even surface, at known ranges; judge it on others."""
     from nir_render.command.console import note, print_error, print_json
     from nir_render.command.progress import progress_bar
-    from nir_render.command.tables import calibration_table, print_table
+    from nir_render.command.tables import calibration_tables, print_table
     from nir_render.run.calibrate import FITTED_FILE, calibrate_run
 
     with progress_bar("calibrate") as progress:
@@ -156,7 +160,10 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
         print_json({"format": 1, "folder": str(folder), "holds": holds, "cameras": records})
     else:
         for name, camera in cameras.items():
-            print_table(calibration_table(name, camera))
+            for table in calibration_tables(name, camera):
+                print_table(table)
+            for sentence in camera.kept:
+                note(f"{name}: {sentence}")
         if holds:
             typer.echo(f"{folder / FITTED_FILE}: written")
     if not holds:

@@ -11,7 +11,7 @@ from rich.table import Table
 from nir_render.evaluate.metrics import Evaluation, Score
 from nir_render.evaluate.tracks import FEW_SETS
 from nir_render.run.calibrate import CameraCalibration
-from perception.calibration.result import IDEAL_MAE, HeldOut
+from perception.calibration.result import IDEAL_MAE, HeldOut, RailCalibration
 
 _MOST_ROWS = 24
 
@@ -107,9 +107,24 @@ def _filled(
     return table
 
 
-def calibration_table(name: str, camera: CameraCalibration) -> Table:
-    """Return a table of one camera's calibration: the flux, and the paper's mean grey beside it."""
-    result, fit, paper = camera.result, camera.result.fit, camera.result.paper
+def calibration_tables(name: str, camera: CameraCalibration) -> list[Table]:
+    """Return tables of one camera's calibration: what was learned of it, and its range constants."""
+    tables = []
+    if learned := camera.learned():
+        table = Table(title=f"{name}: learned", title_justify="left")
+        for heading in ("", "value", "before"):
+            table.add_column(heading, justify="right" if heading else "left")
+        for what, value, sigma, before in learned:
+            table.add_row(what.replace("_", " "), _plain_with_sigma(value, sigma), f"{before:.6g}")
+        tables.append(table)
+    if camera.result.rail is not None:
+        tables.append(_rail_table(name, camera, camera.result.rail))
+    return tables
+
+
+def _rail_table(name: str, camera: CameraCalibration, result: RailCalibration) -> Table:
+    """Return a table of one camera's range constants: the flux, and the paper's mean grey beside it."""
+    fit, paper = result.fit, result.paper
     table = Table(
         title=f"{name}: {result.places_fitted} ranges fitted, {result.places_held_out} held out",
         title_justify="left",
@@ -175,6 +190,14 @@ def _metres(value: float | None, digits: int = 4) -> str:
 def _cell(held_out: HeldOut, field: str, form: str) -> str:
     value = getattr(held_out, field)
     return form.format(value) if math.isfinite(value) else "–"
+
+
+def _plain_with_sigma(value: float, sigma: float) -> str:
+    """Write both to the sigma's second digit: 0.7002 ± 0.0011."""
+    if not math.isfinite(sigma) or sigma <= 0.0:
+        return f"{value:.4g}"
+    digits = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def _with_sigma(value: float, sigma: float) -> str:

@@ -74,6 +74,20 @@ class DirectTable(_ReadOnly):
         return np.flatnonzero((self.irradiance_per_w > 0.0).any(axis=1))
 
 
+NO_SOURCES = DirectTable(
+    group=np.empty(0, dtype=np.int64),
+    facet=np.empty(0, dtype=np.int64),
+    direction=np.empty((0, 3)),
+    distance_m=np.empty(0),
+    angular_radius_rad=np.empty(0),
+    seen=np.empty((0, 0), dtype=bool),
+    visible_fraction=np.empty(0),
+    irradiance_per_w=np.empty((0, 1)),
+    visibility_rays=0,
+)
+"""The table of a camera that no small source shines on."""
+
+
 @dataclass(frozen=True, eq=False)
 class Edges(_ReadOnly):
     """What keeps the edges of light that was rendered in blocks sharp.

@@ -1,11 +1,13 @@
-"""The stage `calibrate`, from folder to folder: frames at known ranges become calibrated range constants."""
+"""The stage `calibrate`, from folder to folder: frames become the calibration that they tell."""
 
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from nir_render.errors import InputError
 from nir_render.run import folder as run_folder
@@ -16,39 +18,96 @@ from nir_render.scene.load import load_scene
 from nir_render.simulation.calibration import range_constant
 from nir_render.truth.sources import SourceTruth, parse_truth
 from perception import (
+    CalibratedCamera,
+    Calibration,
+    CalibrationFrames,
     RailCalibration,
-    calibrate_rail,
+    Recording,
+    calibrate_camera,
     calibration_document,
     encode_ranges,
-    read_calibrations,
-    read_frame,
-    read_frame_records,
     read_ranges,
+    read_recording,
 )
 from perception.calibration.result import IDEAL_MAE, HeldOut, faults
+from perception.files.offsets import encode_offsets
 from perception.files.ranges import RANGES_FILE
 
 FITTED_FILE = "calibration.fitted.json"
+_OFFSETS = "calibration.fitted.{}.offsets.png"
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """One camera's calibration, what speaks against it, and the true constant of rendered frames."""
+    """What was known of a camera, what was learned, what speaks against it, and K of rendered frames."""
 
-    result: RailCalibration
+    before: Calibration
+    result: CalibratedCamera
     faults: tuple[str, ...]
     true_range_constant_dn_m2_per_s: float | None
 
     @property
     def fitted_to_true(self) -> float | None:
         """Relative error of the fitted constant of the flux."""
-        if self.true_range_constant_dn_m2_per_s is None:
+        if self.true_range_constant_dn_m2_per_s is None or self.result.rail is None:
             return None
-        return self.result.fit.range_constant_dn_m2_per_s / self.true_range_constant_dn_m2_per_s - 1.0
+        found = self.result.rail.fit.range_constant_dn_m2_per_s
+        return found / self.true_range_constant_dn_m2_per_s - 1.0
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """What stayed as it was, and which frames would tell it, a sentence each."""
+        result = self.result
+        missing = {
+            "dark": ("black level, read noise and offsets of pixels", "with the cap on", result.dark),
+            "flat": ("the response over the field", "of an even surface that fills the field", result.flat),
+            "rail": ("range constants, point spread and glare", "at known ranges", result.rail),
+        }
+        return tuple(
+            f"{what} stay as they were: no frame is of kind {kind} (taken {how})"
+            for kind, (what, how, told) in missing.items()
+            if told is None
+        )
 
     def record(self) -> dict[str, Any]:
         """Return the numbers, as JSON has them."""
-        result, fit, paper = self.result, self.result.fit, self.result.paper
+        rail = {} if self.result.rail is None else self._rail_record(self.result.rail)
+        learned = {
+            name: {"value": _or_none(value), "sigma": _or_none(sigma), "before": _or_none(before)}
+            for name, value, sigma, before in self.learned()
+        }
+        return {**rail, "learned": learned, "kept": list(self.kept), "faults": list(self.faults)}
+
+    def learned(self) -> list[tuple[str, float, float, float]]:
+        """Return what was learned beside K: name, value, σ, and what it was before."""
+        known = self.result.calibration
+        rows: list[tuple[str, float, float, float]] = []
+        names: list[str] = []
+        if self.result.dark is not None:
+            names += ["black_level_dn", "read_noise_e"]
+        if self.result.point_spread is not None:
+            names += ["psf_sigma_px", "glare_share"]
+            if self.result.point_spread.has_glare:
+                names += ["glare_radius_px", "glare_exponent"]
+        if self.result.flat is not None:
+            names += ["prnu"]
+        rows += [
+            (name, getattr(known, name), known.sigma.get(name, 0.0), getattr(self.before, name))
+            for name in names
+        ]
+        if (dark := self.result.dark) is not None:
+            rows.append(("dsnu_e", dark.dsnu_e, dark.dsnu_sigma_e, self.before.dsnu_e))
+            rows.append(("dsnu_e, offsets off", known.dsnu_e, 0.0, self.before.dsnu_e))
+        if (flat := self.result.flat) is not None:
+            was = np.interp(flat.angle_rad, self.before.response_angle_rad, self.before.response_relative)
+            at = len(flat.angle_rad) - 2  # the last but one is the frame's corner
+            for label, index in (("half way", at // 2), ("in the corner", at)):
+                row = (float(flat.response[index]), float(flat.response_sigma[index]), float(was[index]))
+                rows.append((f"response {label}", *row))
+        return rows
+
+    def _rail_record(self, result: RailCalibration) -> dict[str, Any]:
+        fit, paper = result.fit, result.paper
         numbers = {
             "range_constant_dn_m2_per_s": fit.range_constant_dn_m2_per_s,
             "range_constant_sigma_dn_m2_per_s": fit.range_constant_sigma_dn_m2_per_s,
@@ -65,6 +124,7 @@ class CameraCalibration:
             "misfits": result.misfits,
             "passes": result.passes,
             "last_change": result.last_change,
+            "share_spread": result.share_spread,
             "range_constant_paper_dn_m2_per_s": paper.slope_dn_m2_per_s if paper else None,
             "range_constant_paper_sigma_dn_m2_per_s": paper.slope_sigma_dn_m2_per_s if paper else None,
             "intercept_paper_dn_per_s": paper.intercept_dn_per_s if paper else None,
@@ -81,70 +141,127 @@ class CameraCalibration:
             **{name: _or_none(value) for name, value in numbers.items()},
             "fitted": {"ranges": result.places_fitted, "frames": result.frames_fitted},
             "held_out": held_out,
-            "faults": list(self.faults),
         }
 
 
 def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibration]:
-    """Calibrate the cameras of a folder whose ranges are known; returns the results by camera.
+    """Calibrate the cameras of a folder from frames of darkness, of an even surface, at known ranges.
 
-    The ranges stand in `ranges.csv`; where a rendered run has none, it is written from the truth. Where
-    nothing speaks against the result, `calibration.fitted.json` is written: the calibration with the fitted
-    constants. Otherwise there is none, also none of an earlier call.
+    What a frame is of says its `kind`. Known ranges stand in `ranges.csv`; where a rendered run has none, it
+    is written from the truth. Where nothing speaks against the result, `calibration.fitted.json` is written:
+    the calibration with what was learned. Otherwise there is none, also none of an earlier call.
 
     Raises
     ------
     InputError
-        The folder is no recording, no ranges are known, or they are too few.
+        The folder is no recording, there is nothing to learn from, or frames do not tell what they are for.
     """
     started = time.perf_counter()
-    (folder / FITTED_FILE).unlink(missing_ok=True)
-    truth = _truth(folder)
+    for old in (folder / FITTED_FILE, *folder.glob(_OFFSETS.format("*"))):
+        old.unlink(missing_ok=True)
     try:
-        calibrations = read_calibrations(folder)
-        records = {(record.camera, record.index): record for record in read_frame_records(folder)}
-        if not (folder / RANGES_FILE).is_file() and truth:
-            run_folder.write_file(folder / RANGES_FILE, encode_ranges(_true_ranges(folder, truth)).encode())
-        ranges_m = read_ranges(folder)
+        recording = _as_taken(read_recording(folder))
+        truth = _truth(recording)
+        frames = _frames(recording, truth)
         done = {}
-        for camera, index in ranges_m:
-            if camera not in calibrations:
-                raise unknown_camera(folder, camera, calibrations)
-            if (camera, index) not in records:
-                raise InputError(
-                    f"{folder / RANGES_FILE}: knows the range of frame {index} of {camera!r}, "
-                    "which is not in frames.jsonl"
-                )
-        for camera in dict.fromkeys(camera for camera, _ in ranges_m):
-            own = {index: range_m for (name, index), range_m in ranges_m.items() if name == camera}
-            result = calibrate_rail(
-                own,
-                lambda index, camera=camera: read_frame(folder, records[camera, index]),  # type: ignore[misc]
-                calibrations[camera],
-                progress,
-            )
+        for camera, of_camera in frames.items():
+            result = calibrate_camera(of_camera, recording.calibrations[camera], progress)
+            speaks = () if result.rail is None else tuple(faults(result.rail))
             done[camera] = CameraCalibration(
-                result, tuple(faults(result)), _true_constant(folder, camera, truth)
+                recording.calibrations[camera], result, speaks, _true_constant(folder, camera, truth)
             )
     except InputError:
         raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
-    if not done:
-        raise InputError(f"{folder / RANGES_FILE}: holds no ranges")
     if not any(camera.faults for camera in done.values()):
-        fitted = {**calibrations, **{name: camera.result.calibration for name, camera in done.items()}}
+        learned = {name: _with_offsets(folder, camera.result.calibration) for name, camera in done.items()}
+        fitted = {**recording.calibrations, **learned}
         run_folder.write_json(folder / FITTED_FILE, calibration_document(fitted.values()))
     note_seconds(folder, "calibrate", started)
     return done
 
 
-def _truth(folder: Path) -> list[SourceTruth]:
+def _as_taken(recording: Recording) -> Recording:
+    """Return a recording that leaves the pixels' offsets in its frames: they are learned anew."""
+    plain = {
+        name: replace(known, offset_dn=None, offset_file="") for name, known in recording.calibrations.items()
+    }
+    return replace(recording, calibrations=plain)
+
+
+def _with_offsets(folder: Path, calibration: Calibration) -> Calibration:
+    """Write the pixels' offsets beside the calibration, which then names them."""
+    if calibration.offset_dn is None:
+        return calibration
+    name = _OFFSETS.format(calibration.camera)
+    run_folder.write_file(folder / name, encode_offsets(calibration.offset_dn))
+    return replace(calibration, offset_file=name)
+
+
+def _frames(recording: Recording, truth: list[SourceTruth]) -> dict[str, CalibrationFrames]:
+    """Return what each camera has to learn from, of the cameras that have anything.
+
+    Frames labelled `rail` are the rail's, without any all that show sources; each has to have a known range
+    where it is labelled so.
+    """
+    folder = recording.folder
+    kinds = {(record.camera, record.index): record.kind for record in recording.records}
+    records = {(record.camera, record.index): record for record in recording.records}
+    has_others = any(kind in ("dark", "flat") for kind in kinds.values())
+    has_rail = any(kind == "rail" for kind in kinds.values())
+    path = folder / RANGES_FILE
+    if not path.is_file() and truth:
+        rows = [row for row in truth if kinds[row.camera, row.index] == ("rail" if has_rail else "scene")]
+        if rows:
+            run_folder.write_file(path, encode_ranges(_true_ranges(folder, rows)).encode())
+    ranges_m = read_ranges(folder) if path.is_file() or has_rail or not has_others else {}
+    if not ranges_m and not has_others:
+        raise InputError(f"{path}: holds no ranges")
+    for camera, index in ranges_m:
+        if camera not in recording.calibrations:
+            raise unknown_camera(folder, camera, recording.calibrations)
+        if (camera, index) not in records:
+            raise InputError(
+                f"{path}: knows the range of frame {index} of {camera!r}, which is not in frames.jsonl"
+            )
+        if kinds[camera, index] in ("dark", "flat"):
+            raise InputError(
+                f"{path}: knows the range of frame {index} of {camera!r}, which frames.jsonl calls "
+                f"{kinds[camera, index]}; correct its `kind`, or take its line out"
+            )
+    unranged = [key for key, kind in kinds.items() if kind == "rail" and key not in ranges_m]
+    if unranged:
+        camera, index = unranged[0]
+        raise InputError(
+            f"{path}: knows no range of frame {index} of {camera!r}, which frames.jsonl calls rail (and of "
+            f"{len(unranged) - 1} more); write it, or leave its `kind` out"
+        )
+    found = {}
+    for camera in dict.fromkeys(camera for camera, _ in kinds):
+        of_kind = {
+            kind: [index for (name, index), its in kinds.items() if (name, its) == (camera, kind)]
+            for kind in ("dark", "flat")
+        }
+        own_m = {index: range_m for (name, index), range_m in ranges_m.items() if name == camera}
+        if own_m or any(of_kind.values()):
+            found[camera] = CalibrationFrames(
+                load=lambda index, camera=camera: recording.frame(records[camera, index]),  # type: ignore[misc]
+                dark=of_kind["dark"],
+                flat=of_kind["flat"],
+                ranges_m=own_m,
+            )
+    return found
+
+
+def _truth(recording: Recording) -> list[SourceTruth]:
     """Return the truth about the sources themselves; a ghost is not what one ranges to."""
-    path = folder / run_folder.TRUTH
+    path = recording.folder / run_folder.TRUTH
     if not path.is_file():
         return []
-    return [row for row in parse_lines(path, parse_truth) if row.ghost_of is None]
+    frames = {(record.camera, record.index) for record in recording.of_sources.records}
+    rows = [row for row in parse_lines(path, parse_truth) if row.ghost_of is None]
+    return [row for row in rows if (row.camera, row.index) in frames]
 
 
 def _true_ranges(folder: Path, truth: list[SourceTruth]) -> dict[tuple[str, int], float]:

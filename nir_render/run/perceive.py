@@ -116,8 +116,11 @@ def perceive_run(
     estimators: Mapping[str, RunEstimator],
     progress: Progress,
     own: OwnParts = OwnParts(),  # noqa: B008
+    calibration: Path | None = None,
 ) -> Perceived:
     """Run estimators over the frames of a folder; write the detections of each that reads them all.
+
+    Dark and flat frames are passed over. `calibration` is a file in place of the folder's own.
 
     One's own that fails on a frame is left out from there on, and the others go on. Of it nothing is written;
     detections of an earlier call stay. `own` are a tracker and a decoder of one's own, for all of them.
@@ -129,7 +132,14 @@ def perceive_run(
     """
     started = time.perf_counter()
     try:
-        recording = read_recording(folder)
+        recording = read_recording(folder).of_sources
+        if calibration is not None:
+            recording = recording.calibrated_by(calibration)
+        if not recording.records:
+            raise InputError(
+                f"{folder / run_folder.FRAMES}: names dark and flat frames only; they are for 'nir-render "
+                "calibrate', and show no source to perceive"
+            )
         found, failures = _read_all(recording, estimators, progress, own)
     except InputError:
         raise

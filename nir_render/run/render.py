@@ -181,7 +181,7 @@ class _FrameWriter:
         """
         frame, light, first = shot.frame, shot.light, None
         file = f"frames/{frame.camera}/{frame.index:06d}.png"
-        if frame.camera not in self._cameras:
+        if frame.camera not in self._cameras and shot.kind != "dark":
             self._cameras.add(frame.camera)
             samples = None if light.indirect is None else sample_facts(light)
             first = {"samples": samples, "enlarging": enlarging_facts(shot)}
@@ -193,7 +193,7 @@ class _FrameWriter:
             camera=frame.camera,
             index=frame.index,
             lines={
-                run_folder.FRAMES: [frame_record(frame, file)],
+                run_folder.FRAMES: [frame_record(frame, file, shot.kind)],
                 run_folder.TRUTH: [row.record() for row in shot.truth],
                 run_folder.LAMPS: [row.record() for row in shot.lamps],
             },
@@ -230,7 +230,8 @@ class _FrameWriter:
         frames, exposures = 0, {}
         for entry in self._journal.entries():
             frames += 1
-            self._cameras.add(entry.camera)
+            if entry.first is not None:
+                self._cameras.add(entry.camera)
             self.lights = entry.lights
             if entry.exposure is not None:
                 exposures[entry.camera] = entry.exposure

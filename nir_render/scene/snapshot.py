@@ -154,6 +154,22 @@ class Snapshot:
             return True
         return reflects_or_scatters(self.shapes, self.materials, self.fog)
 
+    def as_fast_as(self, other: "Snapshot") -> bool:
+        """Tell whether all robots go as fast in another world: else their flares are drawn out otherwise."""
+        pairs = [(other.robots[name].velocity, robot.velocity) for name, robot in self.robots.items()]
+        return all(
+            (one is None) == (its is None)
+            and (
+                one is None
+                or its is None
+                or (
+                    np.array_equal(one.linear_m_per_s, its.linear_m_per_s)
+                    and np.array_equal(one.angular_rad_per_s, its.angular_rad_per_s)
+                )
+            )
+            for one, its in pairs
+        )
+
     def at_wavelength(self, wavelength_m: float) -> "Snapshot":
         """Return the world as it is at one wavelength: materials of numbers alone."""
         if not any(curves_of(material) for material in self.materials.values()):

@@ -147,6 +147,13 @@ def _without_rail(camera: str, device: Camera, sources: tuple[Source, ...]) -> C
         distortion=device.lens.distortion,
         hidden_background=1.0,
     )
+    if (glare := device.point_spread.glare) is not None:
+        known = replace(
+            known,
+            glare_share=glare.share,
+            glare_radius_px=glare.core_radius_px,
+            glare_exponent=glare.exponent,
+        )
     for field in fields(known):
         if isinstance(array := getattr(known, field.name), np.ndarray):
             array.setflags(write=False)

@@ -28,7 +28,7 @@ from nir_render.camera.timing.exposure_control import (
 )
 from nir_render.camera.timing.shutter import mid_exposure_s
 from nir_render.errors import InputError
-from nir_render.light.light import Light
+from nir_render.light.light import NO_SOURCES, Light
 from nir_render.randomness import RandomKey
 from nir_render.scene.documents.camera import MOST_GAIN, AutoExposure, Camera
 from nir_render.scene.scene import Scene
@@ -37,9 +37,11 @@ from nir_render.simulation.frame_times import frame_times, last_of_first
 from nir_render.simulation.lamps import lamp_truth
 from nir_render.simulation.refresh import Refreshed, RefreshError
 from nir_render.simulation.truth import truth_of
+from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.cache import LightCache
 from nir_render.truth.lamps import LampTruth
 from nir_render.truth.sources import SourceTruth
+from perception.files.recording import SCENE_KIND
 from perception.types import RawFrame
 
 _SAME_PLACE = 1e-6  # of the distance, or in metres
@@ -54,7 +56,7 @@ class Shot:
     """A frame, its light, the truth about sources and lamps, its mean without noise, the render's noise.
 
     `exposure` is what the camera's automatic exposure knows after it; None without one. `refresh` is what was
-    measured on the way to it of the error of interpolated light.
+    measured on the way to it of the error of interpolated light. `kind` is what the frame is for.
     """
 
     frame: RawFrame
@@ -65,6 +67,7 @@ class Shot:
     noise: RenderNoise
     exposure: ExposureState | None = None
     refresh: tuple[RefreshError, ...] = ()
+    kind: str = SCENE_KIND
 
 
 @dataclass(frozen=True)
@@ -262,7 +265,8 @@ def simulate(
     `seed` replaces the scene's own. A camera with automatic exposure has settled before its first frame.
     Geometry is as at mid-exposure of a frame's middle row; only the flares of what moves are drawn out along
     their way (`camera/motion_blur.py`). Light is rendered only where geometry is new; `cache` keeps it beyond
-    this run. Frames that a camera drops are taken, for automatic exposure, and not yielded. Those that
+    this run. Frames that a camera drops are taken, for automatic exposure, and not yielded. Dark frames have
+    the cap on, and automatic exposure waits for the next that sees. Those that
     are `begun`, done already, are left out, and the others are as they would be after them.
     """
     run_seed = scene.document.seed if seed is None else seed
@@ -290,8 +294,14 @@ def simulate(
     for index, name in turns:
         _, camera = scene.camera(name)
         control, setting = camera.auto_exposure, own_setting(camera, index)
+        kind = scene.document.clock.calibration.kind_of(index)
         time_s, dropped = float(own_times[name].time_s[index]), bool(own_times[name].dropped[index])
-        if index <= done.get(name, -1) or (dropped and control is None):
+        if index <= done.get(name, -1) or (dropped and (control is None or kind == "dark")):
+            continue
+        if kind == "dark":
+            if control is not None and name in states:
+                setting = states[name].upcoming[0]
+            yield _capped(scene, name, index, time_s, setting, run_seed)
             continue
         if control is not None:
             if name not in states:
@@ -306,7 +316,15 @@ def simulate(
         if refreshed is not None:
             shot = replace(shot, refresh=tuple(refreshed.measured()))
         if not dropped:
-            yield shot
+            yield replace(shot, kind=kind)
+
+
+def _capped(scene: Scene, camera: str, index: int, time_s: float, setting: Setting, seed: int) -> Shot:
+    """Return a frame with the cap on."""
+    light = Light(camera, time_s, seed, (), (BAND_M,), NO_SOURCES, None)
+    rates = electron_rates(light, scene.at(time_s))
+    shot = _shot(light, rates, setting, time_s, RandomKey(seed, "read_out", camera, index))
+    return replace(shot, lamps=(), kind="dark")
 
 
 def frame_of(
@@ -349,28 +367,11 @@ def _refreshed(scene: Scene, seed: int, cache: LightCache) -> Refreshed | None:
 
 def _reused_rates(light: Light, snapshot: Snapshot, kept: Rates | None) -> Rates:
     """Return the rates of a light: those that are kept where it is the same light at another time."""
-    if kept is None or not _as_fast(kept.snapshot, snapshot):
+    if kept is None or not kept.snapshot.as_fast_as(snapshot):
         return electron_rates(light, snapshot)
     if kept.light.indirect is not light.indirect or kept.light.direct is not light.direct:
         return electron_rates(light, snapshot)
     return kept
-
-
-def _as_fast(before: Snapshot, after: Snapshot) -> bool:
-    """Tell whether all robots go as fast in two worlds: else their flares are drawn out otherwise."""
-    pairs = [(before.robots[name].velocity, robot.velocity) for name, robot in after.robots.items()]
-    return all(
-        (one is None) == (other is None)
-        and (
-            one is None
-            or other is None
-            or (
-                np.array_equal(one.linear_m_per_s, other.linear_m_per_s)
-                and np.array_equal(one.angular_rad_per_s, other.angular_rad_per_s)
-            )
-        )
-        for one, other in pairs
-    )
 
 
 def _settled(rates: Rates, control: AutoExposure, time_s: float, period_s: float, seed: int) -> ExposureState:

@@ -4,6 +4,7 @@ Every other range is fitted; the ranges between them are held out and judge what
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,11 +14,12 @@ from numpy.typing import NDArray
 from perception.calibration.range_constant import (
     RangeConstantFit,
     regress_range_constant,
+    regress_with_spread,
 )
 from perception.calibration.result import CONVERGED_CHANGE, HeldOut, RailCalibration
 from perception.estimators import detect
 from perception.files.fields import RecordingError
-from perception.model.fisher import flare_limit
+from perception.model.fisher import flare_limit, range_causes
 from perception.model.ranging import effective_exposure_s
 from perception.model.sensor import at_gain
 from perception.paper import PaperRegression, regress_paper_range_constant
@@ -53,6 +55,7 @@ class _ConvergedFit:
     change: float
     passes: int
     sightings: tuple[_Sighting, ...]
+    share_spread: float
 
 
 FindIn = Callable[[Sequence[int], Calibration, str], list[_Sighting]]
@@ -110,7 +113,7 @@ def calibrate_rail(
     to_judge = [index for place in held_out for index in place]
     converged = _iterate_fit(find, to_fit, calibration)
     paper = _fit_paper(find(to_fit, calibration, "paper"))
-    known = _with_constants(calibration, converged.fit, paper)
+    known = _with_constants(calibration, converged, paper)
     robust = find(to_judge, known, "robust")
     # Without a claim (a clipped flare that cannot be recovered) the range is an upper bound, no estimate.
     claimed = [s for s in robust if s.detection and math.isfinite(s.detection.range_sigma_m)]
@@ -125,20 +128,27 @@ def calibrate_rail(
         misfits=sum(s.detection.merged for s in (*converged.sightings, *robust) if s.detection),
         passes=converged.passes,
         last_change=converged.change,
+        share_spread=converged.share_spread,
         range_limit_m=_mean([_range_limit_m(s, s.detection, known) for s in robust if s.detection]),
         robust=_held_out_errors(claimed),
         paper_held_out=_held_out_errors(find(to_judge, known, "paper")),
     )
 
 
-def _split_places(ranges_m: Mapping[int, float], camera: str) -> tuple[list[list[int]], list[list[int]]]:
-    """Return the frames of the places to fit, and those of the places to judge on."""
+def places_of(ranges_m: Mapping[int, float]) -> list[list[int]]:
+    """Return the frames of each place, a range of its own, in order of range."""
     places: list[list[int]] = []
     for index in sorted(ranges_m, key=lambda index: ranges_m[index]):
         if places and ranges_m[index] - ranges_m[places[-1][0]] < _SAME_PLACE_M:
             places[-1].append(index)
         else:
             places.append([index])
+    return places
+
+
+def _split_places(ranges_m: Mapping[int, float], camera: str) -> tuple[list[list[int]], list[list[int]]]:
+    """Return the frames of the places to fit, and those of the places to judge on."""
+    places = places_of(ranges_m)
     if len(places) < LEAST_PLACES:
         raise RecordingError(
             f"{camera}: {len(places)} different ranges are known. Record at least {LEAST_PLACES}: "
@@ -161,22 +171,27 @@ def _iterate_fit(find: FindIn, indices: Sequence[int], calibration: Calibration)
     known = replace(calibration, sigma={**_without_constants(calibration.sigma), **free_size})
     for passes in range(1, MAX_PASSES + 1):
         sightings = find(indices, known, "robust")
-        fit = _fit_range_constant(sightings, known)
+        fit, share_spread = _fit_range_constant(sightings, known)
         change = fit.range_constant_dn_m2_per_s / known.range_constant_dn_m2_per_s - 1.0
-        converged = _ConvergedFit(fit, change, passes, tuple(sightings))
+        converged = _ConvergedFit(fit, change, passes, tuple(sightings), share_spread)
         if abs(change) < CONVERGED_CHANGE:
             break
         known = replace(known, range_constant_dn_m2_per_s=fit.range_constant_dn_m2_per_s)
     return converged
 
 
-def _fit_range_constant(sightings: Sequence[_Sighting], calibration: Calibration) -> RangeConstantFit:
-    """Regress the flux over its effective exposure.
+def _fit_range_constant(
+    sightings: Sequence[_Sighting], calibration: Calibration
+) -> tuple[RangeConstantFit, float]:
+    """Regress the flux over its effective exposure; return the fit, and how the shares found spread.
 
     Flares that do not look like one source count too, with the wider sigmas that they claim: until K is near,
-    that holds for all of them.
+    that holds for all of them. A detector that knows no glare finds of a flare's light a share that changes
+    with its size, from place to place: how much that spreads is found too.
     """
     m, sigma, ranges_m = [], [], []
+    frames_at = Counter(sighting.range_m for sighting in sightings if sighting.detection)
+    fixed_at: dict[float, float] = {}
     for sighting in sightings:
         found = sighting.detection
         if found is None or not math.isfinite(found.range_sigma_m):
@@ -185,16 +200,38 @@ def _fit_range_constant(sightings: Sequence[_Sighting], calibration: Calibration
             found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration
         )
         m.append(found.flux_dn / effective_s)
-        sigma.append(m[-1] * 2.0 * found.range_sigma_m / found.range_m)  # σ_d / d = ½ σ_F / F
+        # Offsets and responses of pixels are the same in each frame of a place: more frames do not help.
+        if sighting.range_m not in fixed_at:
+            fixed_at[sighting.range_m] = _fixed_share(sighting, found, calibration)
+        together = math.sqrt(1.0 + (frames_at[sighting.range_m] - 1) * fixed_at[sighting.range_m])
+        sigma.append(m[-1] * 2.0 * found.range_sigma_m / found.range_m * together)  # σ_d / d = ½ σ_F / F
         ranges_m.append(sighting.range_m)
     try:
-        return regress_range_constant(m, sigma, ranges_m)
+        if calibration.glare_share > 0.0:
+            return regress_with_spread(m, sigma, ranges_m)
+        return regress_range_constant(m, sigma, ranges_m), 0.0
     except ValueError as error:
         raise RecordingError(
             f"{calibration.camera}: the source was measured in {len(m)} of {len(sightings)} frames to "
             f"fit, and {error}. Look at the frames: is one source in view, alone, not clipped? Is the first "
             "guess of range_constant_dn_m2_per_s within a factor of 2?"
         ) from error
+
+
+def _fixed_share(sighting: _Sighting, found: Detection, calibration: Calibration) -> float:
+    """Return which share of the flux's variance is fixed about the pixels."""
+    camera = replace(at_gain(calibration, sighting.gain), sigma={})
+    gain = camera.system_gain_dn_per_e
+    if not found.flux_dn > 0.0:
+        return 0.0
+    background_e = max(found.background_dn - sighting.black_level_dn, 0.0) / gain
+    flux_e = found.flux_dn / gain
+    causes = range_causes(camera, found.u_px, found.v_px, sighting.range_m, flux_e, background_e)
+    if causes is None:
+        return 0.0
+    fixed = causes.prnu_m**2 + causes.dsnu_m**2
+    other = (causes.own_light_m, causes.background_m, causes.read_noise_m, causes.rounding_m)
+    return fixed / (fixed + sum(part**2 for part in other))
 
 
 def _fit_paper(sightings: Sequence[_Sighting]) -> PaperRegression | None:
@@ -213,10 +250,14 @@ def _without_constants(sigma: Mapping[str, float]) -> dict[str, float]:
 
 
 def _with_constants(
-    calibration: Calibration, fit: RangeConstantFit, paper: PaperRegression | None
+    calibration: Calibration, converged: _ConvergedFit, paper: PaperRegression | None
 ) -> Calibration:
-    sigma = _without_constants(calibration.sigma)
-    sigma["range_constant_dn_m2_per_s"] = fit.range_constant_sigma_dn_m2_per_s
+    fit, sigma = converged.fit, _without_constants(calibration.sigma)
+    sigma["range_constant_dn_m2_per_s"] = math.hypot(
+        fit.range_constant_sigma_dn_m2_per_s, converged.share_spread * fit.range_constant_dn_m2_per_s
+    )
+    if converged.share_spread > 0.0:  # under glare, of which the detector knows nothing, a size is no range
+        sigma["source_radius_m"] = calibration.source_radius_m
     fitted = replace(calibration, range_constant_dn_m2_per_s=fit.range_constant_dn_m2_per_s, sigma=sigma)
     if paper is None:
         return fitted

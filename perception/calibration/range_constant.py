@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+_SPREADS = np.concatenate([[0.0], np.geomspace(1e-4, 0.01, 41)])
+
 INTERCEPT_SIGMAS = 3.0
 """An intercept further from zero than this many of its sigmas says that the flux does not follow 1/d²."""
 
@@ -118,3 +120,36 @@ def regress_range_constant(
         chi2_probability=float(chdtrc(freedom, misfit)),
         measurements=m.size,
     )
+
+
+def regress_with_spread(
+    m_dn_per_s: ArrayLike, sigma_dn_per_s: ArrayLike, range_m: ArrayLike
+) -> tuple[RangeConstantFit, float]:
+    """Fit the range constant where m spreads from place to place by more than its σ; return the spread too.
+
+    Measurements at one range become their weighted mean. Each mean has, beside its own σ, a relative spread
+    τ: that of the largest likelihood, −½ Σ (ln v + r²/v), v = σ² + (τ m)², r about a line through the origin.
+    Measurements of a place count alike, but for those of which the σ is twice the median: these by their own.
+    Parameters and errors as `regress_range_constant`.
+    """
+    m, sigma, distance = np.broadcast_arrays(
+        *(np.atleast_1d(np.asarray(a, dtype=np.float64)) for a in (m_dn_per_s, sigma_dn_per_s, range_m))
+    )
+    regress_range_constant(m, sigma, distance)  # says what is wrong with them
+    ranges_m, place = np.unique(distance, return_inverse=True)
+    usual = np.array(
+        [np.quantile(sigma[place == number], 0.5, method="lower") for number in range(ranges_m.size)]
+    )[place]
+    weight = 1.0 / np.where(sigma < 2.0 * usual, usual, sigma) ** 2
+    total = np.bincount(place, weights=weight)
+    mean, own = np.bincount(place, weights=weight * m) / total, 1.0 / np.sqrt(total)
+
+    def at(spread: float) -> tuple[float, RangeConstantFit]:
+        fit = regress_range_constant(mean, np.hypot(own, spread * mean), ranges_m)
+        expected = fit.range_constant_dn_m2_per_s / ranges_m**2
+        variance = own**2 + (spread * expected) ** 2
+        return float(np.sum(np.log(variance) + (mean - expected) ** 2 / variance)), fit
+
+    trials = [(*at(float(spread)), float(spread)) for spread in _SPREADS]
+    _, fit, spread = min(trials, key=lambda trial: trial[0])
+    return fit, spread

@@ -57,6 +57,9 @@ class RailCalibration:
         In how many frames, fitted or held out, the flare did not look like one source.
     passes, last_change
         How often the frames to fit were looked at, and by how much, relatively, the last look moved K.
+    share_spread
+        Relative σ by which the share of a flare's light that the detector finds differs from place to place,
+        where the lens has glare; it is part of the constant's σ.
     range_limit_m
         Mean Cramér–Rao σ of the range over the frames held out. `IDEAL_MAE` times that is the mean absolute
         error of an ideal estimator.
@@ -74,6 +77,7 @@ class RailCalibration:
     misfits: int
     passes: int
     last_change: float
+    share_spread: float
     range_limit_m: float
     robust: HeldOut
     paper_held_out: HeldOut

@@ -85,6 +85,20 @@ CALIBRATION_ENTRIES = (
         "black, 0 if it sends back as much ambient light as it hides", -10.0, 1.0, default=0.0, sigma=True,
     ),
     Entry(
+        "glare_share", "number", "g: share of all light that the lens scatters far off", 0.0, 0.9,
+        default=0.0, sigma=True,
+    ),
+    Entry(
+        "glare_radius_px", "number", "r₀ of glare, w(r) ∝ (1 + (r / r₀)²)^−γ", 1e-2, 1e5, default=10.0,
+        sigma=True,
+    ),
+    Entry("glare_exponent", "number", "γ of glare", 1.0, 100.0, above=True, default=2.5, sigma=True),
+    Entry(
+        "offset_file", "text",
+        "PNG of 16 bits beside this file: each pixel's fixed offset at gain 1, in counts above 32768; "
+        "`dsnu_e` is what it leaves", default="",
+    ),
+    Entry(
         "own_sources_body_m", "places", "where the robot's own sources sit, in body axes", -1e6, 1e6,
         default=(), sigma=True,
     ),
@@ -137,6 +151,8 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     for name in _ARRAYS:
         record[name] = np.asarray(getattr(calibration, name), dtype=np.float64).tolist()
     record["lens_model"] = calibration.lens_model
+    if calibration.offset_file:
+        record["offset_file"] = calibration.offset_file
     record["distortion"] = [float(number) for number in calibration.distortion]
     for field, sigma in calibration.sigma.items():
         name = _QUATERNION if field == "rotation_body_camera" else field

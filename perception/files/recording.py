@@ -5,19 +5,22 @@ encodes and parses; what writes files to disk safely lives elsewhere.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Self
 
 from perception.files.calibration import parse_calibration_document
 from perception.files.entries import MOST_INDEX, MOST_TIME_S, Entry, read_record
 from perception.files.fields import Faults, Place, RecordingError, parse_object, read_text, shown
+from perception.files.offsets import read_offsets
 from perception.files.pictures import Picture, read_picture
-from perception.model.sensor import saturation_dn
+from perception.model.sensor import saturation_dn, without_offsets
 from perception.types import Calibration, FrameKey, RawFrame
 
 FRAMES_FILE = "frames.jsonl"
 CALIBRATION_FILE = "calibration.json"
+SCENE_KIND = "scene"
+FRAME_KINDS = (SCENE_KIND, "dark", "flat", "rail")
 
 FRAME_ENTRIES = (
     Entry("camera", "text", "name of the camera, `robot.camera`; calibration.json has the same"),
@@ -31,6 +34,12 @@ FRAME_ENTRIES = (
     Entry("gain", "number", "factor on the calibrated system gain; 1 as calibrated", 1e-6, 1e6, above=True),
     Entry("black_level_dn", "number", "mean count of a dark pixel in this frame", -65535.0, 65535.0),
     Entry("file", "text", "the picture, from the recording's folder, with forward slashes; once"),
+    Entry(
+        "kind", "choice",
+        "what it shows: a scene, nothing (cap on), an even surface, one source at a known range; `perceive` "
+        "passes over `dark` and `flat`",
+        choices=FRAME_KINDS, default=SCENE_KIND,
+    ),
 )  # fmt: skip
 """The fields of a line of `frames.jsonl`."""
 
@@ -47,9 +56,15 @@ class FrameRecord:
     gain: float
     black_level_dn: float
     file: str
+    kind: str = SCENE_KIND
+
+    @property
+    def shows_sources(self) -> bool:
+        """Whether there may be sources in it: it was not taken of darkness or of an even surface."""
+        return self.kind not in ("dark", "flat")
 
 
-def frame_record(frame: RawFrame, file: str) -> dict[str, Any]:
+def frame_record(frame: RawFrame, file: str, kind: str = SCENE_KIND) -> dict[str, Any]:
     """Describe a frame as the JSON object of its line in `frames.jsonl`.
 
     Parameters
@@ -58,9 +73,14 @@ def frame_record(frame: RawFrame, file: str) -> dict[str, Any]:
         The frame.
     file
         Where its PNG lies, relative to the recording's folder, with forward slashes.
+    kind
+        What it was taken of, one of `FRAME_KINDS`.
     """
-    taken = {field.name: getattr(frame, field.name) for field in fields(FrameRecord) if field.name != "file"}
-    return {"format": 1, **taken, "file": file}
+    taken = {name: getattr(frame, name) for name in _TAKEN}
+    return {"format": 1, **taken, "file": file, **({} if kind == SCENE_KIND else {"kind": kind})}
+
+
+_TAKEN = tuple(field.name for field in fields(FrameRecord) if field.name not in ("file", "kind"))
 
 
 def parse_frame_record(
@@ -165,6 +185,34 @@ class Recording:
     records: tuple[FrameRecord, ...]
     calibrations: Mapping[str, Calibration]
 
+    @property
+    def of_sources(self) -> Self:
+        """The recording without its dark and flat frames, which serve calibration alone."""
+        return replace(self, records=tuple(record for record in self.records if record.shows_sources))
+
+    def calibrated_by(self, path: Path) -> Self:
+        """Return the recording with the calibrations of another file in place of its own.
+
+        Frames have a black level of their own; it is moved by what the calibrations differ in.
+
+        Raises
+        ------
+        RecordingError
+            If the file is missing or broken, knows no such camera, or does not fit the frames.
+        """
+        calibrations, records = read_calibration_file(path), []
+        for record in self.records:
+            if record.camera in calibrations:
+                old, new = self.calibrations[record.camera], calibrations[record.camera]
+                moved_dn = new.black_level_dn - old.black_level_dn
+                record = replace(record, black_level_dn=record.black_level_dn + moved_dn)
+            records.append(record)
+        faults = Faults()
+        for problem in _contradictions(self.folder, records, path, calibrations):
+            faults.problems += problem.problems
+        faults.raise_any()
+        return replace(self, records=tuple(records), calibrations=calibrations)
+
     def frames(self) -> Iterator[RawFrame]:
         """Read the frames one by one, in the order of `frames.jsonl`.
 
@@ -176,11 +224,11 @@ class Recording:
         return (self.frame(record) for record in self.records)
 
     def frame(self, record: FrameRecord) -> RawFrame:
-        """Read one frame; errors as `frames`."""
-        path = self.folder / record.file
+        """Read one frame, known offsets of pixels taken off; errors as `frames`."""
+        path, calibration = self.folder / record.file, self.calibrations[record.camera]
         picture = read_picture(path)
-        check_picture(picture, self.calibrations[record.camera], record.gain, Place(str(path)))
-        return _raw_frame(record, picture)
+        check_picture(picture, calibration, record.gain, Place(str(path)))
+        return without_offsets(_raw_frame(record, picture), calibration)
 
 
 def read_recording(folder: str | Path) -> Recording:
@@ -202,20 +250,20 @@ def read_recording(folder: str | Path) -> Recording:
         records = _right_records(folder / FRAMES_FILE, faults)
         if not records and len(faults.problems) == told:
             raise Place(str(folder / FRAMES_FILE)).error("names no frame", "Write one line per frame")
-    for problem in _contradictions(folder, records, calibrations):
+    for problem in _contradictions(folder, records, folder / CALIBRATION_FILE, calibrations):
         faults.problems += problem.problems
     faults.raise_any()
     return Recording(folder, tuple(records), calibrations or {})
 
 
 def _contradictions(
-    folder: Path, records: list[FrameRecord], calibrations: Mapping[str, Calibration] | None
+    folder: Path, records: list[FrameRecord], path: Path, calibrations: Mapping[str, Calibration] | None
 ) -> Iterator[RecordingError]:
     """Yield what is wrong between frames, calibrations and pictures."""
     file = Place(str(folder / FRAMES_FILE))
     for camera in dict.fromkeys(record.camera for record in records):
         if calibrations is not None and camera not in calibrations:
-            yield Place(str(folder / CALIBRATION_FILE)).error(
+            yield Place(str(path)).error(
                 f"knows no camera {camera!r}, which {FRAMES_FILE} names; known: "
                 f"{', '.join(calibrations) or 'none'}",
                 "Name the camera so, or calibrate it",
@@ -294,8 +342,8 @@ def read_frame(folder: str | Path, record: FrameRecord) -> RawFrame:
 
 
 def _raw_frame(record: FrameRecord, picture: Picture) -> RawFrame:
-    taken = {name: value for name, value in asdict(record).items() if name != "file"}
-    return RawFrame(data_dn=picture.data_dn, **taken)
+    values = asdict(record)
+    return RawFrame(data_dn=picture.data_dn, **{name: values[name] for name in _TAKEN})
 
 
 def read_frames(folder: str | Path) -> Iterator[RawFrame]:
@@ -328,5 +376,20 @@ def read_calibrations(folder: str | Path) -> dict[str, Calibration]:
     RecordingError
         If `calibration.json` is missing or broken.
     """
-    path = Path(folder) / CALIBRATION_FILE
-    return parse_calibration_document(parse_object(read_text(path), Place(str(path))), str(path))
+    return read_calibration_file(Path(folder) / CALIBRATION_FILE)
+
+
+def read_calibration_file(path: Path) -> dict[str, Calibration]:
+    """Read a file of calibrations, whatever its name, and the offsets beside it.
+
+    Raises
+    ------
+    RecordingError
+        If the file, or one that it names, is missing or broken.
+    """
+    found = parse_calibration_document(parse_object(read_text(path), Place(str(path))), str(path))
+    for name, known in found.items():
+        if known.offset_file:
+            offsets = read_offsets(path.parent / known.offset_file, (known.height_px, known.width_px))
+            found[name] = replace(known, offset_dn=offsets)
+    return found

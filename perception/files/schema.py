@@ -49,6 +49,8 @@ def entry_table(entries: Sequence[Entry]) -> str:
 
 
 def _default(entry: Entry) -> str:
+    if entry.default == "":
+        return "; none where it is missing"
     shown = "[]" if entry.default == () else f"{entry.default:g}" if entry.kind != "choice" else entry.default
     return f"; `{shown}` where it is missing"
 

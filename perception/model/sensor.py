@@ -59,6 +59,24 @@ def gain_dn_per_e(frame: RawFrame, calibration: Calibration) -> float:
     return calibration.system_gain_dn_per_e * frame.gain
 
 
+def without_offsets(frame: RawFrame, calibration: Calibration) -> RawFrame:
+    """Take the pixels' known offsets off a frame; clipped pixels stay as they are.
+
+    Detection, tracking and photometry take a frame whose offsets are off where its calibration knows them.
+    """
+    if calibration.offset_dn is None:
+        return frame
+    offset_dn = calibration.offset_dn
+    if frame.gain != 1.0:
+        offset_dn = np.rint(offset_dn * np.float32(frame.gain)).astype(np.int16)
+    clipped_dn = saturation_dn(calibration, frame.gain)
+    counts = frame.data_dn
+    free = np.clip(counts.astype(np.int32) - offset_dn, 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    # What is clipped must read so, and what is not must not.
+    free = np.where(counts >= clipped_dn, counts, np.minimum(free, np.uint16(clipped_dn - 1)))
+    return replace(frame, data_dn=free)
+
+
 def electrons(frame: RawFrame, calibration: Calibration) -> NDArray[np.float32]:
     """Turn counts above black level into electrons; float32, same shape as the frame."""
     scale = 1.0 / gain_dn_per_e(frame, calibration)

@@ -59,10 +59,17 @@ class Calibration:
     system_gain_dn_per_e, read_noise_e, black_level_dn, saturation_dn, bit_depth
         EMVA 1288 linear model. A pixel at or above `saturation_dn` is clipped.
     dsnu_e, prnu
-        Standard deviations of the pixels' fixed offsets and relative responses (EMVA 1288). Which pixel
-        has which is not known: they add to the noise of a place, and do not average over frames.
+        Standard deviations of the pixels' fixed offsets and relative responses (EMVA 1288), so far as it is
+        not known which pixel has which: they add to the noise of a place, and do not average over frames.
+    offset_dn, offset_file
+        Each pixel's offset from the black level at gain 1, whole counts, int16, shape (rows, columns), where
+        it is known; and the picture that holds it, from the calibration's folder. A `Recording` takes it off
+        its frames as it reads them; elsewhere `without_offsets` does. `dsnu_e` is what it leaves.
     psf_sigma_px
         Standard deviation of the Gaussian point spread function, without the pixel's own aperture.
+    glare_share, glare_radius_px, glare_exponent
+        What share g of all light the lens scatters far off, and how: w(r) = (γ − 1) / (π r₀²)
+        (1 + (r / r₀)²)^−γ. Flares are fitted without it: what of it they find is in the range constant.
     response_angle_rad, response_relative
         Response (filter, vignetting) against field angle (increasing from 0), relative to the axis, shape
         (n,) each.
@@ -116,6 +123,11 @@ class Calibration:
     prnu: float = 0.0
     extinction_per_m: float = 0.0
     hidden_background: float = 0.0
+    offset_dn: NDArray[np.int16] | None = None
+    offset_file: str = ""
+    glare_share: float = 0.0
+    glare_radius_px: float = 10.0
+    glare_exponent: float = 2.5
     own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
 
 

@@ -113,7 +113,8 @@ def _split(lens: Intrinsics, disc: Disc, reach_px: int) -> _Split:
     margin_px = reach_px + _EDGE_PX
     near = np.all((rim > -margin_px) & (rim < _size(lens) + margin_px), axis=1)
     near &= np.isfinite(thickness_px) & np.isfinite(step_px)
-    part, across, along = 1.0, _LEAST_ACROSS, _LEAST_ALONG
+    # A rim that lies beyond the frame all around, or far from it, leaves no edge to see.
+    part, across, along = _SMALL_PART, _LEAST_ACROSS, _LEAST_ALONG
     if near.any():
         part = min(_EDGE_PX / float(thickness_px[near].min()), 1.0)
         thickest_px = part * float(thickness_px[near].max())

@@ -21,6 +21,7 @@ from perception import (
     RawFrame,
     RecordingError,
     calibration_document,
+    read_frame,
     read_picture,
     read_recording,
 )
@@ -249,7 +250,7 @@ def _camera(
         if one.camera == name:
             index = _index_of(one, pictures)
             assert index is not None  # _contradictions has told
-            ranges.append((_frame(folder, records[index]), one.range_m))
+            ranges.append((read_frame(folder, records[index]), one.range_m))
     if ranges:
         constant = from_known_ranges(ranges, calibration, None)
     elif constant is not None:
@@ -263,11 +264,6 @@ def _camera(
     known = replace(calibration, range_constant_dn_m2_per_s=constant.value_dn_m2_per_s, sigma=sigma)
     lines = [{"format": 1, **vars(record)} for record in records]
     return Imported(known, len(records), constant, tuple(assumed), pictures.lossy_sigma_dn), lines
-
-
-def _frame(folder: Path, record: FrameRecord) -> RawFrame:
-    taken = {name: value for name, value in vars(record).items() if name != "file"}
-    return RawFrame(data_dn=read_picture(folder / record.file).data_dn, **taken)
 
 
 def _without_empty(raw: Any) -> Any:

@@ -19,12 +19,48 @@ from nir_render.scene.text.units import TIME
 JITTER_SIGMAS = 3.0
 
 
+class CalibrationFrames(Document):
+    """How many of the first frames are for calibration: `dark`, then `flat`, then `rail`.
+
+    Dark ones are taken with the cap on: no light comes in, and automatic exposure waits. What flat and rail
+    frames show is the scene's business: an even surface that fills the field, one source at known ranges.
+    """
+
+    example: ClassVar[str] = "{dark: 16, flat: 16, rail: 320}"
+
+    dark: Annotated[int, Field(ge=0)] = 0
+    flat: Annotated[int, Field(ge=0)] = 0
+    rail: Annotated[int, Field(ge=0)] = 0
+
+    def kind_of(self, index: int) -> str:
+        """Return the kind of a frame, as `frames.jsonl` has it."""
+        for kind, count in (("dark", self.dark), ("flat", self.flat), ("rail", self.rail)):
+            if index < count:
+                return kind
+            index -= count
+        return "scene"
+
+
 class Clock(Document):
-    """When frames are taken: `frames` of them, at most a million, at `frame_rate` from `start` on."""
+    """When frames are taken: `frames` of them, at most a million, at `frame_rate` from `start` on.
+
+    `calibration` says what the first of them are for; the others, all by default, show the scene.
+    """
 
     frames: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     frame_rate_hz: Annotated[Frequency, Positive] = 30.0
     start_s: Time = 0.0
+    calibration: CalibrationFrames = CalibrationFrames()
+
+    @model_validator(mode="after")
+    def _frames_for_calibration(self) -> Self:
+        first = self.calibration
+        if (count := first.dark + first.flat + first.rail) > self.frames:
+            raise ValueError(
+                f"calibration: {count} frames for it are more than the {self.frames} that are taken; raise "
+                "frames, or take fewer of them"
+            )
+        return self
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
