@@ -13,7 +13,7 @@ def _constant(value_m: float) -> np.ndarray:
 
 
 def test_only_neighbours_in_the_last_minute_count() -> None:
-    swinging = np.asarray(1.1 + 0.02 * (-1.0) ** np.arange(10), dtype=np.float64)  # six of them count, as many up as down
+    swinging = np.asarray(1.1 + 0.02 * (-1.0) ** np.arange(10))  # six of them count, as many up as down
     early = _constant(0.97)
     early[0] = 0.3
     found = spacing(TIMES_S, {("a", "b"): swinging, ("b", "c"): early, ("a", "c"): _constant(1.9)}, 1.0, 0.2)
