@@ -7,6 +7,7 @@ K is not among them: its σ does not know yet that places on a rail share column
 """
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -30,7 +31,7 @@ from tests.calibration_frames import (
 )
 from tests.paths import SCENES
 
-SEEDS = 100
+SEEDS = 100 if "AT_LENGTH" in os.environ else 20  # a hundred take ten minutes: AT_LENGTH=1 make verify
 ANGLES = (8, 24, 40, 56, 64)  # of the 65 in the table: the last is the frame's corner
 LEFT_E = 2.19  # what 16 frames leave of offsets: √(1/(1/4² + 16/10²) + rounding)
 
@@ -132,8 +133,8 @@ def test_of_three_cameras_all_that_is_learned_is_true() -> None:
 
 
 @pytest.mark.verify
-def test_of_a_hundred_cameras_the_intervals_hold_the_truth() -> None:
-    """As above, of 100 seeds."""
+def test_of_many_cameras_the_intervals_hold_the_truth() -> None:
+    """As above, of more seeds."""
     _check(SEEDS)
 
 
