@@ -169,8 +169,8 @@ def _check(built: BuiltSource, settings: Settings) -> None:
         raise InputError(f"photons: {settings.photons} is out of range; wanted 1 to {_MOST_PHOTONS}")
     if not 2 <= settings.polar_steps <= 3600:
         raise InputError("the step of the polar angle is out of range; wanted 0.05 to 90 deg")
-    if settings.azimuths < 2 or settings.azimuths % 2:
-        raise InputError("wanted an even number of azimuths, such as 24")
+    if not 2 <= settings.azimuths <= 3600 or settings.azimuths % 2:
+        raise InputError(f"azimuths: {settings.azimuths} do not do; wanted an even number from 2 to 3600")
     reach_m = built.radius_m if built.board is None else max(built.radius_m, built.board.radius_m)
     reach_m += abs(built.origin_m)
     if not (math.isfinite(settings.distance_m) and settings.distance_m > 2.0 * reach_m):
