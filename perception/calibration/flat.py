@@ -16,7 +16,7 @@ from perception.calibration.veil import Glare, veil_of
 from perception.files.fields import RecordingError
 from perception.model.bearing import angle_from_axis_rad, direction_camera
 from perception.model.lens import distortion_of
-from perception.model.sensor import saturation_dn
+from perception.model.sensor import gain_dn_per_e, saturation_dn, summed_floor_e2
 from perception.types import Calibration, RawFrame
 
 Array = NDArray[np.float64]
@@ -104,10 +104,7 @@ def calibrate_flat(
         )
     angle_rad = angle_from_axis_rad(direction).reshape(shape)
     weight, angle_rad = np.where(usable, weight, 1.0), np.where(usable, angle_rad, 0.0)
-    floor_e2 = stack.frames * (
-        calibration.read_noise_e**2 + 1.0 / (12.0 * calibration.system_gain_dn_per_e**2)
-    )
-    floor_e2 += (stack.frames * calibration.dsnu_e) ** 2
+    floor_e2 = summed_floor_e2(calibration, stack.frames)
 
     def fitted(light_e: Array, like: RadialFit | None = None) -> RadialFit:
         return fit_radial(light_e / weight, weight, angle_rad, usable, floor_e2, like)
@@ -173,7 +170,6 @@ class _Stack:
             if share > _MOST_CLIPPED:
                 clipped, most = clipped + 1, max(most, share)
                 continue
-            gain = calibration.system_gain_dn_per_e * frame.gain
-            total += (frame.data_dn - frame.black_level_dn) / gain
+            total += (frame.data_dn - frame.black_level_dn) / gain_dn_per_e(frame, calibration)
             used += 1
         return _Stack(total, used, clipped, most)

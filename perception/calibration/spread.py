@@ -19,7 +19,7 @@ from perception.calibration.rail import Progress, places_of
 from perception.estimators import detect
 from perception.files.fields import RecordingError
 from perception.model.flare import PixelBox
-from perception.model.sensor import gain_dn_per_e, saturation_dn
+from perception.model.sensor import gain_dn_per_e, saturation_dn, summed_floor_e2
 from perception.types import Calibration, Detection, RawFrame
 
 LEAST_PLACES = 2
@@ -203,8 +203,7 @@ def _sum(
     total = np.zeros((box.height, box.width))
     for frame, _ in group:
         total += (frame.data_dn[box.slices] - frame.black_level_dn) / gain
-    of_one_e2 = calibration.read_noise_e**2 + 1.0 / (12.0 * gain**2)
-    floor_e2 = count * of_one_e2 + (count * calibration.dsnu_e) ** 2
+    floor_e2 = summed_floor_e2(calibration, count, group[0][0].gain)
     return StackedFlare(range_m, count, first.u_px, first.v_px, box, total, floor_e2)
 
 

@@ -95,7 +95,7 @@ def range_from_flux(
     calibration
         K is `range_constant_dn_m2_per_s`, σ_K its entry in `sigma`.
     background_dn
-        Of a pixel beside the flare: the flux lacks what the source hides of it (`hidden_share`).
+        Of a pixel beside the flare: the flux lacks what the source hides of it (`covered_px_at_1_m`).
 
     Returns
     -------
@@ -105,11 +105,12 @@ def range_from_flux(
     at_one_metre_dn = float(flux_at_one_metre_dn(u_px, v_px, exposure_s, gain, calibration))
     if not (flux_dn > 0.0 and at_one_metre_dn > 0.0):
         return Range(math.nan, math.nan)
-    hidden, hidden_sigma = (
-        float(hidden_share(np.array([[u_px, v_px]]), background_dn, at_one_metre_dn, hiding, calibration)[0])
-        for hiding in (calibration.hidden_background, calibration.sigma.get("hidden_background", 0.0))
-    )
-    at_one_metre_dn *= max(1.0 - hidden, LEAST_LEFT)
+    behind = 0.0  # background that the source stands before, over its own flux
+    if background_dn > 0.0:
+        covered = float(covered_px_at_1_m(np.array([[u_px, v_px]]), calibration)[0])
+        behind = covered * background_dn / at_one_metre_dn
+    hidden_sigma = behind * calibration.sigma.get("hidden_background", 0.0)
+    at_one_metre_dn *= max(1.0 - behind * calibration.hidden_background, LEAST_LEFT)
     relative = flux_sigma_dn / flux_dn
     constant_relative = (
         calibration.sigma.get("range_constant_dn_m2_per_s", 0.0) / calibration.range_constant_dn_m2_per_s
@@ -120,31 +121,18 @@ def range_from_flux(
     return Range(range_m, 0.5 * range_m * math.hypot(relative, constant_relative, hidden_sigma))
 
 
-def hidden_share(
-    places_px: Array, background_e: ArrayLike, at_1_m_e: ArrayLike, hiding: float, calibration: Calibration
-) -> Array:
-    """Share of its own flux by which a source dims the background that it stands before, at any range.
+def covered_px_at_1_m(places_px: Array, calibration: Calibration) -> Array:
+    """How many pixels a source would cover from one metre: π r² over the solid angle of a pixel there.
 
-    A sphere of radius r stands before π r²/d² of solid angle, of which each pixel, Ω wide, sees B electrons
-    beside it: π r² B / (Ω F₁) of the flux F₁/d², if it is black. 0 where the radius is not known.
-
-    Parameters
-    ----------
-    places_px
-        Where the flares are, shape (n, 2).
-    background_e, at_1_m_e
-        Of a pixel beside each, and the flux that each would have at one metre, in electrons, shape (n,).
-    hiding
-        Share of the background that it takes away (`Calibration.hidden_background`), or its σ.
+    At d it covers 1/d² of that, as its flux is 1/d² of what it has at one metre: of a background it takes
+    away the same share of its own flux at any range (`Calibration.hidden_background`). Of places of shape
+    (n, 2); 0 where the radius is not known.
     """
     radius_m = calibration.source_radius_m
-    if hiding == 0.0 or not radius_m > 0.0:
+    if not radius_m > 0.0:
         return np.zeros(len(places_px))
     along_u, along_v = pixel_turn(places_px, calibration).swapaxes(0, 1)
-    pixel_sr = np.linalg.norm(np.cross(along_u, along_v), axis=1)
-    behind_e, flux_e = np.maximum(background_e, 0.0), np.asarray(at_1_m_e, dtype=np.float64)
-    share = hiding * math.pi * radius_m**2 * behind_e / pixel_sr / np.where(flux_e > 0.0, flux_e, np.inf)
-    return np.asarray(share)
+    return np.asarray(math.pi * radius_m**2 / np.linalg.norm(np.cross(along_u, along_v), axis=1))
 
 
 def angular_radius_rad(range_m: ArrayLike, source_radius_m: float) -> Array:

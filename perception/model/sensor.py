@@ -102,6 +102,15 @@ def noise_floor_e2(calibration: Calibration, gain: float = 1.0) -> float:
     return calibration.read_noise_e**2 + calibration.dsnu_e**2 + rounding_e2
 
 
+def summed_floor_e2(calibration: Calibration, frames: int, gain: float = 1.0) -> float:
+    """Variance of a dark pixel of a sum of frames, in electrons squared; parameters as `noise_floor_e2`.
+
+    Read noise and rounding grow with the number of frames, fixed offsets with its square.
+    """
+    rounding_e2 = 1.0 / (12.0 * (calibration.system_gain_dn_per_e * gain) ** 2)
+    return frames * (calibration.read_noise_e**2 + rounding_e2) + (frames * calibration.dsnu_e) ** 2
+
+
 def pixel_variance_e2(
     expected_e: NDArray[np.float64], floor_e2: float | NDArray[np.float64], prnu: float
 ) -> NDArray[np.float64]:

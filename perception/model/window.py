@@ -18,7 +18,7 @@ from perception.model.bearing import direction_camera
 from perception.model.flare import is_before
 from perception.model.layout import Known, Sources
 from perception.model.nodes import disc_nodes
-from perception.model.ranging import LEAST_LEFT, angular_radius_rad, exposure_towards, flux_e_of, hidden_share
+from perception.model.ranging import LEAST_LEFT, angular_radius_rad, exposure_towards, flux_e_of
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
@@ -110,7 +110,7 @@ def _share(sigma: float, value: float) -> float:
 
 
 def lay_out(
-    camera: Camera, u_px: Array, v_px: Array, log_range: Array, background_e: Array | None = None
+    camera: Camera, u_px: Array, v_px: Array, log_range: Array, hidden_e: Array | None = None
 ) -> tuple[Sources, NDArray[np.bool_]]:
     """Lay sources out as quadrature nodes, all of them at once.
 
@@ -120,9 +120,9 @@ def lay_out(
         The camera, at the frame's exposure and gain.
     u_px, v_px, log_range
         Places, and the logarithm of the range that each size stands for, shape (sources,).
-    background_e
-        Of a pixel beside each, shape (sources,): of what sources hide their flux is short
-        (`Calibration.hidden_background`). By default it is dark.
+    hidden_e
+        What each would take away of the background from one metre, shape (sources,): so much its flux lacks.
+        By default nothing.
 
     Returns
     -------
@@ -132,10 +132,8 @@ def lay_out(
     direction = direction_camera(np.column_stack([u_px, v_px]), calibration)
     exposed_s = exposure_towards(direction, camera.exposure_s, camera.gain, calibration)
     at_1_m_e = flux_e_of(exposed_s, camera.gain, calibration)
-    if background_e is not None:
-        place_px, hiding = np.column_stack([u_px, v_px]), calibration.hidden_background
-        hidden = hidden_share(place_px, background_e, at_1_m_e, hiding, calibration)
-        at_1_m_e = at_1_m_e * np.maximum(1.0 - hidden, LEAST_LEFT)
+    if hidden_e is not None:
+        at_1_m_e = np.maximum(at_1_m_e - hidden_e, LEAST_LEFT * at_1_m_e)
     radius_rad = angular_radius_rad(np.exp(log_range), camera.radius_m)
     imaged = is_before(direction, radius_rad)
     if not imaged.all():

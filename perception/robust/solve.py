@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from perception.model.flare import PixelBox
 from perception.model.layout import UNUSABLE, Sources, Structure, View, even
 from perception.model.pixels import maximise
-from perception.model.ranging import hidden_share
+from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.goodness import LeftOver, left_over, residual_e
@@ -251,22 +251,21 @@ class _Fit:
 def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
+    hidden_px = _hidden_px_at_1_m(own, camera)
     background_e = np.concatenate([fit.background_e for fit in fits])
-    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]), background_e)
+    hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
+    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]), hidden_e)
     reach_px = laid.reach_px
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
         fit.converged = False
         if imaged[first:end].all():
             fit.climb(laid.part(first, end), reach_px[first:end])
-    own = np.concatenate([fit.own for fit in fits])
-    change = laid.log_range_at - _log_range_by_size(own, fits[0])
+    change = laid.log_range_at - _log_range_by_size(np.concatenate([fit.own for fit in fits]), fits[0])
     moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
-    more_e = np.concatenate([fit.background_e for fit in fits]) - background_e
-    at_1_m_e, known = np.exp(laid.log_flux_at_1_m), camera.calibration
-    moved |= (
-        hidden_share(own[:, :2], abs(more_e), at_1_m_e, abs(known.hidden_background), known) > _HIDDEN_KEPT
-    )
+    if hidden_px is not None:
+        more_e = np.concatenate([fit.background_e for fit in fits]) - background_e
+        moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
     if not moved.any():
         return []
     return [
@@ -274,6 +273,12 @@ def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
         for fit, first, end in zip(fits, [0, *ends], ends, strict=False)
         if fit.converged and moved[first:end].any()
     ]
+
+
+def _hidden_px_at_1_m(own: Array, camera: Camera) -> Array | None:
+    """Return of how many pixels' background each source would take away from one metre; None if of none."""
+    hiding = camera.calibration.hidden_background
+    return hiding * covered_px_at_1_m(own[:, :2], camera.calibration) if hiding else None
 
 
 def _log_range_by_size(own: Array, fit: _Fit) -> Array:
@@ -291,11 +296,12 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     slack = own[:, 3] if fits[0].layout.has_slack else None
     log_range, log_range_sigma, log_range_common = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
-    hidden_e = np.concatenate([fit.background_e for fit in fits])
-    unsure = camera.calibration.sigma.get("hidden_background", 0.0)
-    at_1_m_e = np.exp(log_flux_at_1_m)
-    hidden = 0.5 * hidden_share(own[:, :2], hidden_e, at_1_m_e, unsure, camera.calibration)
-    log_range_sigma, log_range_common = np.hypot(log_range_sigma, hidden), np.hypot(log_range_common, hidden)
+    if unsure := camera.calibration.sigma.get("hidden_background", 0.0):
+        background_e = np.maximum(np.concatenate([fit.background_e for fit in fits]), 0.0)
+        behind_e = covered_px_at_1_m(own[:, :2], camera.calibration) * background_e
+        hidden = 0.5 * unsure * behind_e / np.exp(log_flux_at_1_m)
+        log_range_sigma = np.hypot(log_range_sigma, hidden)
+        log_range_common = np.hypot(log_range_common, hidden)
     flux_e = np.exp(log_flux_at_1_m - 2.0 * own[:, 2])
     flux_sigma_e, ranged = 2.0 * sigma[:, 2] * flux_e, log_flux_at_1_m != 0.0
     solutions, first = [], 0
