@@ -69,8 +69,9 @@ def evaluate_run(folder: Path) -> Evaluation:
         check_frames_known(keys, truth, lamps, detections, calibrations, folder)
         recording = recording.of_sources
         keys = [(record.camera, record.index) for record in recording.records]
-        truth = [row for row in truth if (row.camera, row.index) in set(keys)]
-        lamps = [row for row in lamps if (row.camera, row.index) in set(keys)]
+        judged = set(keys)
+        truth = [row for row in truth if (row.camera, row.index) in judged]
+        lamps = [row for row in lamps if (row.camera, row.index) in judged]
         result = evaluate(keys, truth, calibrations, detections, lamps)
         result = _with_sets(recording, result, truth, detections, lamps)
         result = _with_tracks(recording, result, truth, list(detections))

@@ -19,9 +19,7 @@ from perception.types import Calibration
 _MOUNT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _LEAST_NOISE_DN = 0.1  # a sensor that shows no noise is clipped at black
 _MEASURED_NOISE_SHARE = 0.2  # σ of a read noise that is measured in frames with light in them
-_HIDDEN_SIGMA = (
-    0.5  # a white diffuser sends back about as much ambient light as it hides, or half, or half as much again
-)
+_HIDDEN_SIGMA = 0.5  # a white diffuser sends back about as much ambient light as it hides, to a half
 _ANGLES = 9
 
 
