@@ -130,22 +130,20 @@ def experiment(
     as_json: Json = False,
 ) -> None:
     """Run an experiment of the paper in closed loop: robots move by what they see."""
-    import os
-
     from nir_render.command.console import print_json
     from nir_render.command.progress import progress_bar
     from nir_render.experiments.flocking import Flocking
     from nir_render.experiments.outcome import ARENA, outcome_of
     from nir_render.experiments.page import sentence, write_outcome
+    from nir_render.transport.backend.cores import usual_workers
 
     if not (math.isfinite(seconds) and seconds >= 1.0):
         raise InputError(f"--seconds {seconds:g}: wanted a second or more, such as 120")
     plan = Flocking(law=law.value, level=level.value, stack=stack.value, lasts_s=seconds)
     folder = output if output is not None else Path("outputs") / name.value
     world = read_scene(ARENA if scene is None else scene, settings, None)
-    processes = workers or min(os.cpu_count() or 1, 8)
     with progress_bar(name.value) as progress:
-        outcome = outcome_of(world, plan, range(seeds), folder, processes, progress)
+        outcome = outcome_of(world, plan, range(seeds), folder, workers or usual_workers(), progress)
     page = write_outcome(outcome, folder)
     if as_json:
         print_json({**outcome.record(), "page": str(page)})

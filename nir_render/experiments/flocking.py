@@ -17,8 +17,6 @@ from nir_render.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
-LEVELS = ("frames", "measurements", "truth")
-
 _START_WITHIN_M, _START_APART_M = 1.8, 0.5
 _LEADERS_WAY_M = np.array([[-1.2, -2.2], [-1.2, 1.4], [1.2, 1.4]])
 

@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nir_render.experiments.flocking import Flocking
 from nir_render.experiments.runs import Progress, Run, run_seeds
 from nir_render.scene.scene import Scene
+
+Array = NDArray[np.float64]
 
 ARENA = Path(__file__).parents[1] / "data" / "experiments" / "arena.yaml"
 """The paper's arena."""
@@ -32,15 +35,14 @@ class Outcome:
         """The runs in which all are one flock, and nobody bumped into another."""
         return [run for run in self.runs if run.spacing.valid]
 
-    def errors_m(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def errors_m(self) -> Array:
         """Return the spacing error of each run, infinite where it says nothing."""
-        return np.array([run.spacing.error_m if run.spacing.valid else np.inf for run in self.runs])
+        return _errors_m(self.runs)
 
-    def losses_m(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def losses_m(self) -> Array:
         """Return by how much each run's error is larger than with the truth known."""
-        known = np.array([run.spacing.error_m if run.spacing.valid else np.inf for run in self.by_truth])
         with np.errstate(invalid="ignore"):
-            return np.asarray(self.errors_m() - known)
+            return np.asarray(_errors_m(self.runs) - _errors_m(self.by_truth))
 
     def record(self) -> dict[str, Any]:
         """Return the figures as plain data; null where there is none."""
@@ -76,6 +78,10 @@ def outcome_of(
     by_truth = run_seeds(scene, known, seeds, folder / "truth", workers, lambda *_: None)
     runs = by_truth if plan == known else run_seeds(scene, plan, seeds, folder, workers, progress)
     return Outcome(plan, scene.document.name, runs, by_truth)
+
+
+def _errors_m(runs: Sequence[Run]) -> Array:
+    return np.array([run.spacing.error_m if run.spacing.valid else np.inf for run in runs])
 
 
 def _number(value: Any) -> float | None:

@@ -14,22 +14,20 @@ from typing import Any
 
 import numpy as np
 
-import perception
 from nir_render.errors import InputError
 from nir_render.experiments.flocking import Flocking, Instant, Loop
 from nir_render.experiments.frame_sight import FrameSight
 from nir_render.experiments.spacing import Spacing, spacing
 from nir_render.run.folder import locked, read_json, write_file, write_json
 from nir_render.run.manifest import versions
+from nir_render.run.render import run_digest
 from nir_render.scene.scene import Scene
-from nir_render.transport.cache_key import digest as digest_of
-from nir_render.transport.fingerprint import code_hash, matching
+from nir_render.transport.backend.cores import thread_settings
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done, and of all."""
 
 _SAVED_STEPS = 50
-_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ def run_seeds(
     InputError
         The folder holds runs of another plan, scene or version, or another process works in it.
     """
-    digest = _digest(scene, plan)
+    digest = run_digest(scene, repr(plan))
     kept = folder / "plan.json"
     if kept.exists() and read_json(kept).get("digest") != digest:
         raise InputError(
@@ -150,18 +148,12 @@ def _file(folder: Path, seed: int) -> Path:
     return folder / "runs" / f"{seed:04d}.json"
 
 
-def _digest(scene: Scene, plan: Flocking) -> str:
-    """Return the hash of all that decides the bits of a run."""
-    packages = Path(__file__).parents[1], Path(perception.__file__).parent
-    code = code_hash(*(matching(package, ("**/*.py",)) for package in packages))
-    return digest_of((scene.resolved_yaml(), repr(plan), sorted(versions().items()), code))
-
-
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Let processes that start meanwhile compute with one thread each: more gain nothing here."""
-    before = {name: os.environ.get(name) for name in _POOLS}
-    os.environ.update(dict.fromkeys(_POOLS, "1"))
+    one = {name: str(threads) for name, threads in thread_settings(1).items()}
+    before = {name: os.environ.get(name) for name in one}
+    os.environ.update(one)
     try:
         yield
     finally:

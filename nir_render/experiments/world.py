@@ -86,15 +86,6 @@ class World:
         self.time_s += lasts_s
         self._note()
 
-    def distances_m(self) -> dict[tuple[str, str], float]:
-        """Return how far apart robots are, by pairs of their names."""
-        names = list(self.movers)
-        return {
-            (one, other): float(np.hypot(*(self.movers[one].place_m - self.movers[other].place_m)))
-            for number, one in enumerate(names)
-            for other in names[number + 1 :]
-        }
-
     def _note(self) -> None:
         for name, mover in self.movers.items():
             records = self._records[name]

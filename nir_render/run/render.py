@@ -83,7 +83,8 @@ def render_run(
         calibrations = calibrations_of(scene)
     cache = LightCache() if cache is None else cache
     missed, reused = cache.missed, cache.reused
-    digest = _digest(scene, keep_light)
+    # Files of light speak of each other: they are always begun anew.
+    digest = run_digest(scene, uuid.uuid4().hex if keep_light else "")
     with run_folder.resumed_run_folder(folder, overwrite, digest) as (aside, found):
         with _FrameWriter(aside, keep_light) as writer:
             begun = writer.begun
@@ -111,15 +112,14 @@ def _found_words(folder: Path, found: str, frames: int) -> list[str]:
     return []
 
 
-def _digest(scene: Scene, keep_light: bool) -> str:
-    """Return the hash of all that decides the files of a run; two of one digest are the same bits."""
+def run_digest(scene: Scene, more: str) -> str:
+    """Return the hash of all that decides the files of a run, and of `more`; two of one are the same bits."""
     from nir_render.transport.backend.variant import backend
 
     packages = Path(__file__).parents[1], Path(perception.__file__).parent
     code = code_hash(*(matching(package, _CODE) for package in packages))
     made_by = [f"{name} {version}" for name, version in versions().items()]
-    again = uuid.uuid4().hex if keep_light else ""  # files of light speak of each other: always begun anew
-    return digest_of((scene.resolved_yaml(), backend().variant, backend().compiler, made_by, code, again))
+    return digest_of((scene.resolved_yaml(), backend().variant, backend().compiler, made_by, code, more))
 
 
 def _write_times(scene: Scene, folder: Path) -> None:

@@ -1,6 +1,5 @@
 """A campaign from beginning to end: jobs that are not done yet are done, then the table and the page."""
 
-import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -20,13 +19,13 @@ from nir_render.stress.jobs import Job
 from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
 from nir_render.stress.workers.pool import Work, part_file, run_jobs
+from nir_render.transport.backend.cores import cores, usual_workers
 from nir_render.transport.backend.variant import backend
 
 MANIFEST = "campaign.json"
 TABLE, PAGE, JOBS = "table.parquet", "report.html", "jobs.jsonl"
 _PARTS, _LIGHT, _SCRATCH, _LOCK = "jobs", "light", ".workers", ".lock"
 
-_MOST_WORKERS = 8  # by default: each takes a GiB or more
 
 Progress = Callable[[int, int], None]
 
@@ -95,7 +94,7 @@ def sweep(
         done, failed = len(jobs) - len(missing), dict[str, str]()
         progress(done, len(jobs))
         if missing:
-            workers = min(min(cores(), _MOST_WORKERS) if workers is None else workers, len(missing))
+            workers = min(usual_workers() if workers is None else workers, len(missing))
             kept = folder / _LIGHT if light is None else light
             threads = max(cores() // workers, 1)
             work = Work(campaign.scene, campaign.estimators, parts, kept, light_limit_bytes, threads)
@@ -111,11 +110,6 @@ def sweep(
         for place in (folder, parts, folder / _LIGHT):
             _remove_abandoned(place)
         return _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from nir_render.scene.scene import Scene
 from nir_render.stress.execute import execute
 from nir_render.stress.jobs import Job
 from nir_render.stress.table import read_part, write_part
+from nir_render.transport.backend.cores import thread_settings
 from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
 from perception import Estimator
@@ -78,7 +79,7 @@ def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Ge
     settings = {
         "distributed.scheduler.allowed-failures": _DEATHS,
         "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
-        "distributed.nanny.pre-spawn-environ": _pools(work.threads),
+        "distributed.nanny.pre-spawn-environ": thread_settings(work.threads),
         "temporary-directory": str(scratch),
     }
     try:
@@ -225,9 +226,3 @@ def _fault(future: Future) -> str | None:
     if isinstance(error, KilledWorker):
         return f"{_DEATHS + 1} workers died with it, perhaps for want of memory: fewer --workers need less"
     return f"{type(error).__name__}: {error}"
-
-
-def _pools(threads: int) -> dict[str, int]:
-    """Return what tells libraries that bring threads of their own how many to use."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-    return dict.fromkeys(names, threads)
