@@ -222,6 +222,8 @@ def _judged(
         right = [packet for packet in sent if _is_of(message, packet) and packet.robot != robot]
         if any((packet.robot, packet.source, None) in sources for packet in right):
             continue  # not all of it was in view: neither received nor wrong
+        if not sources and any((robot, packet) not in in_view for packet in right):
+            continue  # a track too far off to follow anybody has the word of one too faint to count
         if any(
             (packet.robot, packet.source) == source[:2] for packet in right for source in sources if source
         ):

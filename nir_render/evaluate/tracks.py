@@ -20,6 +20,7 @@ from nir_render.evaluate.track_errors import Followed, TrueWays, error_numbers
 from nir_render.evaluate.track_metrics import Instant, gospa_m, track_scores
 from nir_render.truth.poses import PoseTruth
 from nir_render.truth.sources import SourceTruth
+from perception.rig.frame_sets import Exposed, frame_sets, mid_exposure_s, robot_of, set_time_s
 from perception.types import Calibration, FrameKey, Track
 
 Values = NDArray[np.float64]
@@ -54,6 +55,22 @@ class TrackEvaluation:
     moments: tuple[Moment, ...]
     summary: Mapping[str, Mapping[str, Any]]
     by_observer: Mapping[str, Mapping[str, Mapping[str, Any]]]
+
+
+def sets_in_time(
+    frames: Iterable[Exposed], calibrations: Mapping[str, Calibration]
+) -> tuple[list[TimedSet], dict[FrameKey, float]]:
+    """Return the sets of frames, and when each frame was taken: `sets` and `taken_s` of `evaluate_tracks`."""
+    listed = list(frames)
+    sets: list[TimedSet] = [
+        (robot_of(each[0].camera), set_time_s(each), [(frame.camera, frame.index) for frame in each])
+        for each in frame_sets(listed)
+    ]
+    taken_s = {
+        (frame.camera, frame.index): mid_exposure_s(frame, calibrations[frame.camera].height_px)
+        for frame in listed
+    }
+    return sets, taken_s
 
 
 def evaluate_tracks(

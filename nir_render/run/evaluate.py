@@ -14,7 +14,7 @@ from nir_render.errors import InputError
 from nir_render.evaluate.messages import MessageEvaluation, evaluate_messages, parse_told
 from nir_render.evaluate.metrics import Evaluation, evaluate
 from nir_render.evaluate.sets import evaluate_sets
-from nir_render.evaluate.tracks import TrackEvaluation, evaluate_tracks
+from nir_render.evaluate.tracks import TrackEvaluation, evaluate_tracks, sets_in_time
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds, parse_lines
 from nir_render.run.perceive import unknown_camera
@@ -36,7 +36,7 @@ from perception import (
     read_frame,
     read_recording,
 )
-from perception.rig.frame_sets import mid_exposure_s, robot_of, set_time_s
+from perception.rig.frame_sets import robot_of
 from perception.types import FrameKey
 
 
@@ -164,16 +164,9 @@ def _with_tracks(
     tracks = run_folder.lines_of(folder, "tracks", names, parse_track)
     if not tracks:
         return result
-    sets = [
-        (robot_of(each[0].camera), set_time_s(each), [(frame.camera, frame.index) for frame in each])
-        for each in frame_sets(recording.records)
-    ]
+    sets, taken_s = sets_in_time(recording.records, recording.calibrations)
     poses_path = folder / run_folder.POSES
     poses = parse_lines(poses_path, parse_pose) if poses_path.is_file() else []
-    taken_s = {
-        (frame.camera, frame.index): mid_exposure_s(frame, recording.calibrations[frame.camera].height_px)
-        for frame in recording.records
-    }
     over_time = evaluate_tracks(sets, truth, recording.calibrations, tracks, poses, taken_s)
     scored: list[TrackEvaluation | MessageEvaluation] = [over_time]
     heard = None

@@ -129,13 +129,17 @@ class Follower:
     def _note_messages(self, messages: Iterable[Message], told_s: float) -> None:
         self._lines["messages"] += [{**message_record(message), "told_s": told_s} for message in messages]
 
-    def write(self, folder: Path) -> None:
-        """Write the files of an estimator: of tracks and what they say only where there were any."""
-        self._lines["signals"] = [
+    def lines(self) -> dict[str, list[Line]]:
+        """Return what was found so far, by what it is of: as `KIND.NAME.jsonl` holds it."""
+        signals = [
             signal_record(signal) for pipeline in self._pipelines.values() for signal in pipeline.signals()
         ]
+        return {**self._lines, "signals": signals}
+
+    def write(self, folder: Path) -> None:
+        """Write the files of an estimator: of tracks and what they say only where there were any."""
         always = ("measurements", "mirrors") + (("messages",) if self._lines["tracks"] else ())
-        for kind, lines in self._lines.items():
+        for kind, lines in self.lines().items():
             if lines or kind in always:
                 run_folder.write_lines(folder / f"{kind}.{self._name}.jsonl", lines)
             else:  # of an earlier call

@@ -39,7 +39,8 @@ class Metric:
     higher_is_better
         A bound is the least that is wanted; else the most, of the metric's absolute value.
     kind
-        Which rows it is made of: each source that counts, or each frame.
+        Which rows it is made of: each source that counts, each frame, each observer's sequence of frames, or
+        each packet that an observer could see.
     root
         Whether the metric is the root of the mean of the terms, or the mean.
     term
@@ -54,7 +55,7 @@ class Metric:
     explained: str
     quantity: Quantity
     higher_is_better: bool
-    kind: Literal["source", "frame"]
+    kind: Literal["source", "frame", "sequence", "packet"]
     root: bool
     term: Callable[[Rows], Values]
     limit: Callable[[Rows], Values] | None = None
@@ -85,6 +86,11 @@ class Bound:
     text: str = ""
 
 
+def _column(name: str) -> Callable[[Rows], Values]:
+    """Return the term that is a column as it stands."""
+    return lambda rows: rows[name].astype(np.float64)
+
+
 def _errors_m(rows: Rows) -> Values:
     return np.where(rows["ranged"].astype(bool), rows["range_error_m"], np.nan)
 
@@ -110,7 +116,7 @@ def _pulls(rows: Rows) -> Values:
 _ALL = (
     Metric(
         "recall", "recall", "share of the countable sources that were found",
-        FRACTION, True, "source", False, lambda rows: rows["found"].astype(np.float64),
+        FRACTION, True, "source", False, _column("found"),
     ),
     Metric(
         "ranged", "sources ranged", "share of the countable sources that were found and given a range",
@@ -150,14 +156,41 @@ _ALL = (
     Metric(
         "false_alarms", "false alarms per frame",
         "mean number of things reported where nothing is; ghosts and lamps are counted apart",
-        FRACTION, False, "frame", False, lambda rows: rows["frame_false_alarms"].astype(np.float64),
+        FRACTION, False, "frame", False, _column("frame_false_alarms"),
+    ),
+    Metric(
+        "hota", "HOTA", "how well robots were followed: detection and association in three dimensions",
+        FRACTION, True, "sequence", False, _column("track_hota"),
+    ),
+    Metric(
+        "idf1", "IDF1", "share of robots and tracks that belong to each other over the whole sequence",
+        FRACTION, True, "sequence", False, _column("track_idf1"),
+    ),
+    Metric(
+        "switches", "identity switches", "times that a robot was followed by another track, per sequence",
+        FRACTION, False, "sequence", False, _column("track_switches"),
+    ),
+    Metric(
+        "received", "packets received", "share of the packets in view that were received as they were sent",
+        FRACTION, True, "packet", False, _column("received"),
+    ),
+    Metric(
+        "wrong_messages", "wrong messages", "messages that nobody sent, per sequence",
+        FRACTION, False, "sequence", False, _column("message_wrong"),
+    ),
+    Metric(
+        "bit_errors", "bit error rate", "share of single bits that are wrong, each decided by itself",
+        FRACTION, False, "sequence", False, _column("message_bit_error_rate"),
     ),
 )  # fmt: skip
 
 METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric in _ALL})
 
-SHARES = ("recall", "ranged")
-"""The metrics that lie between 0 and 1."""
+SHARES = ("recall", "ranged", "hota", "idf1", "received")
+"""The metrics that lie between 0 and 1, of which a bound is the least."""
+
+COUNTS = ("false_alarms", "switches", "wrong_messages", "bit_errors")
+"""The metrics that count what should not be, of which a bound is the most, and may be 0."""
 
 
 def known_metric(name: str) -> str:
@@ -190,9 +223,12 @@ def parse_bound(metric: str, text: object) -> Bound:
         raise ValueError(
             f"{shown(text)} is no share that {known.title} could reach; write one up to 1, such as '95 %'"
         )
-    if metric == "false_alarms" and value < 0.0:
-        raise ValueError(f"{shown(text)} is below 0; write the most false alarms per frame, such as 0.01")
-    if metric not in (*SHARES, "false_alarms") and value <= 0.0:
+    if metric in COUNTS and value < 0.0:
+        most = (
+            "the most false alarms per frame" if metric == "false_alarms" else f"the most: {known.explained}"
+        )
+        raise ValueError(f"{shown(text)} is below 0; write {most}, such as 0.01")
+    if metric not in (*SHARES, *COUNTS) and value <= 0.0:
         example = {"range_rmse_share": "2 %", "range_pull": "1.5"}.get(metric, known.quantity.example)
         raise ValueError(
             f"{shown(text)} is nothing that an error stays below; write one above 0, such as {example!r}"

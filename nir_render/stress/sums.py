@@ -22,6 +22,8 @@ _COLUMNS = {
         "bearing_limit_deg",
     ),
     "frame": ("frame_false_alarms",),
+    "sequence": ("track_hota", "track_idf1", "track_switches", "message_wrong", "message_bit_error_rate"),
+    "packet": ("received",),
 }
 
 

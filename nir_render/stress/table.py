@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 
 from nir_render.run.folder import write_file
 from nir_render.stress.axes import Axis
-from nir_render.stress.execute import Row
+from nir_render.stress.job.sequences import Row
 from nir_render.stress.jobs import Job
 
 _TEXT, _FLAG, _WHOLE, _NUMBER = pa.string(), pa.bool_(), pa.int64(), pa.float64()
@@ -20,7 +20,8 @@ _ROWS = pa.schema(
         ("time_s", _NUMBER),
         ("estimator", _TEXT),
         # frame: one row per frame and estimator; source: one per source in view; ghost: one per mirror image
-        # of a source; false_alarm: one per detection of nothing.
+        # of a source; false_alarm: one per detection of nothing; sequence: one per observer (`camera` names
+        # it) of ten sets of frames or more; packet: one per packet that an observer could see.
         ("kind", _TEXT),
         # Of a frame.
         ("exposure_s", _NUMBER),
@@ -65,6 +66,14 @@ _ROWS = pa.schema(
         ("range_sigma_m", _NUMBER),
         ("range_error_m", _NUMBER),
         ("bearing_error_deg", _NUMBER),
+        # Of a sequence.
+        ("track_hota", _NUMBER),
+        ("track_idf1", _NUMBER),
+        ("track_switches", _WHOLE),
+        ("message_wrong", _WHOLE),
+        ("message_bit_error_rate", _NUMBER),
+        # Of a packet.
+        ("received", _FLAG),
     ]
 )
 _FRAMES_HASH = b"frames_sha256"

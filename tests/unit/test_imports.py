@@ -15,7 +15,7 @@ from tests.paths import ROOT
 FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.command": (),
     "nir_render.experiments": (),
-    "nir_render.stress": ("page", "workers"),
+    "nir_render.stress": ("page", "workers", "job"),
     "nir_render.regress": ("stages",),
     "nir_render.compare": (),
     "nir_render.budget": (),

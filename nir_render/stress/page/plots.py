@@ -163,6 +163,7 @@ def _scale_y(panel: Axes, metric: Metric, values: Values, bound: float | None) -
         panel.yaxis.set_major_locator(FixedLocator((unit * ratio_ticks(low / unit, high / unit)).tolist()))
         panel.yaxis.set_minor_locator(NullLocator())
     else:
-        panel.set_ylim(bottom=0.0)
+        nothing = not known.any() and not bound
+        panel.set_ylim(bottom=0.0, top=1.0 if nothing else None)
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: tick_text(metric.name, value)))
     panel.yaxis.set_minor_formatter(NullFormatter())

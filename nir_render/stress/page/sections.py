@@ -128,8 +128,8 @@ def _capitalised(text: str) -> str:
 
 
 def _counts_key(metric: Metric) -> str:
-    if metric.kind == "frame":
-        return "Below each value stands how many frames there are."
+    if metric.kind != "source":
+        return f"Below each value stands how many {metric.kind}s there are."
     if metric.higher_is_better:
         return "Below each value stands how many sources count there."
     return "Below each value stands of how many sources, of those that count, the figure is."

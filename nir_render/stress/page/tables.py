@@ -20,10 +20,17 @@ _MOST_LABELS = 12
 
 
 def overall_table(sums: JobSums) -> Table:
-    """Return every metric of each estimator, over all jobs, and the limit of the same sources."""
+    """Return every metric of each estimator, over all jobs, and the limit of the same sources.
+
+    Those of what no job had, sequences or packets, are left out.
+    """
     headings = ["", *(word for name in sums.estimators for word in (name, "its limit"))]
     rows = []
     for metric in METRICS.values():
+        if metric.kind in ("sequence", "packet") and not any(
+            sums.by_metric[name, metric.name][COUNT].any() for name in sums.estimators
+        ):
+            continue
         cells: list[str] = [metric.title]
         for name in sums.estimators:
             totals = sums.by_metric[name, metric.name].sum(axis=1)
@@ -58,7 +65,7 @@ def worst_table(
         return None
     headings = ["estimator", *(axis.title for axis in axes), "seed", metric.title]
     headings += ["limit"] if metric.limit else []
-    headings += ["of sources" if metric.kind == "source" else "frames", "look at it"]
+    headings += ["of sources" if metric.kind == "source" else f"{metric.kind}s", "look at it"]
     return Table(headings, rows)
 
 
@@ -128,7 +135,7 @@ def axes_table(axes: Sequence[Axis]) -> Table:
 
 
 def _count_text(metric: Metric, count: int, asked: int) -> str:
-    return str(asked) if metric.kind == "frame" or count == asked else f"{count}/{asked}"
+    return str(asked) if metric.kind != "source" or count == asked else f"{count}/{asked}"
 
 
 def _percent(value: float) -> str:

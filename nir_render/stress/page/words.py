@@ -11,7 +11,7 @@ from nir_render.scene.text.units import ANGLE, LENGTH
 from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.crossings import Edge, Span
-from nir_render.stress.metrics import METRICS, SHARES, Bound
+from nir_render.stress.metrics import COUNTS, METRICS, SHARES, Bound
 from nir_render.stress.reach import Extent, Reach, corners_kept, reaches_of
 from nir_render.stress.sums import job_sums
 
@@ -155,7 +155,7 @@ def _metric_text(name: str, value: float, more: int) -> str:
         return share(value, more=more)
     if name == "range_rmse_share":
         return f"{significant(100.0 * value, 3 + more)} %"
-    if name == "false_alarms":
+    if name in COUNTS:
         return _shortened(significant(value, 2 + more))
     return significant(value, 3 + more)
 

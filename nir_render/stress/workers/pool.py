@@ -24,7 +24,7 @@ from distributed.scheduler import KilledWorker
 from nir_render.errors import InputError
 from nir_render.run.perceive import frame_estimators
 from nir_render.scene.scene import Scene
-from nir_render.stress.execute import execute
+from nir_render.stress.job.execute import execute
 from nir_render.stress.jobs import Job
 from nir_render.stress.table import read_part, write_part
 from nir_render.transport.backend.cores import thread_settings

@@ -82,6 +82,18 @@ def test_what_becomes_of_packets_and_messages() -> None:
     assert numbers["message_latency_max_s"] == pytest.approx(3.0)
 
 
+def test_a_word_of_one_too_faint_to_count_is_neither_received_nor_wrong() -> None:
+    """Track 9 follows nobody: a word of the hidden r5 may well be its; one of r2, which all see, is not."""
+    numbers = _scored(_said(9, 4)).summary["robust"]
+    assert (numbers["message_received"], numbers["message_wrong"]) == (0, 0)
+    numbers = _scored(_said(9, 1), _said(9, 7)).summary["robust"]
+    assert (numbers["message_received"], numbers["message_wrong"], numbers["message_misattributed"]) == (
+        0,
+        2,
+        1,
+    )
+
+
 def test_some_frames_of_a_packet_are_enough() -> None:
     """The last two of its five frames, 1.1 s each; nobody wrote when it was said."""
     numbers = _scored(_said(1, 1, told_s=None, start_s=4.3, end_s=6.5, frames=2)).summary["robust"]

@@ -25,6 +25,7 @@ LAMP = Axis("lamp", "lamp", ("lamps",), ("off", "side", "behind"), ("off", "side
 
 Row = dict[str, Any]
 _SOURCE_NUMBERS = ("true_range_m", "range_limit_m", "bearing_limit_deg", "range_error_m", "bearing_error_deg")
+_SEQUENCE_NUMBERS = ("track_hota", "track_idf1", "message_bit_error_rate")
 _FRAME_NUMBERS = ("exposure_s", "gain", "render_noise_share", "render_noise_target")
 
 
@@ -62,6 +63,17 @@ def frame(false_alarms: int = 0, **changes: Any) -> Row:
     } | changes  # fmt: skip
 
 
+def sequence(hota: float | None, switches: int = 0, **changes: Any) -> Row:
+    return {
+        "kind": "sequence", "camera": "r1", "track_hota": hota, "track_idf1": hota, "track_switches": switches,
+        "message_wrong": 0, "message_bit_error_rate": None,
+    } | changes  # fmt: skip
+
+
+def packet(received: bool) -> Row:
+    return {"kind": "packet", "camera": "r1", "robot": "r2", "source": "top", "received": received}
+
+
 def table(
     axes: Sequence[Axis],
     seeds: int,
@@ -82,10 +94,11 @@ def table(
                 out += [{**own, "estimator": name, **row} for row in rows(at, seed, name)]
     types = {
         **dict.fromkeys(("seed", "index", "frame_false_alarms", "frame_ghosts_reported", "frame_lamps_reported"), pa.int64()),
-        **dict.fromkeys(("countable", "found", "ranged", "saturated"), pa.bool_()),
+        **dict.fromkeys(("track_switches", "message_wrong"), pa.int64()),
+        **dict.fromkeys(("countable", "found", "ranged", "saturated", "received"), pa.bool_()),
         **dict.fromkeys(("job", "estimator", "kind", "camera", "robot", "source"), pa.string()),
         **{f"axis.{axis.name}": pa.string() if axis.values_si is None else pa.float64() for axis in axes},
-        **dict.fromkeys((*_SOURCE_NUMBERS, *_FRAME_NUMBERS), pa.float64()),
+        **dict.fromkeys((*_SOURCE_NUMBERS, *_FRAME_NUMBERS, *_SEQUENCE_NUMBERS), pa.float64()),
     }  # fmt: skip
     return pa.Table.from_pylist(out, schema=pa.schema(list(types.items())))
 

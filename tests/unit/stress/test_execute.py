@@ -1,12 +1,16 @@
 """A job's rows against what `evaluate` says of the same frames."""
 
 import math
+from pathlib import Path
 
 import pytest
 
 import nir_render as nr
 from nir_render.evaluate.metrics import evaluate
-from nir_render.stress.execute import execute
+from nir_render.run.evaluate import evaluate_run
+from nir_render.run.perceive import chosen_estimators, perceive_run
+from nir_render.run.render import render_run
+from nir_render.stress.job.execute import execute
 from perception import ESTIMATORS, detect
 from tests.paths import SCENES
 
@@ -66,3 +70,36 @@ def test_an_estimator_that_sees_ghosts_has_its_false_alarms_in_the_rows() -> Non
     assert alarm["u_px"] == source["u_px"] + 50.0
     assert alarm["range_m"] is None
     assert frame["frame_false_alarms"] == 1
+
+
+TALKING = {
+    "clock": {"frames": 130, "frame_rate": "20 Hz"},
+    "robots.r1.rig.cameras.front.sensor.rows": 120,
+    "robots.r1.rig.cameras.front.sensor.columns": 160,
+    "robots.r2.motion": [],
+    "robots.r2.position": "[2, 0.2, 0] m",
+    "robots.r2.rig.sources.top.drive": {"packets": {"sends": [{"at": "0.4 s", "command": "forward"}]}},
+}
+
+
+def test_sequences_and_packets_are_what_a_run_has_of_them(tmp_path: Path) -> None:
+    """A command of 5.5 s at 2 m: tracks, packets and bits as `run` and `evaluate` have them of the same scene."""
+    scene = nr.load_scene(SCENE, TALKING)
+    rows, _ = execute(scene, {"robust": ESTIMATORS["robust"]})
+    (sequence,) = [row for row in rows if row["kind"] == "sequence"]
+    (packet,) = [row for row in rows if row["kind"] == "packet"]
+    render_run(scene, tmp_path / "run", overwrite=False, progress=lambda *_: None)
+    perceive_run(tmp_path / "run", estimators=chosen_estimators(["robust"]), progress=lambda *_: None)
+    numbers = evaluate_run(tmp_path / "run").summary["estimators"]["robust"]
+    for column in ("track_hota", "track_idf1", "track_switches", "message_wrong", "message_bit_error_rate"):
+        assert sequence[column] == pytest.approx(numbers[column], abs=1e-12), column
+    assert sequence["camera"] == packet["camera"] == "r1"
+    assert sequence["track_hota"] > 0.9
+    assert (numbers["message_sent"], numbers["message_received"]) == (1, 1)
+    assert (packet["robot"], packet["source"], packet["received"]) == ("r2", "top", True)
+
+
+def test_a_few_frames_say_nothing_of_tracks() -> None:
+    scene = nr.load_scene(SCENE, {**TALKING, "clock.frames": 9})
+    rows, _ = execute(scene, {"robust": ESTIMATORS["robust"]})
+    assert {row["kind"] for row in rows} <= {"frame", "source", "ghost", "false_alarm"}

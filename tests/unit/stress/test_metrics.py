@@ -10,7 +10,7 @@ from nir_render.stress.metrics import METRICS, known_metric, parse_bound
 from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, job_sums
 from perception.types import Detection
 from tests.unit.report.cases import calibration, detection, truth
-from tests.unit.stress.synthetic import FOG, Row, frame, source, table
+from tests.unit.stress.synthetic import FOG, Row, frame, packet, sequence, source, table
 
 # Five sources count: found at +3 cm and −4 cm of 2 and 4 m, found without a range, missed, found without a limit.
 # A sixth does not count, a seventh is a ghost, whatever is said of them.
@@ -23,6 +23,9 @@ BY_HAND = [
     source(0.12, true_range_m=8.0, range_limit_m=None, bearing_error_deg=None),
     source(5.0, countable=False),
     source(7.0, kind="ghost"),
+    sequence(0.9, 2, message_wrong=1, message_bit_error_rate=0.01),
+    sequence(0.6, 1),
+    packet(True), packet(True), packet(False),
 ]  # fmt: skip
 
 
@@ -50,6 +53,12 @@ def _pooled(rows: list[Row], name: str) -> tuple[float, float, int, int]:
         ("range_pull", math.sqrt((9 + 4) / 2), 1.0, 2, 5),
         ("bearing_rms", math.radians(0.05 / math.sqrt(3)), math.radians(math.sqrt((1 + 4 + 1) / 3) * 0.01), 3, 5),
         ("false_alarms", 3.0, None, 1, 1),
+        ("hota", 0.75, None, 2, 2),
+        ("idf1", 0.75, None, 2, 2),
+        ("switches", 1.5, None, 2, 2),
+        ("wrong_messages", 0.5, None, 2, 2),
+        ("bit_errors", 0.01, None, 1, 2),  # nothing was sent in the other
+        ("received", 2 / 3, None, 3, 3),
     ],
 )  # fmt: skip
 def test_metrics_worked_out_by_hand(
@@ -125,7 +134,7 @@ def test_metrics_agree_with_evaluate() -> None:
     ("name", "text", "value"),
     [
         ("range_rmse", "5 cm", 0.05), ("recall", "95 %", 0.95), ("ranged", 0.9, 0.9), ("bearing_rms", "0.1 deg", math.radians(0.1)),
-        ("false_alarms", 0, 0.0), ("range_pull", "1.5", 1.5), ("range_rmse_share", "2 %", 0.02), ("recall", "1", 1.0),
+        ("false_alarms", 0, 0.0), ("switches", 0, 0.0), ("received", "95 %", 0.95), ("range_pull", "1.5", 1.5), ("range_rmse_share", "2 %", 0.02), ("recall", "1", 1.0),
     ],
 )  # fmt: skip
 def test_bounds_are_read_with_their_units(name: str, text: object, value: float) -> None:

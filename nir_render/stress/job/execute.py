@@ -1,18 +1,16 @@
-"""One job: a scene rendered and perceived in memory, and what each estimator said of each source, as rows."""
+"""One job: a scene rendered and perceived in memory, and what each estimator said of it, as rows."""
 
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from nir_render.evaluate.metrics import Evaluation, Score, angle_deg, evaluate
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Shot, simulate
+from nir_render.stress.job.sequences import Row, Sequences
 from nir_render.transport.cache import LightCache
 from perception import Calibration, Detection, Estimator, detect
-
-Row = dict[str, Any]
 
 _TRUTH_FIELDS = (
     *(
@@ -47,17 +45,18 @@ def execute(
     """
     rows: list[Row] = []
     hashed = hashlib.sha256()
-    calibrations: dict[str, Calibration] = {}
+    calibrations: dict[str, Calibration] = {camera: calibration(scene, camera) for camera in scene.cameras()}
+    sequences = Sequences(scene, list(estimators), calibrations)
     for shot in simulate(scene, cache=cache):
         camera = shot.frame.camera
         hashed.update(f"{camera} {shot.frame.index}\0".encode() + shot.frame.data_dn.tobytes())
-        if camera not in calibrations:
-            calibrations[camera] = calibration(scene, camera)
         found = {
             name: detect(shot.frame, calibrations[camera], estimator)
             for name, estimator in estimators.items()
         }
         rows += _rows(scene, shot, calibrations[camera], found)
+        sequences.take(shot.frame, shot.truth, found)
+    rows += sequences.rows()
     return rows, hashed.hexdigest()
 
 

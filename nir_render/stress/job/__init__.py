@@ -1,0 +1,1 @@
+"""What one job of a campaign does: renders, perceives, follows, and says what came of it in rows."""
