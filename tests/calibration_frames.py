@@ -216,6 +216,46 @@ def point_spread_bounds(glare_share: float, dsnu_e: float) -> dict[str, float]:
     return dict(zip(names, np.sqrt(np.diagonal(np.linalg.inv(total))), strict=True))
 
 
+def range_constant_bound(dsnu_e: float, calibration: Calibration) -> float:
+    """Least relative σ of K without glare, from every other place: place and background of each are unknown too.
+
+    So is the point spread's width, but for what the whole rail tells of it, and the flat frames tell
+    of pixels what their noise allows. K holds on the axis, so errors of the response at the places are errors of it.
+    """
+    camera = camera_of(0.0, "any")
+    read_e2 = camera.sensor.read_noise_e**2 + 1.0 / (12.0 * camera.sensor.system_gain_dn_per_e**2)
+    light = FLAT * flat_e(0.0)
+    flat_noise = np.sqrt(light + FLAT * read_e2 + (FLAT * dsnu_e) ** 2) / light
+    unknown_prnu = 1.0 / np.hypot(1.0 / camera.sensor.prnu.pixel, 1.0 / flat_noise)
+    total = np.zeros((2, 2))
+    total[1, 1] = point_spread_bounds(0.0, dsnu_e)["sigma_px"] ** -2
+    of_place, angle_rad = [], []
+    for place in range(0, len(RANGES_M), 2):
+        at = _window(place, 0.0)
+        image = REPEATS * rail_e(0.0, place)[0][at]
+
+        def change(
+            name: str, value: float, step: float, place: int = place, at: tuple[slice, slice] = at
+        ) -> Array:
+            high, low = (rail_e(0.0, place, **{name: value + s * step})[0][at] for s in (1, -1))
+            return np.asarray(REPEATS * (high - low) / (2.0 * step))
+
+        own = [change("du", 0.0, 0.02), change("dv", 0.0, 0.02), np.ones_like(image)]
+        jacobian = np.array([one.ravel() for one in (image, change("sigma_px", 0.7, 0.002), *own)])
+        variance = image + (unknown_prnu[at] * image) ** 2 + REPEATS * read_e2 + (REPEATS * dsnu_e) ** 2
+        information = (jacobian / variance.ravel()) @ jacobian.T
+        known = information[:2, :2] - information[:2, 2:] @ np.linalg.solve(
+            information[2:, 2:], information[2:, :2]
+        )
+        total += known
+        of_place.append(float(known[0, 0]))
+        row, column = np.unravel_index(int(rail_e(0.0, place)[0].argmax()), tuple(_SIZE.values()))
+        angle_rad.append(math.hypot(column - calibration.cx_px, row - calibration.cy_px) / calibration.fx_px)
+    share = np.array(of_place) / sum(of_place)
+    of_response = float(share @ response_bound(0.0, np.arctan(angle_rad), calibration, dsnu_e))
+    return math.hypot(math.sqrt(float(np.linalg.inv(total)[0, 0])), of_response)
+
+
 def response_bound(glare_share: float, angle_rad: Array, calibration: Calibration, dsnu_e: float) -> Array:
     """Least σ of the response relative to the axis: a cubic spline in θ² of nine parts, and a tilt.
 

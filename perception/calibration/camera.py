@@ -12,7 +12,7 @@ from perception.calibration.result import RailCalibration
 from perception.calibration.spread import PointSpreadCalibration, calibrate_point_spread
 from perception.calibration.veil import Glare
 from perception.files.fields import RecordingError
-from perception.model.sensor import without_offsets
+from perception.model.sensor import without_offsets, without_response
 from perception.types import Calibration, RawFrame
 
 
@@ -87,7 +87,15 @@ def calibrate_camera(
         flat = calibrate_flat(map(load, frames.flat), known, glare=_glare(known, spread))
         known = flat.calibration
     if frames.ranges_m:
-        rail = calibrate_rail(frames.ranges_m, load, known, progress)
+        even = known if flat is None else replace(known, prnu=flat.unknown_prnu)
+
+        def load_even(index: int) -> RawFrame:
+            frame = load(index)
+            return frame if flat is None else without_response(frame, known, flat.pixel_response)
+
+        of_angle = None if flat is None else flat.response_sigma
+        rail = calibrate_rail(frames.ranges_m, load_even, even, progress, of_angle)
+        rail = replace(rail, calibration=replace(rail.calibration, prnu=known.prnu))
         known = rail.calibration
     return CalibratedCamera(known, dark, flat, spread, rail)
 

@@ -41,6 +41,9 @@ class FlatCalibration:
         The response relative to the axis, and its σ at each angle, shape (n,); held beyond the corner.
     prnu, prnu_sigma
         Spread of the pixels' responses, of rows and columns too, and its σ.
+    pixel_response, unknown_prnu
+        Each pixel's response as far as the frames show it, shape (rows, columns); the spread of what they do
+        not show.
     uneven
         By how much of the mean the surface is brighter at one edge of the frame than at the other.
     frames, clipped
@@ -53,6 +56,8 @@ class FlatCalibration:
     response_sigma: Array
     prnu: float
     prnu_sigma: float
+    pixel_response: Array
+    unknown_prnu: float
     uneven: float
     frames: int
     clipped: int
@@ -128,6 +133,7 @@ def calibrate_flat(
             f"{camera}: the surface of its flat frames is brighter by {abs(fit.tilt):.1%} at one edge "
             "than at the other: hold it square to the lens, nearer, or take a larger diffuser"
         )
+    pixel_response, unknown_prnu = fit.pixel_response()
     prnu, prnu_sigma = math.sqrt(fit.spreads.total), fit.spreads.root_sigma
     corner_rad = table_rad[-1]
     table_rad = np.append(table_rad, _BEYOND_CORNER * corner_rad)
@@ -146,6 +152,8 @@ def calibrate_flat(
         response_sigma=sigma,
         prnu=prnu,
         prnu_sigma=prnu_sigma,
+        pixel_response=pixel_response,
+        unknown_prnu=unknown_prnu,
         uneven=abs(fit.tilt),
         frames=stack.frames,
         clipped=stack.clipped,

@@ -7,7 +7,7 @@ equations are Henderson's (Biometrics 31, 423, 1975): rows are eliminated, colum
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,20 +40,24 @@ class Spreads:
 
 @dataclass(frozen=True, eq=False)
 class RadialFit:
-    """The fit: the spline's coefficients and their covariance, the pixels' spread, the tilt."""
+    """The fit: the spline's coefficients and their covariance, the pixels' spread, the tilt, the residuals.
+
+    `left` is what is left of the frame over f, tilt taken off, `noise` its variance in each pixel, `kept` the
+    pixels that count, shape (rows, columns).
+    """
 
     last_rad: float
     coefficients: Array
     covariance: Array
     spreads: Spreads
     tilt: float
+    left: Array
+    noise: Array
+    kept: NDArray[np.bool_]
 
     def at(self, angle_rad: Array) -> Array:
         """Return f at angles of any shape."""
-        from scipy.interpolate import BSpline
-
-        place = np.clip(angle_rad / self.last_rad, 0.0, 1.0) ** 2
-        return np.asarray(BSpline(_knots(), self.coefficients, _DEGREE)(place))
+        return _radial(self.coefficients, angle_rad, self.last_rad)
 
     def relative(self, angle_rad: Array) -> Array:
         """Return f relative to the axis at angles, shape (n,)."""
@@ -65,6 +69,29 @@ class RadialFit:
         on_axis = float(basis[-1] @ self.coefficients)
         slope = (basis[:-1] - self.relative(angle_rad)[:, None] * basis[-1]) / on_axis
         return np.asarray(np.sqrt(np.maximum(((slope @ self.covariance) * slope).sum(axis=1), 0.0)))
+
+    def pixel_response(self) -> tuple[Array, float]:
+        """Return 1 + ρ + κ + ε of each pixel as far as the frame tells, and the spread of what it does not.
+
+        The best linear prediction: a mean counts as far as its own variance goes beyond that of its noise.
+        Pixels that were left out are taken as any other of their row and column.
+        """
+        pixels, left = self.spreads.pixels, self.left
+        weight = self.kept / (pixels + self.noise)
+        of_row, of_column = np.zeros((left.shape[0], 1)), np.zeros((1, left.shape[1]))
+        row_precision, column_precision = (
+            1.0 / max(one, _LEAST_VARIANCE) for one in (self.spreads.rows, self.spreads.columns)
+        )
+        for _ in range(_PASSES):
+            free = weight * (left - of_column)
+            of_row = free.sum(axis=1, keepdims=True) / (weight.sum(axis=1, keepdims=True) + row_precision)
+            free = weight * (left - of_row)
+            of_column = free.sum(axis=0, keepdims=True) / (
+                weight.sum(axis=0, keepdims=True) + column_precision
+            )
+        shown = self.kept * pixels / (pixels + self.noise)
+        response = 1.0 + of_row + of_column + shown * (left - of_row - of_column)
+        return response, math.sqrt(float(np.mean(((1.0 - shown) * pixels)[self.kept])))
 
 
 def fit_radial(
@@ -102,20 +129,23 @@ def fit_radial(
         noise = np.where(usable, (expected_e + floor_e2) / expected_e**2, 1.0)
         weight = kept / (shape**2 * (spreads.pixels + noise))
         values, covariance = _solution(ratio, shape, weight, angle_rad, last_rad, spreads)
-        fit = RadialFit(
-            last_rad=last_rad,
-            coefficients=values[:-_TILTS],
-            covariance=covariance[:-_TILTS, :-_TILTS],
-            spreads=spreads,
-            tilt=math.hypot(*values[-_TILTS:].tolist()),
-        )
-        shape = np.maximum(fit.at(angle_rad), 1e-12)
+        coefficients = values[:-_TILTS]
+        shape = np.maximum(_radial(coefficients, angle_rad, last_rad), 1e-12)
         left = ratio / shape - 1.0
         left -= values[-2] * _across(ratio.shape[1]) + values[-1] * _across(ratio.shape[0])[:, None]
         spreads = _spreads(left, kept, noise)
-        fit = replace(fit, spreads=spreads)
         kept = usable & (np.abs(left) < _DEFECT_SIGMAS * np.sqrt(spreads.total + noise))
-    return fit
+    tilt = math.hypot(*values[-_TILTS:].tolist())
+    of_radial = covariance[:-_TILTS, :-_TILTS]
+    return RadialFit(last_rad, coefficients, of_radial, spreads, tilt, left, noise, kept)
+
+
+def _radial(coefficients: Array, angle_rad: Array, last_rad: float) -> Array:
+    """Return f at angles of any shape."""
+    from scipy.interpolate import BSpline
+
+    place = np.clip(angle_rad / last_rad, 0.0, 1.0) ** 2
+    return np.asarray(BSpline(_knots(), coefficients, _DEGREE)(place))
 
 
 def _knots() -> Array:

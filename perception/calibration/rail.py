@@ -19,7 +19,9 @@ from perception.calibration.range_constant import (
 from perception.calibration.result import CONVERGED_CHANGE, HeldOut, RailCalibration
 from perception.estimators import detect
 from perception.files.fields import RecordingError
-from perception.model.fisher import flare_limit, range_causes
+from perception.model.bearing import angle_from_axis_rad, direction_camera
+from perception.model.fisher import fixed_influence, flare_limit, range_causes
+from perception.model.flare import PixelBox
 from perception.model.ranging import effective_exposure_s
 from perception.model.sensor import at_gain
 from perception.paper import PaperRegression, regress_paper_range_constant
@@ -55,7 +57,29 @@ class _ConvergedFit:
     change: float
     passes: int
     sightings: tuple[_Sighting, ...]
+    measured: "_Measured"
     share_spread: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """The sightings that count, their flux over effective exposure and its σ, shape (n,), and by what."""
+
+    sightings: Sequence[_Sighting]
+    m_dn_per_s: NDArray[np.float64]
+    sigma_dn_per_s: NDArray[np.float64]
+    calibration: Calibration
+
+    @property
+    def range_m(self) -> NDArray[np.float64]:
+        """Their known ranges, shape (n,)."""
+        return np.array([sighting.range_m for sighting in self.sightings])
+
+    @property
+    def share(self) -> NDArray[np.float64]:
+        """By how much each of them makes K, as a share: of the line through the origin, shape (n,)."""
+        share = self.m_dn_per_s / (self.sigma_dn_per_s**2 * self.range_m**2)
+        return np.asarray(share / share.sum())
 
 
 FindIn = Callable[[Sequence[int], Calibration, str], list[_Sighting]]
@@ -67,6 +91,7 @@ def calibrate_rail(
     load: Callable[[int], RawFrame],
     calibration: Calibration,
     progress: Progress = lambda _done, _total: None,
+    response_sigma: NDArray[np.float64] | None = None,
 ) -> RailCalibration:
     """Fit the range constants of one camera, and judge them on ranges held out.
 
@@ -88,6 +113,9 @@ def calibrate_rail(
         Of the camera. Its range constant is only a first guess.
     progress
         Told how far each pass is.
+    response_sigma
+        σ of the calibration's `response_relative`, where it is known angle by angle: errors of it are much
+        the same for all places of a rail, and K, which holds on the axis, has them.
 
     Returns
     -------
@@ -112,8 +140,11 @@ def calibrate_rail(
     to_fit = [index for place in fitted for index in place]
     to_judge = [index for place in held_out for index in place]
     converged = _iterate_fit(find, to_fit, calibration)
+    shared_share = math.hypot(
+        _pixels_share(converged.measured), _response_share(converged.measured, response_sigma)
+    )
     paper = _fit_paper(find(to_fit, calibration, "paper"))
-    known = _with_constants(calibration, converged, paper)
+    known = _with_constants(calibration, converged, shared_share, paper)
     robust = find(to_judge, known, "robust")
     # Without a claim (a clipped flare that cannot be recovered) the range is an upper bound, no estimate.
     claimed = [s for s in robust if s.detection and math.isfinite(s.detection.range_sigma_m)]
@@ -171,25 +202,23 @@ def _iterate_fit(find: FindIn, indices: Sequence[int], calibration: Calibration)
     known = replace(calibration, sigma={**_without_constants(calibration.sigma), **free_size})
     for passes in range(1, MAX_PASSES + 1):
         sightings = find(indices, known, "robust")
-        fit, share_spread = _fit_range_constant(sightings, known)
+        measured = _measured(sightings, known)
+        fit, share_spread = _fit_range_constant(measured, len(sightings))
         change = fit.range_constant_dn_m2_per_s / known.range_constant_dn_m2_per_s - 1.0
-        converged = _ConvergedFit(fit, change, passes, tuple(sightings), share_spread)
+        converged = _ConvergedFit(fit, change, passes, tuple(sightings), measured, share_spread)
         if abs(change) < CONVERGED_CHANGE:
             break
         known = replace(known, range_constant_dn_m2_per_s=fit.range_constant_dn_m2_per_s)
     return converged
 
 
-def _fit_range_constant(
-    sightings: Sequence[_Sighting], calibration: Calibration
-) -> tuple[RangeConstantFit, float]:
-    """Regress the flux over its effective exposure; return the fit, and how the shares found spread.
+def _measured(sightings: Sequence[_Sighting], calibration: Calibration) -> _Measured:
+    """Return what sightings tell of K.
 
     Flares that do not look like one source count too, with the wider sigmas that they claim: until K is near,
-    that holds for all of them. A detector that knows no glare finds of a flare's light a share that changes
-    with its size, from place to place: how much that spreads is found too.
+    that holds for all of them.
     """
-    m, sigma, ranges_m = [], [], []
+    m, sigma, used = [], [], []
     frames_at = Counter(sighting.range_m for sighting in sightings if sighting.detection)
     fixed_at: dict[float, float] = {}
     for sighting in sightings:
@@ -205,28 +234,85 @@ def _fit_range_constant(
             fixed_at[sighting.range_m] = _fixed_share(sighting, found, calibration)
         together = math.sqrt(1.0 + (frames_at[sighting.range_m] - 1) * fixed_at[sighting.range_m])
         sigma.append(m[-1] * 2.0 * found.range_sigma_m / found.range_m * together)  # σ_d / d = ½ σ_F / F
-        ranges_m.append(sighting.range_m)
+        used.append(sighting)
+    return _Measured(used, np.array(m), np.array(sigma), calibration)
+
+
+def _fit_range_constant(measured: _Measured, sightings: int) -> tuple[RangeConstantFit, float]:
+    """Regress the flux over its effective exposure; return the fit, and how the shares found spread.
+
+    A detector that knows no glare finds of a flare's light a share that changes with its size, from place to
+    place: how much that spreads is found too.
+    """
+    columns = measured.m_dn_per_s, measured.sigma_dn_per_s, measured.range_m
     try:
-        if calibration.glare_share > 0.0:
-            return regress_with_spread(m, sigma, ranges_m)
-        return regress_range_constant(m, sigma, ranges_m), 0.0
+        if measured.calibration.glare_share > 0.0:
+            return regress_with_spread(*columns)
+        return regress_range_constant(*columns), 0.0
     except ValueError as error:
         raise RecordingError(
-            f"{calibration.camera}: the source was measured in {len(m)} of {len(sightings)} frames to "
-            f"fit, and {error}. Look at the frames: is one source in view, alone, not clipped? Is the first "
-            "guess of range_constant_dn_m2_per_s within a factor of 2?"
+            f"{measured.calibration.camera}: the source was measured in {len(measured.sightings)} of "
+            f"{sightings} frames to fit, and {error}. Look at the frames: is one source in view, alone, not "
+            "clipped? Is the first guess of range_constant_dn_m2_per_s within a factor of 2?"
         ) from error
+
+
+def _response_share(measured: _Measured, response_sigma: NDArray[np.float64] | None) -> float:
+    """Return the relative σ of K that comes of the response at the places relative to that on the axis."""
+    if response_sigma is None:
+        return 0.0
+    known = measured.calibration
+    places_px = np.array([(s.detection.u_px, s.detection.v_px) for s in measured.sightings if s.detection])
+    angle_rad = angle_from_axis_rad(direction_camera(places_px, known))
+    relative = response_sigma / known.response_relative
+    return float(measured.share @ np.interp(angle_rad, known.response_angle_rad, relative))
+
+
+def _pixels_share(measured: _Measured) -> float:
+    """Return the relative σ of K that comes of flares on the same pixels, beyond that of each place alone.
+
+    Far along a rail the image hardly moves: what is fixed about its pixels is wrong at all of these places.
+    """
+    known, range_m, share = measured.calibration, measured.range_m, measured.share
+    shape = (known.height_px, known.width_px)
+    all_of, own_e2 = [np.zeros(shape), np.zeros(shape)], [0.0, 0.0]
+    for place_m in np.unique(range_m):
+        at = np.flatnonzero(range_m == place_m)
+        parts = _fixed_influence(measured.sightings[int(at[0])], known)
+        if parts is None:
+            continue
+        box, *of_causes = parts
+        for number, cause in enumerate(of_causes):
+            scaled = float(share[at].sum()) * cause
+            all_of[number][box.slices] += scaled
+            own_e2[number] += float((scaled**2).sum())
+    shared = [float((total**2).sum()) - own for total, own in zip(all_of, own_e2, strict=True)]
+    return math.sqrt(max(known.prnu**2 * shared[0] + known.dsnu_e**2 * shared[1], 0.0))
+
+
+def _fixed_influence(
+    sighting: _Sighting, calibration: Calibration
+) -> tuple[PixelBox, NDArray[np.float64], NDArray[np.float64]] | None:
+    found, camera = sighting.detection, at_gain(calibration, sighting.gain)
+    if found is None or not found.flux_dn > 0.0:
+        return None
+    light_e = _light_e(sighting, found, camera)
+    return fixed_influence(camera, found.u_px, found.v_px, sighting.range_m, *light_e)
+
+
+def _light_e(sighting: _Sighting, found: Detection, camera: Calibration) -> tuple[float, float]:
+    """Return flux and background in electrons, by a camera's calibration at the frame's gain."""
+    gain = camera.system_gain_dn_per_e
+    return found.flux_dn / gain, max(found.background_dn - sighting.black_level_dn, 0.0) / gain
 
 
 def _fixed_share(sighting: _Sighting, found: Detection, calibration: Calibration) -> float:
     """Return which share of the flux's variance is fixed about the pixels."""
     camera = replace(at_gain(calibration, sighting.gain), sigma={})
-    gain = camera.system_gain_dn_per_e
     if not found.flux_dn > 0.0:
         return 0.0
-    background_e = max(found.background_dn - sighting.black_level_dn, 0.0) / gain
-    flux_e = found.flux_dn / gain
-    causes = range_causes(camera, found.u_px, found.v_px, sighting.range_m, flux_e, background_e)
+    light_e = _light_e(sighting, found, camera)
+    causes = range_causes(camera, found.u_px, found.v_px, sighting.range_m, *light_e)
     if causes is None:
         return 0.0
     fixed = causes.prnu_m**2 + causes.dsnu_m**2
@@ -250,11 +336,12 @@ def _without_constants(sigma: Mapping[str, float]) -> dict[str, float]:
 
 
 def _with_constants(
-    calibration: Calibration, converged: _ConvergedFit, paper: PaperRegression | None
+    calibration: Calibration, converged: _ConvergedFit, shared_share: float, paper: PaperRegression | None
 ) -> Calibration:
     fit, sigma = converged.fit, _without_constants(calibration.sigma)
+    share = math.hypot(converged.share_spread, shared_share)
     sigma["range_constant_dn_m2_per_s"] = math.hypot(
-        fit.range_constant_sigma_dn_m2_per_s, converged.share_spread * fit.range_constant_dn_m2_per_s
+        fit.range_constant_sigma_dn_m2_per_s, share * fit.range_constant_dn_m2_per_s
     )
     if converged.share_spread > 0.0:  # under glare, of which the detector knows nothing, a size is no range
         sigma["source_radius_m"] = calibration.source_radius_m
@@ -288,14 +375,14 @@ def _range_limit_m(sighting: _Sighting, found: Detection, calibration: Calibrati
         effective_exposure_s(found.u_px, found.v_px, sighting.exposure_s, sighting.gain, calibration)
     )
     flux_dn = calibration.range_constant_dn_m2_per_s * effective_s / sighting.range_m**2
-    background_dn = max(found.background_dn - sighting.black_level_dn, 0.0)
+    _, background_e = _light_e(sighting, found, same_camera)
     limit = flare_limit(
         same_camera,
         found.u_px,
         found.v_px,
         sighting.range_m,
         flux_dn / same_camera.system_gain_dn_per_e,
-        background_dn / same_camera.system_gain_dn_per_e,
+        background_e,
     )
     return limit.range_sigma_m
 

@@ -58,9 +58,14 @@ class RangeCauses:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What the pixels that tell anything, shape (pixels,), tell of flares; `inverse` has the priors in it."""
+    """What the pixels that tell anything, shape (pixels,), tell of flares; `inverse` has the priors in it.
+
+    `used` are these among those of the box, shape (rows, columns).
+    """
 
     camera: Camera
+    box: PixelBox
+    used: NDArray[np.bool_]
     layout: Layout
     jacobian: NDArray[np.float64]
     expected_e: NDArray[np.float64]
@@ -267,6 +272,30 @@ def range_causes(
     return RangeCauses(*[range_m * share for share in (*noise, constant, radius, width)])
 
 
+def fixed_influence(
+    calibration: Calibration, u_px: float, v_px: float, range_m: float, flux_e: float, background_e: float
+) -> tuple[PixelBox, NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return by how much ln F of the efficient estimate changes with what is fixed about pixels.
+
+    Returns
+    -------
+    The pixels, and for each the change with its relative response and with its offset in electrons, shape
+    (rows, columns); None where the flare cannot be ranged, or is too large. Parameters as `flare_limit`.
+    """
+    radius_rad = float(angular_radius_rad(range_m, calibration.source_radius_m))
+    if float(image_radius_px(u_px, v_px, radius_rad, calibration)) > WIDE_PX:
+        return None
+    place = np.array([[u_px, v_px, range_m, flux_e]], dtype=np.float64)
+    known = _known(calibration, place, background_e, True, None)
+    if known is None:
+        return None
+    of_offset, of_response = np.zeros(known.used.shape), np.zeros(known.used.shape)
+    weight = (known.inverse[2] @ known.jacobian) * known.telling / known.variance_e2
+    of_offset[known.used] = -2.0 * weight  # ln F is −2 ln d
+    of_response[known.used] = -2.0 * weight * np.maximum(known.expected_e, 0.0)
+    return known.box, of_response, of_offset
+
+
 def _known(
     calibration: Calibration,
     place: NDArray[np.float64],
@@ -302,7 +331,8 @@ def _known(
     inverse = covariance(fisher_information(jacobian, variance_e2 / telling) + layout.prior(structure))
     if inverse is None:
         return None
-    return _Known(camera, layout, jacobian, expected_e, variance_e2, telling, inverse)
+    used = used.reshape(box.height, box.width)
+    return _Known(camera, box, used, layout, jacobian, expected_e, variance_e2, telling, inverse)
 
 
 def limit_box(

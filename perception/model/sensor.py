@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,12 +70,22 @@ def without_offsets(frame: RawFrame, calibration: Calibration) -> RawFrame:
     offset_dn = calibration.offset_dn
     if frame.gain != 1.0:
         offset_dn = np.rint(offset_dn * np.float32(frame.gain)).astype(np.int16)
+    return _with_unclipped(frame, frame.data_dn.astype(np.int32) - offset_dn, calibration)
+
+
+def without_response(
+    frame: RawFrame, calibration: Calibration, pixel_response: NDArray[np.float64]
+) -> RawFrame:
+    """Divide a frame by its pixels' responses, shape (rows, columns); clipped pixels stay as they are."""
+    light_dn = (frame.data_dn - frame.black_level_dn) / pixel_response
+    return _with_unclipped(frame, np.rint(light_dn + frame.black_level_dn), calibration)
+
+
+def _with_unclipped(frame: RawFrame, counts: NDArray[Any], calibration: Calibration) -> RawFrame:
+    """Put other counts into pixels that are not clipped: what is must read so, and what is not must not."""
     clipped_dn = saturation_dn(calibration, frame.gain)
-    counts = frame.data_dn
-    free = np.clip(counts.astype(np.int32) - offset_dn, 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    # What is clipped must read so, and what is not must not.
-    free = np.where(counts >= clipped_dn, counts, np.minimum(free, np.uint16(clipped_dn - 1)))
-    return replace(frame, data_dn=free)
+    free = np.clip(counts, 0, int(clipped_dn - 1)).astype(np.uint16)
+    return replace(frame, data_dn=np.where(frame.data_dn >= clipped_dn, frame.data_dn, free))
 
 
 def electrons(frame: RawFrame, calibration: Calibration) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from perception import RawFrame, RecordingError, calibrate_flat
 from perception.calibration.veil import Glare, veil_of
+from perception.model.sensor import without_response
 from tests.unit.perception.simulation import calibration, random
 
 ROWS, COLUMNS, FOCAL_PX = 180, 240, 150.0
@@ -54,6 +55,32 @@ def test_intervals_hold_the_truth() -> None:
     spread = np.sqrt(np.mean(np.square(errors), axis=0))
     assert 0.6 < spread.min() < spread.max() < 1.6
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.25)
+
+
+def test_pixels_are_told_apart_as_far_as_noise_allows() -> None:
+    """Of 1 % of PRNU, and rows and columns, what 8 frames of 3000 e leave: 1/√(1/0.01² + 8 · 3000) = 0.54 %."""
+    frames, own = _frames(5)
+    found = calibrate_flat(frames, CAMERA)
+    left = own / found.pixel_response
+    middle = np.hypot(U - COLUMNS / 2, V - ROWS / 2) < 30
+    assert np.std(own[middle]) > 0.010
+    assert found.unknown_prnu == pytest.approx(np.std(left), rel=0.03)
+    assert np.std(left[middle]) == pytest.approx((0.01**-2 + 8 * 3000) ** -0.5, rel=0.06)
+    assert np.mean(left) == pytest.approx(1.0, abs=1e-3)
+    columns = own.mean(axis=0) - own.mean()
+    assert np.corrcoef(columns, found.pixel_response.mean(axis=0))[0, 1] > 0.98
+
+
+def test_an_evened_frame_keeps_what_is_clipped() -> None:
+    frames, _ = _frames(5)
+    found = calibrate_flat(frames, CAMERA)
+    counts = frames[0].data_dn.copy()
+    counts[10, 20] = 4095
+    even = without_response(replace(frames[0], data_dn=counts), CAMERA, found.pixel_response)
+    assert even.data_dn[10, 20] == 4095
+    assert even.data_dn.max() < 4095 or np.sum(even.data_dn == 4095) == 1
+    expected = (counts[30, 40] - 64.0) / found.pixel_response[30, 40] + 64.0
+    assert even.data_dn[30, 40] == round(expected)
 
 
 def test_columns_of_one_response_count_as_one() -> None:

@@ -8,6 +8,7 @@ import pytest
 from perception.model.fisher import (
     censored_weight,
     covariance,
+    fixed_influence,
     flare_limit,
     flare_limits,
     range_causes,
@@ -157,3 +158,23 @@ def test_causes_of_a_bright_point_are_its_own_light() -> None:
 def test_nothing_has_no_causes() -> None:
     assert range_causes(calibration(), 639.5, 479.5, 3.0, 1e5, 6000.0) is None
     assert range_causes(calibration(), -100.0, 50.0, 3.0, 1e4, 2.0) is None
+
+
+def test_what_is_fixed_about_pixels_changes_the_flux_by_their_weights() -> None:
+    """All responses by 1 % more change the flux by 1 %; unlike ones as `prnu_m` and `dsnu_m` say, by 2 σ_d/d."""
+    camera = replace(calibration(prnu=0.009, dsnu_e=2.0), sigma={"source_radius_m": 1.0})
+    place = (639.7, 479.2, 3.0, 1e4, 20.0)
+    found, causes = fixed_influence(camera, *place), range_causes(camera, *place)
+    assert found is not None
+    assert causes is not None
+    box, of_response, of_offset = found
+    assert of_response.shape == of_offset.shape == (box.height, box.width)
+    assert of_response.sum() == pytest.approx(1.0, abs=1e-6)
+    assert of_offset.sum() == pytest.approx(0.0, abs=1e-9)  # an even offset is background
+    assert 0.009 * np.sqrt((of_response**2).sum()) == pytest.approx(2.0 * causes.prnu_m / 3.0, rel=1e-6)
+    assert 2.0 * np.sqrt((of_offset**2).sum()) == pytest.approx(2.0 * causes.dsnu_m / 3.0, rel=1e-6)
+
+
+def test_what_cannot_be_ranged_has_no_influence() -> None:
+    assert fixed_influence(calibration(), -100.0, 50.0, 3.0, 1e4, 2.0) is None
+    assert fixed_influence(calibration(), 639.5, 479.5, 0.05, 1e6, 2.0) is None  # larger than 64 px
