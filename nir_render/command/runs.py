@@ -1,7 +1,7 @@
 """The commands of a run folder: run, render, perceive, evaluate, calibrate, report."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -117,7 +117,7 @@ def perceive(
     as_json: Json = False,
 ) -> None:
     """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
-    from nir_render.command.console import print_json
+    from nir_render.command.console import print_json, warn
     from nir_render.command.progress import progress_bar
     from nir_render.run.follow import OwnParts
     from nir_render.run.perceive import perceive_run
@@ -129,11 +129,14 @@ def perceive(
             folder, estimators=chosen, progress=progress, own=own, calibration=calibration
         )
     if as_json:
-        failed = {"failed": dict(perceived.failures)} if perceived.failures else {}
-        print_json({"folder": str(folder), "detections": dict(perceived.detections), **failed})
+        told: dict[str, Any] = {"failed": dict(perceived.failures)} if perceived.failures else {}
+        told |= {"warnings": list(perceived.warnings)} if perceived.warnings else {}
+        print_json({"folder": str(folder), "detections": dict(perceived.detections), **told})
     else:
         for name, count in perceived.detections.items():
             typer.echo(f"{name}: {count} detections in {folder / f'detections.{name}.jsonl'}")
+    for text in perceived.warnings:
+        warn(text)
     if perceived.failures:
         raise InputError(*perceived.problems)
 

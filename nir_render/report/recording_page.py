@@ -1,7 +1,7 @@
 """`report.html` of a recording without truth: frames, what was found in them, ranges with their σ."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -24,6 +24,7 @@ from nir_render.report.recording_checks import ShapesSeen, darkness_warnings, sh
 from nir_render.report.style import MATPLOTLIB, look
 from nir_render.report.wording import counted, metres, share
 from perception.picture import tone_map
+from perception.rig.overlap import finest, overlap_warnings
 from perception.types import Calibration, Detection, FrameKey, RawFrame
 
 _WHOLES = 4
@@ -129,7 +130,7 @@ def _warnings(
     calibrations: Mapping[str, Calibration],
 ) -> tuple[list[str], dict[str, ShapesSeen]]:
     """Return where frames contradict the calibration, and by estimator the shapes seen by all cameras."""
-    warnings: list[str] = []
+    warnings = list(_overlap_warnings(keys, found, calibrations))
     shapes: dict[str, list[ShapesSeen]] = {name: [] for name in found}
     for camera in cameras_of(keys):
         looked = spread([key for key in keys if key[0] == camera], _CHECKED)
@@ -146,6 +147,19 @@ def _warnings(
                 f"{name} found nothing in any frame: too faint, or exposure_s and the calibration are off"
             )
     return warnings, {name: _together(listed) for name, listed in shapes.items()}
+
+
+def _overlap_warnings(
+    keys: Sequence[FrameKey], found: Found, calibrations: Mapping[str, Calibration]
+) -> Iterator[str]:
+    """Yield where what a robot's cameras see contradicts how they stand; frames of one index are a set."""
+    name = finest(list(found))
+    if name is None:
+        return
+    sets: dict[int, dict[str, Sequence[Detection]]] = {}
+    for camera, index in keys:
+        sets.setdefault(index, {})[camera] = found[name].get((camera, index), ())
+    yield from overlap_warnings(sets.values(), calibrations)
 
 
 def _together(listed: Sequence[ShapesSeen]) -> ShapesSeen:

@@ -1,7 +1,7 @@
 """The stage `perceive`: the frames of any folder become detections, tracks, messages, by some estimators."""
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +33,7 @@ from perception import (
 )
 from perception.command_estimator import LIMIT_S, is_command
 from perception.messages.own import DecoderError
+from perception.rig.overlap import finest, overlap_warnings
 from perception.track.own import TrackerError
 from perception.types import FrameKey
 
@@ -44,10 +45,14 @@ Found = dict[FrameKey, list[Detection]]
 
 @dataclass(frozen=True)
 class Perceived:
-    """How many detections each estimator made, and what went wrong with those that failed, by name."""
+    """How many detections each estimator made, and what went wrong with those that failed, by name.
+
+    `warnings` say where what was found contradicts the calibration.
+    """
 
     detections: Mapping[str, int]
     failures: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -157,7 +162,20 @@ def perceive_run(
             failures[name] = f"{text}\ndetections.{name}.jsonl is of an earlier call, and stays as it was"
     if counts:
         note_seconds(folder, "perceive", started)
-    return Perceived(counts, failures)
+    return Perceived(counts, failures, tuple(_overlap_warnings(recording, found)))
+
+
+def _overlap_warnings(recording: Recording, found: Mapping[str, tuple[Found, Follower]]) -> Iterator[str]:
+    """Yield, by robot, where what its cameras see contradicts how the calibration has them stand."""
+    name = finest(list(found))
+    if name is None:
+        return
+    hits, _ = found[name]
+    sets = (
+        {frame.camera: hits.get((frame.camera, frame.index), []) for frame in group}
+        for group in frame_sets(recording.records)
+    )
+    yield from overlap_warnings(sets, recording.calibrations)
 
 
 def _read_all(

@@ -17,6 +17,10 @@ class Exposed(Protocol):
         """Name, `robot.camera`."""
 
     @property
+    def index(self) -> int:
+        """Number of the frame among those of its camera."""
+
+    @property
     def time_s(self) -> float:
         """Start of the exposure."""
 

@@ -11,8 +11,10 @@ import pytest
 
 import nir_render as nr
 from nir_render.run.evaluate import evaluate_run
+from nir_render.run.render import render_run
 from perception import calibration_document, encode_png16
 from tests.paths import SCENES
+from tests.system.command import nir_render
 
 
 def _write_lines(file: Path, records: Iterable[dict[str, Any]]) -> None:
@@ -96,3 +98,30 @@ def test_a_broken_line_is_named(folder: Path) -> None:
     )
     with pytest.raises(nr.InputError, match=r"truth.jsonl, line 2: range_m is '3 m'; wanted a finite number"):
         evaluate_run(folder)
+
+
+@pytest.mark.mitsuba
+def test_two_cameras_swapped_are_named(tmp_path: Path) -> None:
+    """The files of front and left under each other's names; where robots stand between cameras that shows."""
+    robots = {"r1": {"rig": "infra_swarm"}}
+    for name, place in (("r2", "[1.5, 1.5, 0] m"), ("r3", "[-1.2, 1.1, 0] m"), ("r4", "[2.0, 0.4, 0] m")):
+        robots[name] = {"rig": "infra_swarm", "position": place}
+    document = {
+        "format": 1,
+        "clock": {"frames": 2, "frame_rate": "10 Hz"},
+        "observe": ["r1"],
+        "robots": robots,
+    }
+    run = tmp_path / "run"
+    render_run(nr.parse_scene(document), run, overwrite=False, progress=lambda *_: None)
+    right = nir_render("perceive", str(run), "--estimator", "robust", "--json", cwd=tmp_path)
+    assert "warnings" not in json.loads(right.stdout)
+    names = {"r1.front": "r1.left", "r1.left": "r1.front"}
+    records = [json.loads(line) for line in (run / "frames.jsonl").read_text(encoding="utf-8").splitlines()]
+    _write_lines(
+        run / "frames.jsonl",
+        ({**record, "camera": names.get(record["camera"], record["camera"])} for record in records),
+    )
+    swapped = nir_render("perceive", str(run), "--estimator", "robust", cwd=tmp_path)
+    assert swapped.returncode == 0
+    assert "with the images of r1.front and r1.left exchanged it were 8 of 8" in swapped.stderr
