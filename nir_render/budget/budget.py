@@ -24,6 +24,7 @@ from nir_render.budget.flares import (
     places_of,
 )
 from nir_render.budget.in_view import InView, in_view
+from nir_render.camera.optics.leak import leak
 from nir_render.camera.optics.lens import aperture_area_m2
 from nir_render.camera.optics.response import response
 from nir_render.errors import InputError
@@ -40,7 +41,11 @@ from perception.types import Calibration
 
 @dataclass(frozen=True)
 class SourceBudget:
-    """One kind of source before one kind of camera. `drives` says of each source what it sends over time."""
+    """One kind of source before one kind of camera. `drives` says of each source what it sends over time.
+
+    `out_of_band_share` is what leaks over what is in band, on the axis, and lies within the next two: None
+    where nothing is in band.
+    """
 
     sources: tuple[str, ...]
     drives: Mapping[str, str]
@@ -49,9 +54,16 @@ class SourceBudget:
     largest_intensity_w_per_sr: float
     in_band_share: float
     electrons_per_j: float
+    out_of_band_share: float | None
+    out_of_band_share_within: tuple[float, float] | None
     flare_share: float
     field: FieldResponse
     curves: tuple[Curve, ...]
+
+    @property
+    def largest_relative_intensity(self) -> float:
+        """The largest intensity over the mean."""
+        return self.largest_intensity_w_per_sr / self.intensity_w_per_sr
 
 
 @dataclass(frozen=True)
@@ -201,7 +213,7 @@ def _source_budget(
     assumed: Assumptions,
 ) -> SourceBudget:
     mean_intensity = source.sent_flux_w / (4.0 * math.pi)
-    extinction_per_m = _extinction_per_m(snapshot)
+    extinction_per_m, leaks = _extinction_per_m(snapshot), leak(camera, source).out_of_band_shares
     return SourceBudget(
         sources=tuple(names),
         drives={name: drive_text(ranged[name]) for name in names},
@@ -210,6 +222,8 @@ def _source_budget(
         largest_intensity_w_per_sr=mean_intensity * largest_relative_intensity(source),
         in_band_share=in_band_share(camera, source),
         electrons_per_j=float(response(camera, source)(0.0)),
+        out_of_band_share=None if leaks is None else leaks[0],
+        out_of_band_share_within=None if leaks is None else leaks[1:],
         flare_share=flare_spread(camera, source.of_its_type).share,
         field=field_response(camera, source),
         curves=tuple(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from nir_render.budget.assumptions import Assumptions
 from nir_render.budget.causes import Flare, range_error
@@ -13,6 +14,7 @@ from nir_render.budget.flares import (
     Saturation,
     brightest_e_per_s,
     flux_e_per_s,
+    largest_relative_intensity,
     saturation,
 )
 from nir_render.camera.timing.exposure_control import Setting
@@ -29,12 +31,15 @@ class Curve:
     """A source against range in one direction, at one exposure; lists are along `range_m`.
 
     Electrons are those of a source that is fully lit, of its mean intensity Φ/4π, through the scene's fog all
-    the way. `brightest_pixel_e` holds the background and the dark current too. None is what cannot be ranged.
+    the way, and so is `saturation`; a robot that turns its brightest side to the camera clips from
+    `saturation_at_largest_intensity` on. `brightest_pixel_e` holds the background and the dark current too.
+    None is what cannot be ranged.
     """
 
     exposure: str
     place: Place
     saturation: Saturation
+    saturation_at_largest_intensity: Saturation
     range_m: tuple[float, ...]
     exposure_s: tuple[float, ...]
     gain: tuple[float, ...]
@@ -81,13 +86,15 @@ def curve_of(
         electrons_e.append(flux_e)
         brightest_e.append(peak * setting.exposure_s)
         errors.append(range_error(camera, source, known, setting.gain, flare, assumed))
+    clipping = partial(
+        saturation, camera, source, place, exposure.shortest(camera), others_e_per_s, extinction_per_m
+    )
     causes = next((list(error.causes_m) for error in errors if error is not None), [])
     return Curve(
         exposure=exposure.name,
         place=place,
-        saturation=saturation(
-            camera, source, place, exposure.shortest(camera), others_e_per_s, extinction_per_m
-        ),
+        saturation=clipping(),
+        saturation_at_largest_intensity=clipping(largest_relative_intensity(source)),
         range_m=tuple(ranges_m),
         exposure_s=tuple(setting.exposure_s for setting in settings),
         gain=tuple(setting.gain for setting in settings),

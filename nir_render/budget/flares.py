@@ -142,14 +142,18 @@ def saturation(
     setting: Setting,
     others_e_per_s: float,
     extinction_per_m: float,
+    intensity: float = 1.0,
 ) -> Saturation:
-    """Return where the brightest pixel, with what else falls on it, reaches the level of clipping."""
+    """Return where the brightest pixel, with what else falls on it, reaches the level of clipping.
+
+    `intensity` is the source's towards the camera over its mean.
+    """
     level_e = clip_e(camera, setting.gain)
 
     def beyond(log_range: float) -> float:
         range_m = math.exp(log_range)
         rate = brightest_e_per_s(camera, source, place.u_px, place.v_px, range_m)
-        rate = rate * math.exp(-extinction_per_m * range_m) + others_e_per_s
+        rate = intensity * rate * math.exp(-extinction_per_m * range_m) + others_e_per_s
         return read_e(camera, rate * setting.exposure_s) - level_e
 
     if read_e(camera, others_e_per_s * setting.exposure_s) >= level_e:

@@ -16,6 +16,7 @@ from nir_render.budget.tables import (
     range_table,
     source_sentences,
     view_table,
+    view_title,
 )
 from nir_render.report.drawing import Drawing
 from nir_render.report.parts import Table, render_page
@@ -76,8 +77,8 @@ RULES = {
         "IEC 62471:2006, 0.2 m from the source's middle where it is brightest, for any length of time: "
         "cornea and lens 100 W/m² (780 to 3000 nm); retina 6000/α W/m²/sr weighted by R(λ) (780 to 1400 "
         "nm, no visible light that warns), α between 0.011 and 0.1 rad, the radiance that of an even "
-        "disc of the source's radius. Pulses count with their mean. Lasers, and so VCSELs, are IEC "
-        "60825's. No certificate."
+        "disc of the source's radius. What pulses counts with its mean, and each pulse by the limit of its "
+        "length. Lasers, and so VCSELs, are IEC 60825's. No certificate."
     ),
 }
 
@@ -100,6 +101,7 @@ class CameraSection:
 
     title: str
     sentence: str
+    view_title: str
     view: Table | None
     sources: Sequence[SourceSection]
     left_out: str
@@ -156,6 +158,7 @@ def _camera_section(camera: CameraBudget) -> CameraSection:
     return CameraSection(
         title=alike(camera.cameras),
         sentence=camera_sentence(camera),
+        view_title=view_title(camera),
         view=view_table(camera) if camera.in_view else None,
         sources=[_source_section(camera, one) for one in shown],
         left_out=f"{counted(more, 'more kind')} of sources: {RECORD} has them." if more else "",
@@ -168,7 +171,7 @@ def camera_sentence(camera: CameraBudget) -> str:
     """Say how a camera exposes, where it clips, and what it has for a background."""
     exposures = f"exposure {', '.join(camera.exposures)}"
     if camera.exposures == ("automatic",):
-        exposures = "its exposure is chosen by the brightest pixel, here by flare and wall with all lit"
+        exposures = "its exposure is chosen by the brightest pixel, here by flare and wall with robots lit"
     exposure_s = camera.stated_exposure_s[0]
     wall_e = camera.background_e_per_s * exposure_s
     behind = f"the wall behind flares has {wall_e:.3g} e per pixel in {1e3 * exposure_s:.3g} ms"

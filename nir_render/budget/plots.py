@@ -10,7 +10,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 
 from nir_render.budget.budget import CameraBudget, SourceBudget
 from nir_render.budget.curves import Curve
-from nir_render.budget.tables import GROUPS, grouped
+from nir_render.budget.tables import GROUPS, LOBE, grouped
 from nir_render.report.drawing import Drawing, legend, sheet, short, svg_of
 from nir_render.report.style import BAD, FAINT, INK, LIMIT, MATPLOTLIB, TRUTH
 from nir_render.report.wording import metres
@@ -38,6 +38,13 @@ def electrons_plot(camera: CameraBudget, source: SourceBudget) -> Drawing:
             )
             if curve.saturation.range_m is not None and curve.exposure != "automatic":
                 left.axvline(curve.saturation.range_m, color=BAD, linewidth=0.8, linestyle=dash)
+            brightest = source.largest_relative_intensity
+            if brightest > LOBE:
+                most_e = [min(brightest * one, camera.clip_e[0]) for one in curve.brightest_pixel_e]
+                left.plot(
+                    curve.range_m, most_e, dash, color="#ff9f1c", linewidth=0.8, alpha=0.7,
+                    label=f"of its brightest side{end}",
+                )  # fmt: skip
         left.axhline(camera.clip_e[0], color=BAD, linewidth=0.9, label="a pixel clips")
         _range_axis(left)
         _electron_axis(left, "y")

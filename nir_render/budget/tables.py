@@ -24,6 +24,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 }
 """Causes of a range's σ as tables and plots name them; the first six are the limit."""
 
+LOBE = 1.05  # of the largest intensity over the mean: what has more is told apart
+
 SHOWN_M = (0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
 BUDGET_SHOWN_M = (1.0, 3.0, 10.0)
 
@@ -86,12 +88,16 @@ def cause_table(curves: Sequence[Curve]) -> Table:
     return Table(("σ of the range by", *heads), rows)
 
 
+def view_title(camera: CameraBudget) -> str:
+    """Return what stands above `view_table`: the exposure too where all have the same."""
+    exposures_s = {one.exposure_s for one in camera.in_view}
+    within = f", in {1e3 * exposures_s.pop():.3g} ms" if len(exposures_s) == 1 else ""
+    return f"The sources where they stand{within}, before a wall lit by all lights"
+
+
 def view_table(camera: CameraBudget) -> Table:
     """Return what each source in view brings where it stands; its camera where there are several."""
-    cameras, exposures = (
-        len(camera.cameras) > 1,
-        len(camera.exposures) > 1 or camera.exposures[0] == "automatic",
-    )
+    cameras, exposures = len(camera.cameras) > 1, len({one.exposure_s for one in camera.in_view}) > 1
     foggy = any(one.fog_transmittance < 1.0 for one in camera.in_view)
     rows = []
     for one in camera.in_view:
@@ -118,7 +124,7 @@ def ambient_table(camera: CameraBudget) -> Table:
     rows = [
         (
             one.name,
-            f"{significant(one.irradiance_w_per_m2)} W/m²",
+            significant(one.irradiance_w_per_m2) if one.irradiance_w_per_m2 >= 1e-5 else "0",
             *(electrons(one.wall_e_per_s * exposure_s) for exposure_s in camera.stated_exposure_s),
             "–" if one.seen_e_per_s is None else electrons(one.seen_e_per_s * camera.stated_exposure_s[0]),
             "–" if one.rejection is None else f"{100.0 * one.rejection:.2f} %",
@@ -127,27 +133,25 @@ def ambient_table(camera: CameraBudget) -> Table:
         )
         for one in camera.ambient
     ]
-    walls = [f"e/px, wall, {1e3 * exposure_s:.3g} ms" for exposure_s in camera.stated_exposure_s]
-    heads = ("light", "on the wall", *walls, "seen itself", "kept out", "leak", "within")
+    walls = [f"e/px in {1e3 * exposure_s:.3g} ms" for exposure_s in camera.stated_exposure_s]
+    heads = ("light", "W/m² on the wall", *walls, "seen itself", "kept out", "leak", "within")
     return Table(heads, rows)
 
 
 def eye_table(budget: Budget) -> Table:
-    """Return what sources bring to an eye, lit, and as shares of the limits."""
+    """Return what sources bring to an eye as shares of the limits: lit for any time, and by one pulse."""
     rows = [
         (
             alike(one.sources),
             significant(1e3 * one.intensity_w_per_sr),
-            significant(one.cornea_w_per_m2),
             _of_limit(one.cornea_w_per_m2 / one.cornea_limit_w_per_m2),
-            electrons(one.retina_w_per_m2_sr),
             _of_limit(one.retina_w_per_m2_sr / one.retina_limit_w_per_m2_sr),
+            "–" if one.pulse_of_limit is None else _of_limit(one.pulse_of_limit),
             _group(one),
         )
         for one in budget.eye_safety
     ]
-    values = ("mW/sr", "cornea W/m²", "of limit", "retina W/m²/sr", "of limit")
-    return Table(("source", *values, "group"), rows)
+    return Table(("source", "mW/sr", "cornea", "retina", "a pulse", "group"), rows)
 
 
 def source_sentences(source: SourceBudget) -> str:
@@ -161,11 +165,14 @@ def _light_sentence(source: SourceBudget) -> str:
         f"{share(source.in_band_share)} of its {significant(1e3 * source.sent_flux_w)} mW pass the filter on "
         f"the axis; a joule of its light becomes {source.electrons_per_j:.3g} electrons."
     )
+    within = source.out_of_band_share_within
+    if within is not None and within[1] > 0.01:
+        text += f" From out of band it may leak {_ratio(within[0])} to {_ratio(within[1])} beside that."
     mean, most = source.intensity_w_per_sr, source.largest_intensity_w_per_sr
-    if most > 1.001 * mean:
+    if source.largest_relative_intensity > 1.001:
         text += (
             f" Curves are of its mean intensity, {significant(1e3 * mean)} mW/sr; "
-            f"where it is brightest it has {significant(1e3 * most)} mW/sr."
+            f"it sends up to {significant(1e3 * most)} mW/sr."
         )
     blinking = {drive for drive in source.drives.values() if drive != "fully lit"}
     if blinking:
@@ -179,7 +186,7 @@ def _saturation_sentences(source: SourceBudget) -> list[str]:
         exposure = "at the shortest exposure" if curve.exposure == "automatic" else f"in {curve.exposure}"
         where = {"axis": "on the axis", "edge": "near the edge"}[curve.place.name]
         found.setdefault(exposure, {})[where] = _saturation(curve.saturation)
-    return [
+    said_of = [
         f"Its flare {said} {exposure}."
         for exposure, by_place in found.items()
         for said in (
@@ -187,6 +194,24 @@ def _saturation_sentences(source: SourceBudget) -> list[str]:
             if len(set(by_place.values())) == 1
             else [f"{where} {what}" for where, what in by_place.items()]
         )
+    ]
+    return said_of + _brightest_side(source)
+
+
+def _brightest_side(source: SourceBudget) -> list[str]:
+    """Say from where on a source clips that turns its brightest side to the camera, if that is elsewhere."""
+    most = source.largest_relative_intensity
+    if most <= LOBE:
+        return []
+    farthest = [
+        curve.saturation_at_largest_intensity.range_m or 0.0
+        for curve in source.curves
+        if curve.place.name == "axis"
+    ]
+    if not any(farthest):
+        return []
+    return [
+        f"Where it shines brightest, {most:.3g} times its mean, it clips nearer than {metres(max(farthest))}."
     ]
 
 
@@ -212,8 +237,12 @@ def small(value_m: float | None) -> str:
 
 
 def electrons(value: float) -> str:
-    """Write a number of electrons."""
-    return f"{value:.3g}" if value >= 1e6 or (value < 0.01 and value > 0.0) else f"{float(f'{value:.3g}'):,g}"
+    """Write a number of electrons: 0.0727, 36,000, 1.28 M, and <0.001 of none to speak of."""
+    if 0.0 < value < 1e-3:
+        return "<0.001"
+    if 999_500.0 <= value < 999.5e6:
+        return f"{value / 1e6:.3g} M"
+    return f"{value:.3g}" if value >= 1e6 else f"{float(f'{value:.3g}'):,g}"
 
 
 def _saturation(found: Saturation) -> str:
@@ -235,5 +264,5 @@ def _of_limit(value: float) -> str:
 
 
 def _group(one: EyeSafety) -> str:
-    group = "exempt" if one.exempt_lit else ("exempt by its mean" if one.exempt_mean else "above the limit")
-    return f"{group}; not if a laser" if one.narrow_spectrum else group
+    group = "exempt" if one.exempt_lit else "exempt, pulsed" if one.exempt_as_driven else "above the limit"
+    return f"{group}, if no laser" if one.narrow_spectrum else group

@@ -67,6 +67,7 @@ def _show(budget: "Budget") -> None:
         range_table,
         source_sentences,
         view_table,
+        view_title,
     )
 
     for camera in budget.cameras:
@@ -83,11 +84,11 @@ def _show(budget: "Budget") -> None:
                     )
             _print(cause_table(first[:1]), "What makes a range uncertain")
         if camera.in_view:
-            _print(view_table(camera), "The sources where they stand, if nothing hides them")
+            _print(view_table(camera), view_title(camera))
         if camera.ambient:
             _print(ambient_table(camera), f"Other light before {name}")
     if budget.eye_safety:
-        _print(eye_table(budget), "Eye safety, IEC 62471, any length of time")
+        _print(eye_table(budget), "Eye safety by IEC 62471: of the exempt group's limits")
 
 
 def _print(table: "Table", title: str) -> None:

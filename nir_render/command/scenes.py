@@ -171,6 +171,8 @@ def _show_goniometer(figures: "dict[str, Any]") -> None:
     ):
         others = [] if bare is None else [f"{100.0 * bare[key]:.1f} %"]
         table.add_row(label, f"{100.0 * own[key]:.1f} %", *others)
+    others = [] if bare is None else [f"{100.0 * bare['noise_alone']:.2g} %"]
+    table.add_row("noise alone would vary by", f"{100.0 * own['noise_alone']:.2g} %", *others)
     shares = figures["shares"]
     table.add_row("flux that leaves", f"{1e3 * figures['flux_w']:.4g} mW, {100.0 * shares['left']:.1f} %")
     taken = f"{100.0 * shares['absorbed_in_board']:.1f} %, {100.0 * shares['absorbed_in_cover']:.2f} %"

@@ -181,13 +181,12 @@ def spectral_facts(scene: Scene) -> dict[str, list[dict[str, Any]]]:
 
 
 def _leak_record(one: Leak, emitters: list[str]) -> dict[str, Any]:
-    in_band = one.in_band_e_per_j
-    out_of_band = (one.out_of_band_e_per_j, one.low_e_per_j, one.high_e_per_j)
-    shares = [None if in_band == 0.0 else float(f"{share / in_band:.6g}") for share in out_of_band]
+    known = one.out_of_band_shares
+    shares = [None] * 3 if known is None else [float(f"{share:.6g}") for share in known]
     return {
         "emitters": emitters,
         "band_nm": [round(1e9 * end_m, 3) for end_m in one.band_m],
-        "in_band_e_per_j": float(f"{in_band:.6g}"),
+        "in_band_e_per_j": float(f"{one.in_band_e_per_j:.6g}"),
         "out_of_band_share": shares[0],
         "out_of_band_share_within": shares[1:],
     }

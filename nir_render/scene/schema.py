@@ -31,7 +31,8 @@ def scene_schema() -> dict[str, Any]:
     """Return the schema (draft 2020-12) of what a person writes: presets by name, includes, unit strings."""
     schema = SceneDocument.model_json_schema(by_alias=True)
     definitions = schema["$defs"]
-    definitions["Led"]["properties"]["power_at_current"] = {"type": "array", "minItems": 2}
+    for key in ("power_at_current", "voltage_at_current"):
+        definitions["Led"]["properties"][key] = {"type": "array", "minItems": 2}
     for model in _PRESET_MODELS:
         if model.__name__ in definitions:
             definitions[model.__name__] = _or_preset(definitions[model.__name__], model.preset_folder)

@@ -10,7 +10,7 @@ products of up to three curves, of which some may be the same.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -74,6 +74,31 @@ def choose_nodes(
             if len(found) <= most:
                 nodes = min(nodes, found, key=problem.error)
     return Choice(tuple(np.round(wavelength_m[nodes], 12).tolist()), problem.error(nodes))
+
+
+def beyond_data(weights: Array, held: Array, outside: NDArray[np.bool_]) -> float:
+    """Return the largest relative error that reflectances beyond their data could make, of any product.
+
+    Beyond its data a curve is carried as `held`, and could be anything from 0 to 1, at each bounce.
+
+    Parameters
+    ----------
+    weights
+        What a camera sees of emitters, shape (emitters, n).
+    held, outside
+        The curves, held at the ends of their data, and where they lie beyond these, each shape (curves, n).
+    """
+    seen = weights[weights.sum(axis=1) > 0.0]
+    if not seen.size or not outside.any():
+        return 0.0
+    seen = seen / seen.sum(axis=1, keepdims=True)
+    largest = 0.0
+    for some in _bounces(len(held)):
+        product, most = np.prod(held[some], axis=0), np.prod(np.where(outside[some], 1.0, held[some]), axis=0)
+        off = np.where(outside[some].any(axis=0), np.maximum(product, most - product), 0.0)
+        scale = np.maximum(seen @ product, _LEAST_F * product.max())
+        largest = max(largest, float((seen @ off / np.maximum(scale, 1e-300)).max()))
+    return largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,9 +209,14 @@ class _Problem:
 
 def _products(curves: Array) -> Array:
     curves = np.unique(curves, axis=0)
-    orders = [itertools.combinations_with_replacement(curves, order) for order in range(1, _BOUNCES + 1)]
-    products = np.array([np.prod(some, axis=0) for some in itertools.chain(*orders)])
+    products = np.array([np.prod(curves[some], axis=0) for some in _bounces(len(curves))])
     return np.asarray(products[products.max(axis=1) > 0.0])
+
+
+def _bounces(count: int) -> Iterator[list[int]]:
+    """Return which of so many curves light meets, in up to three bounces."""
+    for order in range(1, _BOUNCES + 1):
+        yield from map(list, itertools.combinations_with_replacement(range(count), order))
 
 
 def _some(places: NDArray[np.int64], most: int) -> NDArray[np.int64]:

@@ -12,9 +12,17 @@ from nir_render.spectra.curve import Curve
 # Second radiation constant h c / k_B, and the luminous efficacy of 555 nm light (both exact in the SI).
 _HC_OVER_K_M_K = 6.62607015e-34 * 299_792_458.0 / 1.380649e-23
 _EFFICACY_LM_PER_W = 683.0
+_FIRST_RADIATION_W_M2 = 2.0 * math.pi * 6.62607015e-34 * 299_792_458.0**2
+
+# The sun: its effective temperature (IAU 2015, resolution B3), and its radius as seen at its mean distance.
+_SUN_K = 5772.0
+SUN_RADIUS_RAD = math.radians(0.2666)
 
 # What silicon sees: a lamp's flux counts over this range.
 SILICON_M = (300e-9, 1100e-9)
+
+# What a table must cover so that lumens say how much a lamp sends: 99.9 % of what the eye sees of even light.
+VISIBLE_M = (400e-9, 700e-9)
 
 # Tables of lamps in CIE 15:2018 (fluorescent: FL2 cool white, FL7 daylight, FL11 and FL12 three bands; high
 # pressure sodium HP1; white LEDs: B1 to B5 blue chip and phosphor, 2733 to 6598 K, V1 violet chip).
@@ -42,6 +50,16 @@ def gaussian_spectrum(centroid_m: float, fwhm_m: float, name: str) -> Curve:
 def planck_shape(wavelength_m: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:
     """Return the spectral exitance of a black body over wavelength, up to a constant."""
     return wavelength_m**-5.0 / np.expm1(_HC_OVER_K_M_K / (wavelength_m * temperature_k))
+
+
+def sunlight_ceiling(wavelength_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a spectral irradiance in W/m³ that no light of the sun exceeds, at its mean distance.
+
+    A quarter more than that of a black body of 5772 K of the sun's size: of the extraterrestrial column of
+    ASTM G173, 300 to 1100 nm, the largest value is 1.235 times that (at 451 nm).
+    """
+    exitance = _FIRST_RADIATION_W_M2 * planck_shape(wavelength_m, _SUN_K)
+    return 1.25 * exitance * math.sin(SUN_RADIUS_RAD) ** 2
 
 
 def incandescent_spectrum(temperature_k: float, name: str) -> Curve:

@@ -14,7 +14,7 @@ from nir_render.scene.documents.document import WavelengthSettings
 from nir_render.scene.documents.materials import curves_of
 from nir_render.scene.emission import Emitter
 from nir_render.scene.snapshot import Snapshot
-from nir_render.spectra.choice import Choice, choose_nodes
+from nir_render.spectra.choice import Choice, beyond_data, choose_nodes
 from nir_render.spectra.curve import Curve
 from nir_render.spectra.illuminants import SILICON_M
 from nir_render.spectra.nodes import BAND_M
@@ -30,7 +30,7 @@ def carried_wavelengths(snapshot: Snapshot, camera: str) -> Choice:
 
     Where all materials are the same at all wavelengths that is 940 nm alone, without any error. What lies
     beyond a material's data, if it is little, is carried by the data's end, and its error is in that of the
-    nodes: it could have any reflectance.
+    nodes: it could have any reflectance, at each of the bounces that are counted on.
 
     Raises
     ------
@@ -94,22 +94,24 @@ def _carried(
 def _beyond(
     camera: str, wavelength_m: Array, seen: Mapping[str, Array], curves: Mapping[str, Curve], error: float
 ) -> float:
-    """Return the largest relative error that anything from 0 to 1 beyond a curve's data could make."""
+    """Return the largest relative error that anything from 0 to 1 beyond the curves' data could make."""
+    held = np.array([np.interp(wavelength_m, one.wavelength_m, one.value) for one in curves.values()])
+    outside = np.array(
+        [(wavelength_m < one.low_m - 1e-15) | (wavelength_m > one.high_m + 1e-15) for one in curves.values()]
+    )
     largest = 0.0
-    for place, curve in curves.items():
-        held = np.interp(wavelength_m, curve.wavelength_m, curve.value)
-        outside = (wavelength_m < curve.low_m - 1e-15) | (wavelength_m > curve.high_m + 1e-15)
-        off = np.where(outside, np.maximum(held, 1.0 - held), 0.0)
-        for emitter, parts in seen.items():
-            could_err = float(((parts @ off) / np.maximum(parts @ held, 1e-300)).max(initial=0.0))
-            if could_err > _BEYOND_SHARE * error:
-                share = float(parts[:, outside].sum(axis=1).max())
-                wanted = 1.05 * could_err / _BEYOND_SHARE
-                allowing = f"render: {{wavelengths: {{error: {100.0 * wanted:.2g} %}}}}"
-                raise InputError(
-                    f"{place}: covers {curve.range_nm()}, but {100.0 * share:.3g} % of what {camera} sees of "
-                    f"{emitter} lies beyond; give data there"
-                    + (f", or allow the error that this could make by {allowing}" if wanted < 0.95 else "")
-                )
-            largest = max(largest, could_err)
+    for emitter, parts in seen.items():
+        could_err = beyond_data(parts, held, outside)
+        if could_err > _BEYOND_SHARE * error:
+            shares = [float(parts[:, one].sum(axis=1).max()) for one in outside]
+            most = int(np.argmax(shares))
+            place, curve = list(curves.items())[most]
+            wanted = 1.05 * could_err / _BEYOND_SHARE
+            allowing = f"render: {{wavelengths: {{error: {100.0 * wanted:.2g} %}}}}"
+            raise InputError(
+                f"{place}: covers {curve.range_nm()}, but {100.0 * shares[most]:.3g} % of what {camera} sees "
+                f"of {emitter} lies beyond; give data there"
+                + (f", or allow the error that this could make by {allowing}" if wanted < 0.95 else "")
+            )
+        largest = max(largest, could_err)
     return largest

@@ -158,7 +158,7 @@ BAD_SCENES: dict[str, tuple[dict[str, Any], str]] = {
         "RGB colours have no meaning at 940 nm",
     ),
     "curve without 940 nm": (
-        {"robots.r2.rig.sources.top.spectrum": {"points": [["800 nm", 1], ["900 nm", 1]]}},
+        {"robots.r2.rig.sources.top.spectrum": {"points": [["800 nm", 0], ["850 nm", 1], ["900 nm", 0]]}},
         "covers 800 to 900 nm, not 940 nm",
     ),
 }

@@ -2,7 +2,8 @@
 
 A filter's floor of 10⁻⁴ counts for little with an LED and for much under a lamp or the sun, which shine over
 all that silicon sees. The floor is stated as a bound, quantum efficiencies are published at few wavelengths,
-tables end: so what leaks is an interval, beside what frames are rendered with.
+tables end, and of a sun by its `irradiance` at 940 nm nothing else is known: so what leaks is an interval,
+beside what frames are rendered with.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,10 @@ from numpy.typing import NDArray
 from scipy import constants
 
 from nir_render.camera.optics.response import incidence, kind_alone, merged_grid, optics_alone
+from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.emission import Emitter, emission_spectrum
+from nir_render.spectra.illuminants import sunlight_ceiling
 from nir_render.spectra.nodes import BAND_M
 
 _HALF_BAND_M = 5e-9  # what counts as in band where there is no filter
@@ -36,6 +39,17 @@ class Leak:
     low_e_per_j: float
     high_e_per_j: float
 
+    @property
+    def out_of_band_shares(self) -> tuple[float, float, float] | None:
+        """What is out of band over what is in band: as rendered, at least, at most; None of nothing."""
+        if self.in_band_e_per_j == 0.0:
+            return None
+        rendered, low, high = (
+            part / self.in_band_e_per_j
+            for part in (self.out_of_band_e_per_j, self.low_e_per_j, self.high_e_per_j)
+        )
+        return rendered, low, high
+
 
 def leak(camera: Camera, emitter: Emitter) -> Leak:
     """Return what a camera sees of an emitter in band and out of band, on its axis.
@@ -43,11 +57,18 @@ def leak(camera: Camera, emitter: Emitter) -> Leak:
     The band is where the filter passes more than 1 % of its peak at the angles of light on the axis; without
     a filter, 935 to 945 nm.
     """
-    return _leak(optics_alone(camera), kind_alone(emitter))
+    return _leak(optics_alone(camera), kind_alone(emitter), _flat_w_per_m3(emitter))
+
+
+def _flat_w_per_m3(emitter: Emitter) -> float | None:
+    """Return the spectral irradiance of a sun or sky of which it is known at 940 nm alone."""
+    if isinstance(emitter, Sun) and emitter.air is None:
+        return emitter.irradiance_w_per_m3
+    return emitter.sky.irradiance_w_per_m3 if isinstance(emitter, Skylight) else None
 
 
 @lru_cache(maxsize=256)
-def _leak(camera: Camera, emitter: Emitter) -> Leak:
+def _leak(camera: Camera, emitter: Emitter, flat_w_per_m3: float | None) -> Leak:
     rays, of_ray = incidence(camera, np.zeros(1))
     # On the axis the rays of a ring about it meet the filter alike.
     cosines, ring = np.unique(rays[0].round(12), return_inverse=True)
@@ -78,7 +99,11 @@ def _leak(camera: Camera, emitter: Emitter) -> Leak:
     whole = np.ones(wavelength_m.size, dtype=bool)
     seen = density * efficiency * passed
     in_band = electrons_per_j(seen, within)
-    bounded = [density * eta * share for eta, share in ((low, passed_low), (high, passed_high))]
+    sent_low, sent_high = density, density
+    if flat_w_per_m3 is not None:
+        most = np.maximum(sunlight_ceiling(wavelength_m) / flat_w_per_m3, 1.0)
+        sent_low, sent_high = np.zeros_like(density), density * most
+    bounded = [sent_low * low * passed_low, sent_high * high * passed_high]
     return Leak(
         band_m=band_m,
         in_band_e_per_j=in_band,

@@ -8,6 +8,7 @@ import yaml
 from numpy.typing import NDArray
 
 from nir_render.scene.documents.built.source import BuiltSource
+from nir_render.scene.text.units import LENGTH, parse_quantity
 from nir_render.transport.goniometer.goniogram import Goniogram
 
 Array = NDArray[np.float64]
@@ -52,11 +53,24 @@ def baked_document(built: BuiltSource, gram: Goniogram) -> dict[str, Any]:
     return {
         "flux": f"{1e3 * built.flux_w * gram.left / gram.photons:.6g} mW",
         "radius": f"{1e3 * built.radius_m:.6g} mm",
-        "spectrum": built.spectrum.model_dump(
-            mode="json", by_alias=True, exclude_none=True, exclude_defaults=True
+        "spectrum": _in_nm(
+            built.spectrum.model_dump(mode="json", by_alias=True, exclude_none=True, exclude_defaults=True)
         ),
         "pattern": pattern,
     }
+
+
+def _in_nm(written: Any) -> Any:
+    """Return a document with wavelengths in nanometres, where these are the same to the bit."""
+    if isinstance(written, dict):
+        return {key: _in_nm(value) for key, value in written.items()}
+    if isinstance(written, list):
+        return [_in_nm(value) for value in written]
+    if isinstance(written, str) and written.endswith(" m"):
+        value_m = parse_quantity(written, LENGTH)
+        short = f"{1e9 * value_m:.10g} nm"
+        return short if value_m < 1e-5 and parse_quantity(short, LENGTH) == value_m else written
+    return written
 
 
 def source_yaml(document: dict[str, Any], comments: list[str]) -> str:
@@ -83,7 +97,8 @@ def ies_text(name: str, built: BuiltSource, gram: Goniogram, date: str) -> str:
         f"[ISSUEDATE] {date}",
         f"[MANUFAC] {_ascii(name)}",
         "[OTHER] radiometric: candela values are radiant intensity in mW/sr near 940 nm, not photometric",
-        f"[TESTDIST] {gram.distance_m:g}",
+        f"[_TESTDIST] {gram.distance_m:g} m",
+        "[OTHER] input watts are the radiant flux of the dies",
         "[OTHER] vertical angle 0 is the axis of the source",
         "TILT=NONE",
         f"1 -1 1 {len(vertical_deg)} {len(horizontal_deg)} 1 2 {size_m:.6g} {size_m:.6g} {size_m:.6g}",

@@ -56,7 +56,7 @@ def measure_into(
         run_folder.write_file(aside / PATTERN, pattern_csv(gram).encode())
         today = datetime.now(UTC).date().isoformat()
         run_folder.write_file(aside / IES, ies_text(title, built, gram, today).encode("ascii"))
-        source = source_yaml(baked_document(built, gram), _comments(name, gram))
+        source = source_yaml(baked_document(built, gram), _comments(name, gram, settings))
         run_folder.write_file(aside / SOURCE, source.encode())
         run_folder.write_file(aside / POLAR, polar_png(title, gram, uncovered))
         run_folder.write_json(aside / FIGURES, figures)
@@ -110,10 +110,21 @@ def _azimuthal_spread(gram: Goniogram) -> float | None:
     return _rounded(float(np.max((most - least) / np.maximum(most + least, 1e-30))))
 
 
-def _comments(name: str, gram: Goniogram) -> list[str]:
+def _comments(name: str, gram: Goniogram, settings: Settings) -> list[str]:
+    options, usual = (
+        {
+            "step": 180.0 / one.polar_steps,
+            "azimuths": one.azimuths,
+            "distance": one.distance_m,
+            "seed": one.seed,
+        }
+        for one in (settings, Settings())
+    )
+    changed = [f" --{key} {value:.10g}" for key, value in options.items() if value != usual[key]]
     return [
-        f"Measured from {name} as it is built, by: nir-render goniometer {name}",
-        f"with {gram.photons} photons, at {gram.distance_m:g} m; {figures_text(variation(gram))}.",
+        f"Measured from {name} as it is built, by:",
+        f"nir-render goniometer {name} --photons {settings.photons}{''.join(changed)}",
+        f"At {gram.distance_m:g} m it {figures_text(variation(gram))}.",
         "Its position is the centre of its cover, or of its board where it has none; its axis is z.",
     ]
 

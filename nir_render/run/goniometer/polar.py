@@ -43,7 +43,8 @@ def figures_text(figures: Variation) -> str:
     reach = f"±{np.rad2deg(figures.reach_rad):.0f}°"
     return (
         f"varies by {100.0 * figures.peak_to_peak:.1f} % over {reach} (±{100.0 * figures.plus_minus:.1f} %; "
-        f"at most {100.0 * figures.about_mean:.1f} % from the mean)"
+        f"at most {100.0 * figures.about_mean:.1f} % from the mean; "
+        f"noise alone: {100.0 * figures.noise_alone:.2g} %)"
     )
 
 

@@ -1,6 +1,5 @@
 """Values against wavelength or angle: [place, value] points, CSV files that become such, and curves."""
 
-import csv
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from nir_render.spectra.illuminants import SILICON_M, gaussian_spectrum
 Points = tuple[tuple[float, float], ...]
 
 _ANGLE_SLACK_RAD = 1e-9
+_END_SHARE = 0.02  # of a table's largest value, at its ends
 
 
 class Gaussian(Document):
@@ -53,7 +53,7 @@ class CurveDocument(Document):
             known = ", ".join(map(repr, cls.forms[:-1]))
             raise ValueError(f"wanted one of {known} and {cls.forms[-1]!r}, not {forms}")
         if "file" in data:
-            points = read_csv(resolve_file(str(data["file"]), info), "wavelength_nm,value")
+            points = read_curve(resolve_file(str(data["file"]), info), "wavelength_nm,value")
             others = {key: value for key, value in data.items() if key != "file"}
             return {**others, "points": [(f"{nm!r} nm", value) for nm, value in points]}
         return data
@@ -151,6 +151,22 @@ def parse_half_turn(points: Any, place: str) -> Points:
     return tuple((angle, value) for angle, (_, value) in zip(ends, pairs, strict=True))
 
 
+def check_ends(points: Points | None, what: str) -> None:
+    """Raise ValueError where a table over wavelength stops before its values do, within what silicon sees."""
+    if points is None:
+        return
+    most = max(value for _, value in points)
+    if most == 0.0:
+        raise ValueError(f"{what} is 0 everywhere")
+    for place_m, value in (points[0], points[-1]):
+        if SILICON_M[0] < place_m < SILICON_M[1] and value > _END_SHARE * most:
+            raise ValueError(
+                f"{what} ends at {place_m * 1e9:.4g} nm with {100.0 * value / most:.2g} % of its largest "
+                "value: what is beyond is not known; give data down to where they are below 2 %, or a point "
+                "of 0 where it truly ends"
+            )
+
+
 def half_turn(angles_rad: Sequence[float], place: str) -> list[float]:
     """Return increasing angles with their ends, rounded by their unit, at exactly 0 and π."""
     first, last = angles_rad[0], angles_rad[-1]
@@ -166,17 +182,52 @@ def read_csv(path: Path, header: str) -> list[tuple[float, ...]]:
     Raises
     ------
     ValueError
-        Another header, a line of another length, a cell that is no number.
+        Another header, a line of another length, a cell that is no number; the line is named.
     """
+    return [row for _, row in _numbered_rows(path, header)]
+
+
+def read_curve(path: Path, header: str) -> list[tuple[float, float]]:
+    """Read pairs likewise, of increasing places and of values that are finite and not negative.
+
+    Raises
+    ------
+    ValueError
+        As `read_csv`, or pairs that are no such; the line is named.
+    """
+    pairs: list[tuple[float, float]] = []
+    for number, (place, value) in _numbered_rows(path, header):
+        try:
+            not_negative([value])
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {value:g}: {error}") from None
+        if pairs and not place > pairs[-1][0]:
+            raise ValueError(
+                f"{path}, line {number}: {place:g} does not lie beyond {pairs[-1][0]:g}, the one before it; "
+                "sort the lines, and have each once"
+            )
+        pairs.append((place, value))
+    return pairs
+
+
+def _numbered_rows(path: Path, header: str) -> list[tuple[int, tuple[float, ...]]]:
     columns = header.split(",")
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(line for line in file if line.strip() and not line.startswith("#")))
-    if not rows or [cell.strip() for cell in rows[0]] != columns:
-        raise ValueError(f"{path}: the first line must be the header {header!r}")
     try:
-        numbers = [tuple(float(cell) for cell in row) for row in rows[1:]]
-    except ValueError as error:
-        raise ValueError(f"{path}: each line must hold {len(columns)} numbers ({error})") from None
-    if any(len(row) != len(columns) for row in numbers):
-        raise ValueError(f"{path}: each line must hold {len(columns)} numbers")
-    return numbers
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: this is no text; wanted CSV with the header {header!r}") from None
+    written = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
+    if not written or [cell.strip() for cell in written[0][1].split(",")] != columns:
+        raise ValueError(f"{path}: the first line must be the header {header!r}")
+    rows = []
+    for number, line in written[1:]:
+        try:
+            row = tuple(float(cell) for cell in line.split(","))
+        except ValueError:
+            row = ()
+        if len(row) != len(columns):
+            raise ValueError(
+                f"{path}, line {number}: {shown(line)}: each line must hold {len(columns)} numbers"
+            )
+        rows.append((number, row))
+    return rows

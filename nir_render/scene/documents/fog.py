@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, field_serializer, field_validator, m
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import Document, Extinction, Fraction, Length, Position, Size3, typed
-from nir_render.scene.documents.curves import Points, one_form, parse_half_turn, read_csv, write_points
+from nir_render.scene.documents.curves import Points, one_form, parse_half_turn, read_curve, write_points
 from nir_render.scene.documents.files import resolve_file
 from nir_render.scene.text.units import ANGLE, EXTINCTION, VISIBILITY, format_quantity, parse_quantity
 
@@ -48,7 +48,7 @@ class TabulatedPhase(Document):
         one_form(data, ("points", "file"))
         if data.get("file") is None:
             return data
-        rows = read_csv(resolve_file(str(data["file"]), info), "angle_deg,value")
+        rows = read_curve(resolve_file(str(data["file"]), info), "angle_deg,value")
         others = {key: value for key, value in data.items() if key != "file"}
         return {**others, "points": [(f"{angle_deg!r} deg", value) for angle_deg, value in rows]}
 

@@ -7,11 +7,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.randomness import generator
+
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 REACH_RAD = math.radians(85.0)  # of the paper's Exp. 2
 _FLAT = 0.05
+_DRAWS = 500  # by which it is told how much noise alone would vary
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +119,7 @@ class Variation:
     (max − min)/(max + min), the ± about the middle between the two; `about_mean` is the largest difference
     from the mean over the turn, over that mean. `edge` is the least intensity at ±`reach_rad` over that on
     the axis. `sigma` is the mean standard error of the values, over their mean: noise adds some of it to all
-    three.
+    three. `noise_alone` is the `peak_to_peak` that it would make of a source that does not vary at all.
     """
 
     reach_rad: float
@@ -125,6 +128,7 @@ class Variation:
     about_mean: float
     edge: float
     sigma: float
+    noise_alone: float
 
 
 def turned(gram: Goniogram, values: Array) -> tuple[Array, Array]:
@@ -149,7 +153,7 @@ def variation(gram: Goniogram, reach_rad: float = REACH_RAD) -> Variation:
     )
     mean, least, most = float(over.mean()), float(over.min()), float(over.max())
     if most <= 0.0:
-        return Variation(reach_rad, 1.0, 1.0, 1.0, 0.0, 0.0)
+        return Variation(reach_rad, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
     axis = float(intensity[len(intensity) // 2])
     return Variation(
         reach_rad,
@@ -158,7 +162,17 @@ def variation(gram: Goniogram, reach_rad: float = REACH_RAD) -> Variation:
         max(most - mean, mean - least) / mean,
         float(ends.min()) / axis if axis > 0.0 else 0.0,
         float(noise.mean()) / mean,
+        _varies_by_noise(gram, mean, reach_rad),
     )
+
+
+def _varies_by_noise(gram: Goniogram, mean: float, reach_rad: float) -> float:
+    """Return the mean `peak_to_peak` of even intensity with the noise of the cells, over draws."""
+    draws = generator(1, "goniometer noise", "", 0).standard_normal((_DRAWS, *gram.near.shape))
+    angle_rad, _ = turned(gram, gram.intensity_per_sr)
+    within = np.abs(angle_rad) < reach_rad + 1e-9
+    over = [turned(gram, mean + gram.sigma_per_sr * one)[1][within] for one in draws]
+    return float(np.mean([(one.max() - one.min()) / one.max() for one in over]))
 
 
 def _parabola_weights(solid_angle_sr: Array) -> Array:

@@ -23,7 +23,7 @@ def test_an_even_source_of_0_2_watts() -> None:
     assert found.angle_rad == pytest.approx(0.1)
     assert found.retina_limit_w_per_m2_sr == pytest.approx(60_000.0)
     assert found.exempt_lit
-    assert found.exempt_mean
+    assert found.exempt_as_driven
     assert found.narrow_spectrum
     assert found.cornea_limit_at_m == pytest.approx(math.sqrt(0.2 / (4.0 * math.pi) / 100.0), rel=1e-4)
 
@@ -51,7 +51,7 @@ def test_pulses_count_with_their_mean() -> None:
     strobe = Source.model_validate({"preset": "mocap_strobe_850"})
     found = eye_safety(["strobe"], strobe)
     assert found.mean_cornea_w_per_m2 == pytest.approx(0.06 * found.cornea_w_per_m2)
-    assert (found.exempt_lit, found.exempt_mean) == (False, True)
+    assert (found.exempt_lit, found.exempt_as_driven) == (False, True)
     # ∫ of the lobe's points over the sphere, linear between them.
     assert strobe.pattern is not None
     polar_rad, value = np.array(strobe.pattern.points).T
@@ -60,6 +60,28 @@ def test_pulses_count_with_their_mean() -> None:
     intensity = 5.0 / float(lobe.sum() * (fine[1] - fine[0]))
     assert found.intensity_w_per_sr == pytest.approx(intensity, rel=2e-3)
     assert found.cornea_w_per_m2 == pytest.approx(intensity / 0.04, rel=2e-3)
+
+
+def test_a_long_pulse_is_held_against_its_own_limit() -> None:
+    """700 W/m² for 100 s of each 1000: 70 in the mean, but one pulse may have 18 000 · 100^(−3/4) = 569."""
+    pulses = {"square": {"frequency": "1 mHz", "duty": 0.1}}
+    found = eye_safety(
+        ["r2.top"], _source(flux=f"{700.0 * 4.0 * math.pi * 0.04} W", radius="0.1 m", drive=pulses)
+    )
+    assert found.pulse_s == pytest.approx(100.0)
+    assert found.mean_cornea_w_per_m2 == pytest.approx(70.0, rel=1e-4)
+    assert found.pulse_of_limit == pytest.approx(700.0 / (18_000.0 * 100.0**-0.75), rel=1e-4)
+    assert not found.exempt_as_driven
+
+
+def test_a_short_pulse_meets_the_retinas_limit_first() -> None:
+    """0.1 ms of a disc that fills 5 mrad: 0.2/(4π² r²) W/m²/sr, weighted, against 50 000/(0.005 · 0.1)."""
+    pulses = {"square": {"frequency": "1 kHz", "duty": 0.1}}
+    spectrum = {"gaussian": {"centroid": "940 nm", "fwhm": "1 nm"}}
+    found = eye_safety(["r2.top"], _source(radius="0.5 mm", drive=pulses, spectrum=spectrum))
+    radiance = 0.2 / (4.0 * math.pi**2 * 0.5e-3**2) * R_940
+    assert found.pulse_of_limit == pytest.approx(radiance * 0.005 / (50_000.0 * 1e-4**-0.25), rel=1e-4)
+    assert eye_safety(["r2.top"], _source()).pulse_of_limit is None
 
 
 def test_weights_of_the_retina() -> None:

@@ -149,3 +149,40 @@ def test_fog_dims_along_the_whole_way() -> None:
     index = _on_axis(clear).range_m.index(5.0)
     passed = _on_axis(foggy).electrons_e[index] / _on_axis(clear).electrons_e[index]
     assert passed == pytest.approx(math.exp(-0.5), rel=1e-9)
+
+
+def test_a_source_clips_farther_off_on_its_bright_side() -> None:
+    """An LED's lens sends 4π · 550 mW/sr/55 mW = 126 times the mean along its axis: √126 times as far, as a point."""
+    changes = {"robots.r2.rig.sources.top": {"preset": "sfh_4545"}, f"{CAMERA}.exposure": "20 ms"}
+    budget = _budget(changes)
+    source, curve = budget.cameras[0].sources[0], _on_axis(budget)
+    times = source.largest_intensity_w_per_sr / source.intensity_w_per_sr
+    assert times == pytest.approx(4.0 * math.pi * 0.55 / 0.055, rel=5e-3)
+    mean_m, bright_m = curve.saturation.range_m, curve.saturation_at_largest_intensity.range_m
+    assert mean_m is not None
+    assert bright_m is not None
+    assert bright_m / mean_m == pytest.approx(math.sqrt(times), rel=0.02)
+
+
+def test_an_automatic_exposure_is_not_ruled_by_a_strobe() -> None:
+    """Lit a twentieth of the time at 30 Hz: most exposures miss it. At 1 MHz each has a twentieth of it."""
+    beacon = {
+        "preset": "infra_swarm",
+        "position": "[1.5, 0.3, 0.3] m",
+        "flux": "20 W",
+        "drive": {"square": {"frequency": "30 Hz", "duty": 0.05}},
+    }
+    automatic = {
+        f"{CAMERA}.auto_exposure": {"shortest": "1 us", "longest": "20 ms"},
+    }
+
+    def exposure_s(changes: dict[str, Any]) -> float:
+        return _budget({**automatic, **changes}).cameras[0].in_view[0].exposure_s
+
+    alone_s, strobe_s = exposure_s({}), exposure_s({"beacons": {"flash": beacon}})
+    assert strobe_s == pytest.approx(alone_s, rel=1e-2)  # the wall that it lights is of its mean
+    fast = {**beacon, "drive": {"square": {"frequency": "1 MHz", "duty": 0.05}}}
+    steady = {**beacon, "flux": "1 W", "drive": 1.0}
+    found_s = exposure_s({"beacons": {"flash": fast}})
+    assert found_s == pytest.approx(exposure_s({"beacons": {"flash": steady}}), rel=0.05)
+    assert found_s < 0.5 * alone_s

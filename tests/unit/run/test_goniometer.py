@@ -212,3 +212,16 @@ def test_a_source_that_is_the_same_all_around_has_one_column() -> None:
     moved = {"dies": (built.dies[0].model_copy(update={"position_m": (1e-3, 0.0, 0.0)}),)}
     aside: BuiltSource = built.model_copy(update=moved)
     assert measure(aside, Settings(photons=1000)).near.shape == (37, 24)
+
+
+def test_noise_alone_varies_by_what_is_told() -> None:
+    """300 000 photons of an even source, counted 200 times."""
+    edges = np.clip((np.arange(38) - 0.5) * np.pi / 36, 0.0, np.pi)
+    shares = (np.cos(edges)[:-1] - np.cos(edges)[1:]) / 2
+    random = np.random.default_rng(5)
+    found = [variation(_flat(list(random.multinomial(300_000, shares)))) for _ in range(200)]
+    told = np.array([one.noise_alone for one in found])
+    varied = np.array([one.peak_to_peak for one in found])
+    error = varied.std() / math.sqrt(len(varied))
+    assert told.mean() == pytest.approx(varied.mean(), abs=3.0 * error + 0.02 * varied.mean())
+    assert 0.02 < varied.mean() < 0.1

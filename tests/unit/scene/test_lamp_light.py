@@ -136,6 +136,9 @@ def test_a_halogen_lamp_is_hundreds_of_times_a_leds_at_940_nm() -> None:
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"preset": "fluorescent"}, "the table ends at 780 nm, and what the lamp sends from there to 1100 nm is unknown"),
     ({"illuminant": {"points": [["400 nm", 1], ["900 nm", 1]]}}, "the table ends at 900 nm"),
+    ({"illuminant": {"points": [["850 nm", 1], ["1100 nm", 1]]}}, "write it among the 'beacons', by its 'flux'"),
+    ({"illuminant": {"points": [["300 nm", 1], ["600 nm", 1]]}}, "give values from 400 to 700 nm"),
+    ({"illuminant": {"points": [["300 nm", 0], ["800 nm", 0], ["940 nm", 1], ["1100 nm", 0]]}}, "no light from 400"),
     ({"temperature": "2856 K", "infrared": {"share": 0, "least": 0, "most": 1}}, "this spectrum reaches 1100 nm"),
     ({}, "wanted one of 'temperature'"),
     ({"temperature": "2856 K", "illuminant": "FL11"}, "wanted one of 'temperature'"),

@@ -80,7 +80,15 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
         "sensor.quantum_efficiency: covers 400 to 900 nm, but robots.r1.rig.sources.top.spectrum shines from 835",
     ),
     (
-        {"robots.r2.rig.sources.top.spectrum": {"points": [["840 nm", 1.0], ["860 nm", 1.0]]}},
+        {"robots.r2.rig.sources.top.spectrum": {"points": [["900 nm", 0.0], ["940 nm", 1.0], ["960 nm", 0.5]]}},
+        "ends at 960 nm with 50 % of its largest value",
+    ),
+    (
+        {f"{FRONT}.filter.table": {"points": [["930 nm", 0.4], ["940 nm", 0.9], ["960 nm", 0.0]]}},
+        "ends at 930 nm with 44 % of its largest value",
+    ),
+    (
+        {"robots.r2.rig.sources.top.spectrum": {"points": [["840 nm", 0.0], ["850 nm", 1.0], ["860 nm", 0.0]]}},
         "robots.r2.rig.sources.top.spectrum: covers 840 to 860 nm, not 940 nm",
     ),
     ({"robots.r2.rig.sources.top.spectrum": {"points": [["960 nm", 1], ["940 nm", 1]]}}, "increasing wavelength"),

@@ -92,7 +92,7 @@ def test_numbers_alone_are_carried_at_940_nm() -> None:
 
 
 def test_curves_that_end_within_what_is_seen_are_refused_with_the_way_to_mend_it() -> None:
-    short = scene(points=[["930 nm", 0.5], ["1000 nm", 0.4]])
+    short = scene(points=[["930 nm", 0.9], ["1000 nm", 0.85]])
     with pytest.raises(
         nr.InputError, match=r"materials\.paint\.reflectance: covers 930 to 1000 nm, but .* give data there"
     ) as refused:
@@ -104,15 +104,15 @@ def test_curves_that_end_within_what_is_seen_are_refused_with_the_way_to_mend_it
 
 
 def test_what_little_lies_beyond_data_is_in_the_error_as_if_anything_could_be_there() -> None:
-    """0.4 of a wall known from 925 to 948 nm: what is beyond could be 0 or 1, so 0.6 / 0.4 of its share may be off."""
-    wall = scene(points=[["925 nm", 0.4], ["948 nm", 0.4]]).with_({"render.wavelengths.error": 0.5})
+    """A wall of 0.75 known from 925 to 948 nm, which light may meet three times: 0.42, and beyond it could be 1."""
+    wall = scene(points=[["925 nm", 0.75], ["948 nm", 0.75]]).with_({"render.wavelengths.error": 0.5})
     camera, source = wall.camera("r1.front")[1], wall.sources()["r2.top"][1]
     wavelength_m = np.arange(300e-9, 1100.1e-9, 0.25e-9)
     parts = sensed(camera, source, wavelength_m)
     share = (parts * ((wavelength_m < 925e-9) | (wavelength_m > 948e-9))).sum(axis=1).max()
     assert 1e-3 < share < 0.2
     found = carried_wavelengths(wall.at(0.0), "r1.front")
-    assert found.error == pytest.approx(share * 0.6 / 0.4, rel=0.02)
+    assert found.error == pytest.approx(share * (0.75**-3 - 1.0), rel=0.02)
 
 
 def test_what_is_sensed_is_what_the_camera_responds_to() -> None:

@@ -72,6 +72,15 @@ def test_current_heats_the_junction_through_its_thermal_resistance() -> None:
     assert centroid_nm(source({**driven, "duty": 0.1})) == pytest.approx(940.0 + 0.3 * 6.75, abs=0.01)
 
 
+def test_a_higher_current_heats_by_its_own_voltage() -> None:
+    """1 A at 2.3 V, a twentieth of the time: 450 K/W × 2.3 V × 50 mA = 51.75 K, not 33.75 K by 1.5 V."""
+    led = {"preset": "sfh_4545", "ambient_temperature": "298.15 K", "current": "1 A", "duty": 0.05}
+    assert centroid_nm(source(led)) == pytest.approx(940.0 + 0.3 * 51.75, abs=0.01)
+    assert emission_units(source(led)) == pytest.approx(0.2 * 7.64 * (1.0 - 0.005 * 51.75), rel=1e-12)
+    half = {**led, "current": "550 mA"}  # midway between the points
+    assert centroid_nm(source(half)) == pytest.approx(940.0 + 0.3 * 450.0 * 1.9 * 0.0275, abs=0.01)
+
+
 def test_current_drives_the_flux_along_the_data_sheets_points() -> None:
     """4200 mW/sr at 1 A over 550 at 100 mA; between them a power law."""
     share = emission_units(source({"preset": "sfh_4545", "current": "300 mA"})) / 0.2
@@ -87,6 +96,21 @@ def test_current_drives_the_flux_along_the_data_sheets_points() -> None:
         ({"preset": "sfh_4545", "junction_temperature": "400 K"}, "outside the 233.15 to 373.15 K"),
         ({"preset": "sfh_4545", "ambient_temperature": "320 K"}, "the junction is at 387.5 K"),
         ({"preset": "infra_swarm", "ambient_temperature": "300 K"}, "give them, or 'junction_temperature'"),
+        (
+            {
+                "preset": "sfh_4545",
+                "ambient_temperature": "298.15 K",
+                "current": "1 A",
+                "duty": 0.05,
+                "forward_voltage": "1.5 V",
+                "voltage_at_current": None,
+            },
+            "what it is at 1 A is not known, and so neither is the heat",
+        ),
+        (
+            {"preset": "sfh_4545", "ambient_temperature": "298.15 K", "forward_voltage": "1.5 V"},
+            "write either 'forward_voltage' or 'voltage_at_current'",
+        ),
         ({"centroid": "940 nm"}, "wanted 'centroid' and 'fwhm'"),
         (
             {"preset": "sfh_4545", "wavelength_shift": "0.3 nm"},

@@ -21,7 +21,7 @@ from nir_render.scene.documents.base import (
 from nir_render.scene.documents.curves import CurveDocument
 from nir_render.scene.documents.files import PresetDocument
 from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
-from nir_render.spectra.illuminants import CIE_END_M, SILICON_M, CieLamp
+from nir_render.spectra.illuminants import CIE_END_M, SILICON_M, VISIBLE_M, CieLamp
 
 _DIRECTIONS = {"up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0)}
 
@@ -72,6 +72,22 @@ class Lamp(PresetDocument):
     def _a_table(cls, illuminant: CieLamp | CurveDocument | None) -> CieLamp | CurveDocument | None:
         if isinstance(illuminant, CurveDocument) and illuminant.points is None:
             raise ValueError("wanted the name of a table, 'points' or 'file'")
+        if isinstance(illuminant, CurveDocument):
+            assert illuminant.points is not None
+            first_m, last_m = illuminant.points[0][0], illuminant.points[-1][0]
+            if first_m > VISIBLE_M[0] + 1e-12 or last_m < VISIBLE_M[1] - 1e-12:
+                raise ValueError(
+                    f"the table covers {first_m * 1e9:.4g} to {last_m * 1e9:.4g} nm, but 'luminous_flux' is "
+                    "what the eye sees of it: give values from 400 to 700 nm, 0 where nothing is sent (a "
+                    "lamp of infrared alone has no lumens: write it among the 'beacons', by its 'flux')"
+                )
+            if not any(
+                value for place_m, value in illuminant.points if VISIBLE_M[0] <= place_m <= VISIBLE_M[1]
+            ):
+                raise ValueError(
+                    "the table has no light from 400 to 700 nm, so no 'luminous_flux' tells how much it "
+                    "sends: write a lamp of infrared alone among the 'beacons', by its 'flux'"
+                )
         return illuminant
 
     @model_validator(mode="after")

@@ -19,6 +19,7 @@ from nir_render.scene.documents.base import (
     SpectralIrradiance,
 )
 from nir_render.scene.documents.files import PresetDocument
+from nir_render.spectra.illuminants import SUN_RADIUS_RAD
 from nir_render.spectra.sunlight import sun_position
 
 
@@ -52,15 +53,15 @@ class Sun(Document):
     """The sun: `azimuth` from world x towards y, `elevation` above the horizon; or a `place` and a `time`.
 
     Its light comes through `air`, or is an `irradiance`, the spectral one across its direction at 940 nm,
-    taken as flat over what silicon sees: 0.305 W/m²/nm is 3.05 W/m² from 935 to 945 nm, as ASTM G173 has it
-    (global). `clouds` is the share of its light that these let through. `day_of_year` sets its distance,
-    without it the mean one.
+    taken as flat over what silicon sees: 0.287 W/m²/nm is 2.87 W/m² from 935 to 945 nm, as ASTM G173 has it
+    of the direct sun (with the sky, on its tilted plane, 3.05). `clouds` is the share of its light that these
+    let through. `day_of_year` sets its distance, without it the mean one.
     """
 
-    angular_radius_rad: ClassVar[float] = math.radians(0.2666)
+    angular_radius_rad: ClassVar[float] = SUN_RADIUS_RAD
     read_keys: ClassVar[tuple[str, ...]] = ("place", "time")
 
-    example: ClassVar[str] = "{azimuth: 30 deg, elevation: 40 deg, irradiance: 0.305 W/m^2/nm}"
+    example: ClassVar[str] = "{azimuth: 30 deg, elevation: 40 deg, irradiance: 0.287 W/m^2/nm}"
 
     azimuth_rad: Angle
     elevation_rad: Annotated[Angle, Field(gt=0, le=math.pi / 2)]
@@ -100,7 +101,7 @@ class Sun(Document):
     def _one_spectrum(self) -> Self:
         if (self.irradiance_w_per_m3 is None) == (self.air is None):
             raise ValueError(
-                "wanted one of 'irradiance', such as 0.305 W/m^2/nm, and 'air', such as g173, which gives it"
+                "wanted one of 'irradiance', such as 0.287 W/m^2/nm, and 'air', such as g173, which gives it"
             )
         return self
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
 from nir_render.scene.documents.base import Angle, Fraction, Length, Positive, Temperature, WavelengthShift
-from nir_render.scene.documents.curves import CurveDocument
+from nir_render.scene.documents.curves import CurveDocument, check_ends
 from nir_render.scene.documents.files import PresetDocument
 from nir_render.spectra.bandpass import blue_shift, cavities_of_edge, transmission, width_at_half_m
 from nir_render.spectra.curve import Curve
@@ -54,6 +54,7 @@ class Bandpass(PresetDocument):
                 raise ValueError(
                     "wanted 'points' or 'file': transmissions up to 1, not 0 everywhere; write 92 % as 0.92"
                 )
+            check_ends(table.points, "the table")
         return table
 
     @model_validator(mode="after")

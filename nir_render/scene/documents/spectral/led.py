@@ -2,6 +2,7 @@
 
 from typing import Annotated, Any, ClassVar, Self
 
+import numpy as np
 from pydantic import Field, field_serializer, field_validator, model_validator
 
 from nir_render.errors import shown
@@ -17,7 +18,7 @@ from nir_render.scene.documents.base import (
     Voltage,
     WavelengthShift,
 )
-from nir_render.scene.documents.curves import CurveDocument, Points, parse_points, write_points
+from nir_render.scene.documents.curves import CurveDocument, Points, check_ends, parse_points, write_points
 from nir_render.scene.documents.files import PresetDocument
 from nir_render.scene.text.units import CURRENT
 from nir_render.spectra.curve import Curve
@@ -32,9 +33,10 @@ class Led(PresetDocument):
     `reference_current`, and so does the source's flux. With the junction's temperature the spectrum moves as
     a whole by `wavelength_shift`, the flux changes by `power_shift`, in proportion; with the current the flux
     follows `power_at_current`: points of [current, relative flux], straight on logarithmic axes. The junction
-    has `junction_temperature`, or what `ambient_temperature` + `thermal_resistance` × `forward_voltage` ×
-    `current` × `duty` makes of it: so current moves the spectrum too. Outside `coolest` … `hottest` and
-    the points of `power_at_current` nothing is known: refused.
+    has `junction_temperature`, or what `ambient_temperature` + `thermal_resistance` × voltage × `current` ×
+    `duty` makes of it: so current moves the spectrum too. The voltage is `forward_voltage`, that at the
+    reference current, or follows `voltage_at_current`, points of [current, volts], straight between them.
+    Outside `coolest` … `hottest` and the points over current nothing is known: refused.
     """
 
     preset_folder: ClassVar[str] = "leds"
@@ -55,15 +57,16 @@ class Led(PresetDocument):
     power_at_current_a: Points | None = None
     thermal_resistance_k_per_w: Annotated[ThermalResistance, Positive] | None = None
     forward_voltage_v: Annotated[Voltage, Positive] | None = None
+    voltage_at_current_a: Points | None = None
     duty: Annotated[Fraction, Field(gt=0, le=1)] = 1.0
 
-    @field_validator("power_at_current_a", mode="before")
+    @field_validator("power_at_current_a", "voltage_at_current_a", mode="before")
     @classmethod
-    def _parse_powers(cls, points: Any) -> Any:
+    def _parse_currents(cls, points: Any) -> Any:
         return None if points is None else parse_points(points, CURRENT, "current", "['100 mA', 1]")
 
-    @field_serializer("power_at_current_a")
-    def _write_powers(self, points: Points | None) -> list[list[Any]] | None:
+    @field_serializer("power_at_current_a", "voltage_at_current_a")
+    def _write_currents(self, points: Points | None) -> list[list[Any]] | None:
         return write_points(points, CURRENT)
 
     @model_validator(mode="after")
@@ -76,6 +79,8 @@ class Led(PresetDocument):
             )
         if self.table is not None and self.table.points is None:
             raise ValueError("table: wanted 'points' or 'file', the spectrum over wavelength")
+        if self.table is not None:
+            check_ends(self.table.points, "table: it")
         return self
 
     @model_validator(mode="after")
@@ -88,15 +93,10 @@ class Led(PresetDocument):
                 "'power_at_current', such as [['10 mA', 0.1], ['100 mA', 1]]"
             )
         powers = [power for _, power in self.power_at_current_a]
-        least_a, most_a = self.power_at_current_a[0][0], self.power_at_current_a[-1][0]
-        if min(powers) <= 0.0 or least_a <= 0.0:
+        if min(powers) <= 0.0 or self.power_at_current_a[0][0] <= 0.0:
             raise ValueError("power_at_current: wanted currents and relative fluxes above 0")
         for key, current_a in (("current", self.current_a), ("reference_current", self.reference_current_a)):
-            if not least_a <= current_a <= most_a:
-                raise ValueError(
-                    f"{key}: {current_a:g} A lies outside the {least_a:g} to {most_a:g} A of "
-                    "'power_at_current'; data are not extrapolated: take one within, or give more points"
-                )
+            _within(key, current_a, "power_at_current", self.power_at_current_a)
         return self
 
     @model_validator(mode="after")
@@ -107,11 +107,14 @@ class Led(PresetDocument):
                     "write either 'junction_temperature' or 'ambient_temperature', from which it follows; "
                     "set the other to null"
                 )
-            if None in (self.thermal_resistance_k_per_w, self.forward_voltage_v, self._current_in_use_a):
+            voltage = self.forward_voltage_v or self.voltage_at_current_a
+            if None in (self.thermal_resistance_k_per_w, voltage, self._current_in_use_a):
                 raise ValueError(
-                    "ambient_temperature: the junction's follows by 'thermal_resistance', 'forward_voltage' "
-                    "and 'current'; give them, or 'junction_temperature' in its place"
+                    "ambient_temperature: the junction's follows by 'thermal_resistance', "
+                    "'forward_voltage' or 'voltage_at_current', and 'current'; give them, or "
+                    "'junction_temperature' in its place"
                 )
+            self._check_voltage()
         if not self.coolest_k <= self.temperature_k <= self.hottest_k:
             raise ValueError(
                 f"the junction is at {self.temperature_k:.5g} K, outside the {self.coolest_k:g} to "
@@ -123,6 +126,23 @@ class Led(PresetDocument):
                 f"power_shift leaves no light at {self.temperature_k:.5g} K; check it: -0.3 %/K is usual"
             )
         return self
+
+    def _check_voltage(self) -> None:
+        """Raise ValueError where the voltage at the current in use is not known."""
+        current_a = self._current_in_use_a
+        assert current_a is not None
+        if self.voltage_at_current_a is not None:
+            if self.forward_voltage_v is not None:
+                raise ValueError(
+                    "write either 'forward_voltage' or 'voltage_at_current'; set the other to null"
+                )
+            _within("current", current_a, "voltage_at_current", self.voltage_at_current_a)
+        elif self.current_a is not None and self.current_a != self.reference_current_a:
+            raise ValueError(
+                f"forward_voltage is that at the reference current; what it is at {current_a:g} A is not "
+                "known, and so neither is the heat: give 'voltage_at_current', such as "
+                "[['100 mA', 1.5], ['1 A', 2.3]], in its place, or 'junction_temperature'"
+            )
 
     @property
     def _current_in_use_a(self) -> float | None:
@@ -138,8 +158,12 @@ class Led(PresetDocument):
         current_a = self._current_in_use_a
         assert current_a is not None
         assert self.thermal_resistance_k_per_w is not None
-        assert self.forward_voltage_v is not None
-        heat_w = self.forward_voltage_v * current_a * self.duty
+        volts = self.forward_voltage_v
+        if self.voltage_at_current_a is not None:
+            currents_a, voltages_v = np.array(self.voltage_at_current_a).T
+            volts = float(np.interp(current_a, currents_a, voltages_v))
+        assert volts is not None
+        heat_w = volts * current_a * self.duty
         return self.ambient_temperature_k + self.thermal_resistance_k_per_w * heat_w
 
     @property
@@ -166,6 +190,15 @@ class Led(PresetDocument):
         assert self.centroid_m is not None
         assert self.fwhm_m is not None
         return led_spectrum(self.centroid_m + self.shift_m, self.fwhm_m, self.skew, name)
+
+
+def _within(key: str, current_a: float, table: str, points: Points) -> None:
+    least_a, most_a = points[0][0], points[-1][0]
+    if not least_a <= current_a <= most_a:
+        raise ValueError(
+            f"{key}: {current_a:g} A lies outside the {least_a:g} to {most_a:g} A of {table!r}; data are "
+            "not extrapolated: take one within, or give more points"
+        )
 
 
 class UnitOffset(Document):
@@ -199,6 +232,7 @@ class SpectrumDocument(CurveDocument):
                 f"{shown(self.constant)}: a spectrum needs a shape; "
                 "write 'led', 'gaussian', 'points' or 'file'"
             )
+        check_ends(self.points, "the table")
         return self
 
     def curve(self, name: str) -> Curve:

@@ -10,6 +10,7 @@ import nir_render as nr
 from nir_render.camera.optics.leak import Leak, leak
 from nir_render.camera.optics.response import response
 from nir_render.scene.documents.files import preset_names
+from nir_render.spectra.illuminants import sunlight_ceiling
 from tests.paths import SCENES
 
 FRONT = "robots.r1.rig.cameras.front"
@@ -74,11 +75,39 @@ def test_the_leak_of_lamp_and_sun_is_the_integral_over_all_that_silicon_sees(
 
     found = seen(scene(quantum_efficiency={"points": MEASURED}, efficiency_envelope=None), emitter)
     assert found.out_of_band_e_per_j == pytest.approx(by_hand_e_per_j(density, efficiency), rel=2e-4)
-    assert found.high_e_per_j == pytest.approx(found.out_of_band_e_per_j, rel=1e-9)
-    assert found.low_e_per_j == pytest.approx(by_hand_e_per_j(density, efficiency, floor=0.0), rel=2e-3)
+    if emitter != "sun":  # of this one the spectrum too lies between bounds
+        assert found.high_e_per_j == pytest.approx(found.out_of_band_e_per_j, rel=1e-9)
+        assert found.low_e_per_j == pytest.approx(by_hand_e_per_j(density, efficiency, floor=0.0), rel=2e-3)
     whole = found.in_band_e_per_j + found.out_of_band_e_per_j
     camera = scene(quantum_efficiency={"points": MEASURED}, efficiency_envelope=None).camera("r1.front")[1]
     assert whole == pytest.approx(float(response(camera, scene().emitters()[emitter])(0.0)), rel=1e-4)
+
+
+def test_a_sun_known_at_940_nm_leaks_between_nothing_and_all_that_the_sun_sends() -> None:
+    """1.25 times a black body of 5772 K of the sun's size, which ASTM G173's sun, above and below the air, keeps to."""
+    pvlib = pytest.importorskip("pvlib", reason="pvlib is not installed: pip install 'nir-render[sun]'")
+    table = pvlib.spectrum.get_reference_spectra(standard="ASTM G173-03").loc[300.0:1100.0]
+    ceiling = sunlight_ceiling(table.index.to_numpy() * 1e-9) * 1e-9
+    assert (table["extraterrestrial"].to_numpy() < ceiling).all()
+    assert ceiling.max() < 1.25 * table["extraterrestrial"].max()
+    even = {"points": [["300 nm", 0.15], ["1100 nm", 0.15]]}
+    flat = scene(quantum_efficiency=even, efficiency_envelope=None)
+    found = seen(flat, "sun")
+    real = seen(flat.with_({"sun.irradiance": None, "sun.air": "g173"}), "sun")
+    share = real.out_of_band_e_per_j / real.in_band_e_per_j
+    assert found.low_e_per_j == 0.0
+    assert 1.5 * found.out_of_band_e_per_j < share * found.in_band_e_per_j < 0.7 * found.high_e_per_j
+
+    def most(nm: Any) -> Any:
+        """W/m²/nm: π B(5772 K) sin² of the sun's radius."""
+        hot = np.expm1(constants.h * constants.c / (constants.k * 5772.0 * nm * 1e-9))
+        exitance = 2.0 * np.pi * constants.h * constants.c**2 / ((nm * 1e-9) ** 5 * hot)
+        return 1.25 * 1e-9 * exitance * np.sin(np.radians(0.2666)) ** 2
+
+    nm = np.linspace(300.0, 1100.0, 80_001)
+    sent = float(np.trapezoid(most(nm), nm)) / (0.305 * 800.0)
+    by_hand = sent * by_hand_e_per_j(most, lambda nm: np.full_like(nm, 0.15))
+    assert found.high_e_per_j == pytest.approx(by_hand, rel=2e-3)
 
 
 def test_one_flat_number_understates_the_leak_that_its_envelope_allows() -> None:
@@ -93,9 +122,9 @@ def test_one_flat_number_understates_the_leak_that_its_envelope_allows() -> None
 @pytest.mark.parametrize("sensor", preset_names("sensors"))
 def test_frames_of_either_end_of_the_envelope_leak_what_the_interval_says(sensor: str) -> None:
     """The interval's ends, less the floor at its low end, are what frames made with these ends hold."""
-    known = seen(scene(preset=sensor), "sun")
-    high = seen(scene(preset=sensor, efficiency_taken="high"), "sun")
-    low = seen(scene(preset=sensor, efficiency_taken="low"), "sun")
+    known = seen(scene(preset=sensor), "lamps.lamp")
+    high = seen(scene(preset=sensor, efficiency_taken="high"), "lamps.lamp")
+    low = seen(scene(preset=sensor, efficiency_taken="low"), "lamps.lamp")
     assert high.out_of_band_e_per_j == pytest.approx(known.high_e_per_j, rel=1e-9)
     assert known.low_e_per_j < low.out_of_band_e_per_j < high.out_of_band_e_per_j
 
@@ -103,7 +132,7 @@ def test_frames_of_either_end_of_the_envelope_leak_what_the_interval_says(sensor
 def test_where_a_table_ends_the_leak_is_an_interval() -> None:
     """A curve from 800 to 1000 nm: beyond it between nothing and every photon that the filter's floor lets through."""
     short = {"points": [["800 nm", 0.3], ["1000 nm", 0.1]]}
-    found = seen(scene(quantum_efficiency=short, efficiency_envelope=None), "sun")
+    found = seen(scene(quantum_efficiency=short, efficiency_envelope=None), "lamps.lamp")
 
     def most(nm: Any) -> Any:
         return np.where((nm >= 800) & (nm <= 1000), np.interp(nm, [800, 1000], [0.3, 0.1]), 1.0)
@@ -112,9 +141,9 @@ def test_where_a_table_ends_the_leak_is_an_interval() -> None:
         return np.where((nm >= 800) & (nm <= 1000), np.interp(nm, [800, 1000], [0.3, 0.1]), 0.0)
 
     # The table's ends are jumps, each known to half a step of 0.1 nm: 0.3 · 0.05 nm of 200 nm at 0.2.
-    assert found.high_e_per_j == pytest.approx(by_hand_e_per_j(np.ones_like, most), rel=1e-3)
-    assert found.out_of_band_e_per_j == pytest.approx(by_hand_e_per_j(np.ones_like, least), rel=1e-3)
-    assert found.low_e_per_j == pytest.approx(by_hand_e_per_j(np.ones_like, least, floor=0.0), rel=2e-3)
+    assert found.high_e_per_j == pytest.approx(by_hand_e_per_j(planck, most), rel=1e-3)
+    assert found.out_of_band_e_per_j == pytest.approx(by_hand_e_per_j(planck, least), rel=1e-3)
+    assert found.low_e_per_j == pytest.approx(by_hand_e_per_j(planck, least, floor=0.0), rel=2e-3)
 
 
 def test_without_a_filter_all_must_be_known() -> None:
