@@ -7,7 +7,15 @@ from numpy.typing import NDArray
 
 from nir_render.geometry import rectangle_frame
 from nir_render.scene.documents.base import Orientation
-from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.documents.shapes import (
+    Box,
+    Cylinder,
+    Mesh,
+    Rectangle,
+    ShapeDocument,
+    Sphere,
+    by_material,
+)
 from nir_render.scene.motion import frame_pose
 from nir_render.scene.pose import Pose, rotation_of
 
@@ -45,15 +53,17 @@ def carried(shape: ShapeDocument, pose: Pose) -> ShapeDocument:
 
 def shapes_at(shapes: Mapping[str, ShapeDocument], time_s: float) -> dict[str, ShapeDocument]:
     """Return the scene's own shapes where their motions have brought them; what stands still is as it was."""
-    return {
-        name: carried(shape, frame_pose(shape, time_s)) if shape.moves else shape
-        for name, shape in shapes.items()
-    }
+    return by_material(
+        {
+            name: carried(shape, frame_pose(shape, time_s)) if shape.moves else shape
+            for name, shape in shapes.items()
+        }
+    )
 
 
 def body_shapes(robot: str, body: Mapping[str, ShapeDocument], pose: Pose) -> dict[str, ShapeDocument]:
     """Return the shapes of a robot's body in the world, by `robot.body.shape`."""
-    return {f"{robot}{BODY}{name}": carried(shape, pose) for name, shape in body.items()}
+    return by_material({f"{robot}{BODY}{name}": carried(shape, pose) for name, shape in body.items()})
 
 
 def place_of_shape(name: str) -> str:

@@ -11,10 +11,11 @@ from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.materials import Dielectric, Pane
 from nir_render.scene.documents.sensor import Sensor
-from nir_render.scene.documents.shapes import Box, Cylinder, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, ShapeDocument, Sphere
 from nir_render.scene.documents.times.clocks import JITTER_SIGMAS, CameraClock
 from nir_render.scene.documents.times.motion import Moving
 from nir_render.scene.emission import emission_spectrum
+from nir_render.scene.meshes.mesh import lies_open
 from nir_render.scene.motion import (
     camera_positions_m,
     frame_positions_m,
@@ -158,6 +159,13 @@ def _sheets_and_solids(document: SceneDocument) -> list[str]:
                 f"{place}.material: {shown(shape.material)} is a solid dielectric, and a rectangle has "
                 "no inside; use the type 'pane' for a sheet of glass, or a box"
             )
+        if isinstance(material, Dielectric) and isinstance(shape, Mesh):
+            open_by = lies_open(shape.parts())
+            if open_by is not None:
+                problems.append(
+                    f"{place}.material: {shown(shape.material)} is a solid dielectric, and {shape.file} "
+                    f"has no inside: {open_by}"
+                )
     return problems
 
 

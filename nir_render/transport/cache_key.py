@@ -47,7 +47,7 @@ _CODE = (
 )
 
 # Of a shape: its material is told beside it; a snapshot has it where its motion has brought it.
-_ELSEWHERE = {"material", "motion", "between", "path"}
+_ELSEWHERE = {"material", "materials", "motion", "between", "path"}
 
 Sampled = NDArray[np.int64] | int | str | tuple[str, NDArray[np.int64]] | None
 

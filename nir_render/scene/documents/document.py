@@ -29,7 +29,7 @@ from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import expand_preset, preset_names
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import MaterialDocument, is_black
-from nir_render.scene.documents.shapes import ShapeDocument
+from nir_render.scene.documents.shapes import ShapeDocument, by_material
 from nir_render.scene.documents.times.clocks import Clock
 from nir_render.scene.documents.times.motion import Moving, Waypoint
 from nir_render.spectra.lambert import polygon_share
@@ -214,7 +214,12 @@ class SceneDocument(Document):
         if not isinstance(data.get("materials") or {}, dict):
             return data
         materials = dict(data.get("materials") or {})
-        named = {str(shape.get("material")) for shape in data["shapes"].values() if isinstance(shape, dict)}
+        named: set[str] = set()
+        for shape in data["shapes"].values():
+            if isinstance(shape, dict):
+                of_slots = shape.get("materials")
+                named |= {str(shape.get("material"))}
+                named |= set(map(str, of_slots.values())) if isinstance(of_slots, dict) else set()
         for name in sorted(named & set(preset_names("materials")) - set(materials)):
             folder = info.context["folder"] if info.context else Path()
             materials[name] = expand_preset(name, "materials", folder)
@@ -314,13 +319,13 @@ class SceneDocument(Document):
         return [f"{robot}.{name}" for name in cameras]
 
     def all_shapes(self) -> dict[str, ShapeDocument]:
-        """Return the scene's shapes and those of the robots' bodies, by their place in the document."""
+        """Return the scene's shapes and those of the robots' bodies, by their place; each of one material."""
         bodies = {
             f"robots.{robot}.rig.body.{name}": shape
             for robot, carrier in self.robots.items()
             for name, shape in carrier.rig.body.items()
         }
-        return {f"shapes.{name}": shape for name, shape in self.shapes.items()} | bodies
+        return by_material({f"shapes.{name}": shape for name, shape in self.shapes.items()} | bodies)
 
     def has_indirect_light(self) -> bool:
         """Tell whether light comes other than straight from sources: from a lamp, off a body, off fog."""

@@ -1,8 +1,10 @@
 """Models of the bodies that stand in a scene."""
 
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import (
@@ -20,6 +22,10 @@ from nir_render.scene.documents.base import (
 )
 from nir_render.scene.documents.files import resolve_file
 from nir_render.scene.documents.times.motion import Moving
+from nir_render.scene.meshes.mesh import MeshPart
+from nir_render.scene.meshes.read import SUFFIXES, read_mesh
+
+_FARTHEST_M = 10_000.0
 
 
 class _Shape(Moving):
@@ -85,22 +91,63 @@ class Cylinder(_Shape):
 
 
 class Mesh(_Shape):
-    """A triangle mesh from a PLY or OBJ file in metres, scaled, turned and moved."""
+    """A triangle mesh from a PLY, OBJ, STL or glTF file, in metres once scaled, turned and moved.
+
+    Slots, the names of materials in OBJ and glTF files, may have `materials` of their own; `material` is that
+    of all others. `up` is the file's axis that stands upright: y for glTF, z for all others where not said.
+    Flat triangles stay flat; where the file has normals the surface is shaded as they say.
+    """
 
     example: ClassVar[str] = "{type: mesh, file: body.ply, material: black}"
 
     type: Literal["mesh"]
     file: str
     scale: Annotated[float, Field(gt=0, le=1e6)] = 1.0
+    up: Literal["y", "z"] | None = None
     position_m: Position = (0.0, 0.0, 0.0)
     orientation: Orientation = Orientation()
+    materials: dict[str, str] | None = None
+    slot: str | None = None
 
     @field_validator("file")
     @classmethod
     def _find(cls, name: str, info: ValidationInfo) -> str:
-        if not name.lower().endswith((".ply", ".obj")):
-            raise ValueError(f"{shown(name)} is neither a .ply nor an .obj file; write the name of one")
+        if not name.lower().endswith(SUFFIXES):
+            raise ValueError(
+                f"{shown(name)} is none of {', '.join(SUFFIXES)}; export the mesh as one of these"
+            )
         return str(resolve_file(name, info))
+
+    @model_validator(mode="after")
+    def _look_inside(self) -> Self:
+        parts = read_mesh(self.file, self.up)
+        slots = [part.slot for part in parts]
+        for key, named in (
+            ("materials", [*(self.materials or {})]),
+            ("slot", [self.slot] * (self.slot is not None)),
+        ):
+            for name in named:
+                if name not in slots:
+                    known = ", ".join(map(repr, filter(None, slots))) or "none"
+                    raise ValueError(f"{key}: {self.file} has no slot {shown(name)}; known: {known}")
+        extent_m = self.scale * max(float(np.abs(part.vertices).max()) for part in parts)
+        if extent_m > _FARTHEST_M:
+            raise ValueError(
+                f"{self.file}: reaches {extent_m:.3g} m from its origin; files are in metres: write "
+                "'scale: 0.001' for one in millimetres"
+            )
+        return self
+
+    def parts(self) -> tuple[MeshPart, ...]:
+        """Return what it is of the file: one slot, or all.
+
+        Raises
+        ------
+        ValueError
+            The file has changed since the scene was loaded, and cannot be read.
+        """
+        parts = read_mesh(self.file, self.up)
+        return parts if self.slot is None else tuple(part for part in parts if part.slot == self.slot)
 
 
 ShapeDocument = Annotated[
@@ -111,3 +158,20 @@ ShapeDocument = Annotated[
         Rectangle, Box, Sphere, Cylinder, Mesh,
     ),
 ]  # fmt: skip
+
+
+def by_material(shapes: Mapping[str, ShapeDocument]) -> dict[str, ShapeDocument]:
+    """Return shapes of one material each, by name: of a mesh with `materials`, one for each slot."""
+    found: dict[str, ShapeDocument] = {}
+    for name, shape in shapes.items():
+        if not isinstance(shape, Mesh) or not shape.materials or shape.slot is not None:
+            found[name] = shape
+            continue
+        for part in shape.parts():
+            own = {
+                "slot": part.slot,
+                "material": shape.materials.get(part.slot, shape.material),
+                "materials": None,
+            }
+            found[f"{name}.{part.slot}" if part.slot else name] = shape.model_copy(update=own)
+    return found

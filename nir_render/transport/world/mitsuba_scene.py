@@ -1,6 +1,6 @@
 """A scene's bodies at one time as a Mitsuba scene."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from nir_render.scene.documents.materials import (
     RoughConductor,
     number,
 )
-from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, Sphere
 from nir_render.scene.pose import rotation_of
 from nir_render.scene.snapshot import Snapshot
 from nir_render.scene.text.units import LENGTH, format_vector
@@ -85,6 +85,10 @@ def described(
         if isinstance(material, Pane) and not panes:
             continue
         bsdf = _bsdf(material)
+        if isinstance(shape, Mesh):
+            key = f"shape_{body_id(name)}_0"
+            bodies[key] = _mesh(key, shape, bsdf)
+            continue
         for part, body in enumerate(_bodies(shape)):
             bodies[f"shape_{body_id(name)}_{part}"] = {**body, "bsdf": bsdf}
     for index, (name, placed) in enumerate(snapshot.sources.items()):
@@ -127,16 +131,20 @@ def source_spheres(bodies: Any) -> list[Any]:
 
 def check_meshes(snapshot: Snapshot, point_m: NDArray[np.float64], what: str) -> None:
     """Raise InputError where a point is inside a closed mesh: a ray leaves it an odd number of times."""
+    whole: dict[tuple[Any, ...], list[tuple[str, Mesh]]] = {}
     for name, shape in snapshot.shapes.items():
-        if isinstance(shape, Mesh) and _crossings(shape, point_m) % 2 == 1:
-            raise InputError(f"{snapshot.origin}: {what} is inside {place_of_shape(name)}; move one of them")
+        if isinstance(shape, Mesh):
+            key = (shape.file, shape.up, shape.scale, shape.position_m, str(shape.orientation))
+            whole.setdefault(key, []).append((name, shape))
+    for parts in whole.values():
+        if _crossings([shape for _, shape in parts], point_m) % 2 == 1:
+            place = place_of_shape(parts[0][0])
+            raise InputError(f"{snapshot.origin}: {what} is inside {place}; move one of them")
 
 
-def _crossings(shape: Mesh, point_m: NDArray[np.float64]) -> int:
-    try:
-        body = mi.load_dict({"type": "scene", "mesh": _bodies(shape)[0]})
-    except RuntimeError as error:
-        raise InputError(f"{shape.file}: cannot be read as a mesh: {' '.join(str(error).split())}") from None
+def _crossings(shapes: Sequence[Mesh], point_m: NDArray[np.float64]) -> int:
+    parts = {f"part_{index}": _mesh(f"part_{index}", shape, _BLACK) for index, shape in enumerate(shapes)}
+    body = mi.load_dict({"type": "scene", **parts}, optimize=False)
     direction = mi.Vector3f(
         0.2672612, 0.5345225, 0.8017837
     )  # a direction that axis-aligned edges do not share
@@ -149,7 +157,37 @@ def _crossings(shape: Mesh, point_m: NDArray[np.float64]) -> int:
     return 0
 
 
-def _bodies(shape: ShapeDocument) -> list[dict[str, Any]]:
+def _mesh(name: str, shape: Mesh, bsdf: dict[str, Any]) -> Any:
+    """Return a mesh for Mitsuba, in the world: flat where its file has no normals.
+
+    Mitsuba's own readers of files make normals up where there are none: a box would shine like a ball.
+    """
+    try:
+        parts = shape.parts()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{shape.file}: cannot be read any more: {error}") from None
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + np.uint32(at) for part, at in zip(parts, first, strict=False)])
+    rotation = rotation_of(shape.orientation)
+    vertices_m = np.concatenate([part.vertices for part in parts]) @ (shape.scale * rotation.T) + np.array(
+        shape.position_m
+    )
+    given = [part.normals for part in parts if part.normals is not None]
+    smooth = len(given) == len(parts)
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf, optimize=False)
+    properties.set_id(name)
+    mesh = mi.Mesh(name, len(vertices_m), len(faces), props=properties, has_vertex_normals=smooth)
+    arrays = mi.traverse(mesh)
+    arrays["vertex_positions"] = vertices_m.astype(np.float32).ravel()
+    arrays["faces"] = faces.ravel()
+    if smooth:
+        arrays["vertex_normals"] = (np.concatenate(given) @ rotation.T).astype(np.float32).ravel()
+    arrays.update()
+    return mesh
+
+
+def _bodies(shape: Rectangle | Box | Sphere | Cylinder) -> list[dict[str, Any]]:
     match shape:
         case Rectangle():
             frame = rectangle_frame(shape.normal, shape.size_m, shape.rotation_rad)
@@ -166,10 +204,6 @@ def _bodies(shape: ShapeDocument) -> list[dict[str, Any]]:
             return [{"type": "sphere", "center": list(shape.center_m), "radius": shape.radius_m}]
         case Cylinder():
             return _closed_cylinder(shape)
-        case Mesh():
-            kind = shape.file.rsplit(".", 1)[1].lower()
-            placed = _matrix(rotation_of(shape.orientation) * shape.scale, shape.position_m)
-            return [{"type": kind, "filename": shape.file, "to_world": placed}]
 
 
 def _uniform(value: float) -> dict[str, Any]:

@@ -53,7 +53,7 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"materials.m": {"type": "diffuse", "reflectance": "#ff0000"}}, "RGB colours have no meaning at 940 nm"),
     ({"materials.m": {"type": "diffuse", "reflectance": 1.2}}, "materials.m.reflectance: input should be less than"),
     ({"shapes.m": {"type": "mesh", "file": "no.ply", "material": "black"}}, "there is no file 'no.ply'"),
-    ({"shapes.m": {"type": "mesh", "file": "no.stl", "material": "black"}}, "neither a .ply nor an .obj"),
+    ({"shapes.m": {"type": "mesh", "file": "no.dae", "material": "black"}}, "none of .ply, .obj, .stl, .glb, .gltf"),
     ({f"{FRONT}.sensor.bit_depth": "17 bit"}, f"{FRONT}.sensor.bit_depth: input should be less than or equal to 16"),
     ({f"{FRONT}.sensor.bit_depth": "10.5 bit"}, "10.5 is not a whole number of bits"),
     ({f"{FRONT}.sensor.full_well": "-5 e"}, f"{FRONT}.sensor.full_well: input should be greater than 0"),

@@ -1,0 +1,1 @@
+"""Triangle meshes from files of Blender and CAD, looked into before anything is rendered."""

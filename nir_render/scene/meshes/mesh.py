@@ -1,0 +1,93 @@
+"""What a mesh file holds: the triangles of each slot, and what must be true of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """The triangles that are of one material.
+
+    Attributes
+    ----------
+    slot
+        The material's name in the file, empty where it has none.
+    vertices
+        Shape (n, 3), z up, in units of the file.
+    normals
+        Unit vectors at the vertices, shape (n, 3), where the file gives them: between them the surface is
+        shaded as if it were round. None is flat triangles.
+    faces
+        Vertices of each triangle, counterclockwise seen from outside, shape (m, 3).
+    """
+
+    slot: str
+    vertices: Array
+    normals: Array | None
+    faces: NDArray[np.uint32]
+
+
+def checked(part: MeshPart) -> MeshPart:
+    """Return a part without triangles of no area, which no light can meet.
+
+    Raises
+    ------
+    ValueError
+        A vertex or normal that is not finite, a triangle of a vertex that is not there, none with an area.
+    """
+    named = f" of the slot {part.slot!r}" if part.slot else ""
+    off = np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))
+    if len(off):
+        raise ValueError(f"vertex {off[0] + 1}{named} is not finite: {_row(part.vertices[off[0]])}")
+    beyond = np.flatnonzero((part.faces >= len(part.vertices)).any(axis=1))
+    if len(beyond):
+        raise ValueError(
+            f"triangle {beyond[0] + 1}{named} wants vertex {int(part.faces[beyond[0]].max()) + 1}, but there "
+            f"are {len(part.vertices)}"
+        )
+    normals = part.normals
+    if normals is not None:
+        length = np.linalg.norm(normals, axis=1)
+        odd = np.flatnonzero(~(np.isfinite(length) & (length > 0.0)))
+        if len(odd):
+            raise ValueError(
+                f"normal {odd[0] + 1}{named} has no direction: {_row(normals[odd[0]])}; export without them"
+            )
+        normals = normals / length[:, None]
+    with np.errstate(over="ignore"):
+        has_area = np.linalg.norm(_doubled_areas(part.vertices, part.faces), axis=1) > 0.0
+    if not has_area.any():
+        raise ValueError(f"there is no triangle{named} with an area; export the surface, not points or edges")
+    return MeshPart(part.slot, part.vertices, normals, part.faces[has_area])
+
+
+def lies_open(parts: tuple[MeshPart, ...]) -> str | None:
+    """Return why parts together have no inside: edges of one triangle alone, faces that look inwards."""
+    corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
+    _, index = np.unique(corners, axis=0, return_inverse=True)
+    triangles = index.reshape(-1, 3).astype(np.int64)
+    count = int(index.max()) + 1
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    there, back = edges @ (count, 1), edges[:, ::-1] @ (count, 1)
+    there = np.sort(there)
+    if not np.array_equal(there, np.sort(back)):
+        unmatched = max(len(np.setdiff1d(there, back)), 1)
+        return f"it is not closed: {unmatched} edges have a triangle on one side alone, or face two ways"
+    volume = 0.0
+    for part in parts:
+        a, b, c = (part.vertices[part.faces[:, corner]] for corner in range(3))
+        volume += float((a * np.cross(b, c)).sum())
+    return None if volume > 0.0 else "its triangles look inwards: turn its normals over"
+
+
+def _doubled_areas(vertices: Array, faces: NDArray[np.uint32]) -> Array:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _row(values: Array) -> str:
+    return f"[{', '.join(f'{value:g}' for value in values)}]"

@@ -1,0 +1,127 @@
+"""Wavefront OBJ: vertices, normals, polygons, and `usemtl`, the slots; what is wrong is told by its line.
+
+Textures, curves, lines, points and the file of materials are passed over.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.scene.meshes.mesh import MeshPart
+
+Array = NDArray[np.float64]
+
+_Corner = tuple[int, int]  # of a vertex and its normal, from 0; -1 where there is none
+
+
+def read_obj(text: str) -> list[MeshPart]:
+    """Return the parts of a file, a slot each, in the order in which they come.
+
+    Raises
+    ------
+    ValueError
+        A line that cannot be read; it is named.
+    """
+    vertices: list[tuple[float, ...]] = []
+    normals: list[tuple[float, ...]] = []
+    slots: dict[str, list[tuple[_Corner, ...]]] = {}
+    slot = ""
+    for number, line in _lines(text):
+        word, _, rest = line.partition(" ")
+        try:
+            if word == "v":
+                vertices.append(_numbers(rest))
+            elif word == "vn":
+                normals.append(_numbers(rest))
+            elif word == "usemtl":
+                slot = rest.strip()
+            elif word == "f":
+                corners = [_corner(one, len(vertices), len(normals)) for one in rest.split()]
+                slots.setdefault(slot, []).extend(_triangles(corners, vertices))
+        except ValueError as error:
+            raise ValueError(f"line {number}: {line[:60]!r}: {error}") from None
+    return [_part(name, found, vertices, normals) for name, found in slots.items()]
+
+
+def _lines(text: str) -> Iterator[tuple[int, str]]:
+    """Yield what is written, with the line where it begins; a backslash at its end joins it to the next."""
+    begun, kept = 0, ""
+    for number, line in enumerate(text.splitlines(), 1):
+        begun = begun if kept else number
+        kept += line.split("#", 1)[0].replace("\t", " ").strip()
+        if kept.endswith("\\"):
+            kept = kept[:-1] + " "
+            continue
+        if kept:
+            yield begun, kept
+        kept = ""
+    if kept:
+        yield begun, kept.strip()
+
+
+def _numbers(rest: str) -> tuple[float, ...]:
+    values = tuple(float(one) for one in rest.split()[:3])
+    if len(values) < 3:
+        raise ValueError("three numbers are wanted")
+    if not np.isfinite(values).all():
+        raise ValueError("the numbers must be finite")
+    return values
+
+
+def _corner(written: str, vertices: int, normals: int) -> _Corner:
+    parts = written.split("/")
+    vertex = _index(parts[0], vertices, "vertex", "vertices")
+    normal = _index(parts[2], normals, "normal", "normals") if len(parts) > 2 and parts[2] else -1
+    return vertex, normal
+
+
+def _index(written: str, count: int, one: str, many: str) -> int:
+    """Return an index from 0: a file counts from 1, and back from the last where it is negative."""
+    index = int(written)
+    if not 1 <= abs(index) <= count:
+        raise ValueError(f"there is no {one} {index}: {count} {many} stand above this line")
+    return index - 1 if index > 0 else count + index
+
+
+def _triangles(corners: list[_Corner], vertices: list[tuple[float, ...]]) -> list[tuple[_Corner, ...]]:
+    """Return a polygon as triangles: a fan about a corner that sees all others.
+
+    Raises
+    ------
+    ValueError
+        There are fewer than three corners, or no such one among them.
+    """
+    if len(corners) < 3:
+        raise ValueError("a face has three corners or more")
+    if len(corners) == 3:
+        return [tuple(corners)]
+    place = np.array([vertices[vertex] for vertex, _ in corners])
+    normal = np.cross(place, np.roll(place, -1, axis=0)).sum(axis=0)  # Newell's: twice the area
+    for first in range(len(corners)):
+        rolled, turned = corners[first:] + corners[:first], np.roll(place, -first, axis=0)
+        across = np.cross(turned[1:-1] - turned[0], turned[2:] - turned[0])
+        if (across @ normal >= -1e-9 * (normal @ normal)).all():
+            return [(rolled[0], *pair) for pair in pairwise(rolled[1:])]
+    raise ValueError("the face has an outline that turns inwards: export with faces made triangles")
+
+
+def _part(
+    slot: str,
+    triangles: list[tuple[_Corner, ...]],
+    vertices: list[tuple[float, ...]],
+    normals: list[tuple[float, ...]],
+) -> MeshPart:
+    """Return the triangles of a slot with vertices of their own; a corner without a normal makes all flat."""
+    corners = np.array(triangles, dtype=np.int64).reshape(-1, 2)
+    flat = bool((corners[:, 1] < 0).any())
+    if flat:
+        corners[:, 1] = -1
+    used, faces = np.unique(corners, axis=0, return_inverse=True)
+    return MeshPart(
+        slot,
+        np.array(vertices)[used[:, 0]],
+        None if flat else np.array(normals)[used[:, 1]],
+        faces.reshape(-1, 3).astype(np.uint32),
+    )

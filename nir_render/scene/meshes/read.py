@@ -1,0 +1,148 @@
+"""A mesh file, of PLY, OBJ, STL or glTF, becomes parts of one material each; damaged ones are refused.
+
+OBJ is read here, as errors name their line and slots are needed without a file of materials; the others by
+trimesh. glTF stands with y up by its standard, the others as `up` says.
+"""
+
+import io
+import logging
+import warnings
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from nir_render.scene.meshes.mesh import Array, MeshPart, checked
+from nir_render.scene.meshes.obj import read_obj
+
+SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf")
+_MOST_BYTES = 256 * 2**20
+_UNNAMED = ""
+
+Up = Literal["y", "z"]
+
+
+def read_mesh(file: str | Path, up: Up | None = None) -> tuple[MeshPart, ...]:
+    """Return the parts of a mesh file, a slot each, z up; None is y for glTF, and z for all else.
+
+    Raises
+    ------
+    ValueError
+        It is no such file, it is damaged, or it is too large; it says what is wrong, and where.
+    """
+    path = Path(file)
+    state = path.stat()
+    if state.st_size > _MOST_BYTES:
+        raise ValueError(
+            f"{path}: has {state.st_size >> 20} MiB, at most {_MOST_BYTES >> 20} are read; simplify it"
+        )
+    return _read(str(path), up, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=16)
+def _read(file: str, up: Up | None, _changed_ns: int, _size: int) -> tuple[MeshPart, ...]:
+    path = Path(file)
+    kind = path.suffix.lower().removeprefix(".")
+    try:
+        parts = [checked(part) for part in _parts(path.read_bytes(), kind)]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not parts:
+        raise ValueError(f"{path}: holds no triangles; export the surface as a mesh")
+    if (up or ("y" if kind in ("glb", "gltf") else "z")) == "y":
+        parts = [_stood_up(part) for part in parts]
+    return tuple(parts)
+
+
+def _parts(data: bytes, kind: str) -> list[MeshPart]:
+    if kind == "obj":
+        try:
+            return read_obj(data.decode("utf-8"))
+        except UnicodeDecodeError:
+            raise ValueError("this is no text, and so no OBJ file; export the mesh again") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.getLogger("trimesh").setLevel(logging.CRITICAL)
+        try:
+            return _read_by_trimesh(data, kind)
+        except MemoryError:
+            raise ValueError(
+                f"cannot be read as {kind}: it claims to hold more than fits; export it again"
+            ) from None
+        except Exception as error:  # of any kind: what is damaged meets trimesh's parsers anywhere
+            told = " ".join(str(error).split())[:120] or type(error).__name__
+            other = "; with buffers in files beside it, export as .glb" if kind == "gltf" else ""
+            raise ValueError(f"cannot be read as {kind} ({told}); export the mesh again{other}") from None
+
+
+def _read_by_trimesh(data: bytes, kind: str) -> list[MeshPart]:
+    from trimesh.exchange import ply, stl
+
+    if kind in ("glb", "gltf"):
+        return _read_gltf(data, kind)
+    found = (ply.load_ply if kind == "ply" else stl.load_stl)(io.BytesIO(data))
+    if found.get("faces") is None:
+        return []
+    return [_part(found, _UNNAMED, np.eye(4))]
+
+
+def _read_gltf(data: bytes, kind: str) -> list[MeshPart]:
+    import trimesh
+    from trimesh.exchange import gltf
+
+    # The geometry as it is written, and from the scene where each piece of it stands.
+    written = (gltf.load_glb if kind == "glb" else gltf.load_gltf)(io.BytesIO(data))["geometry"]
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
+    slots: dict[str, list[MeshPart]] = {}
+    for node in scene.graph.nodes_geometry:
+        to_world, name = scene.graph[node]
+        found = written[name]
+        if found.get("faces") is None:
+            continue
+        material = getattr(found.get("visual"), "material", None)
+        slot = str(getattr(material, "name", None) or _UNNAMED)
+        slots.setdefault(slot, []).append(_part(found, slot, np.asarray(to_world, dtype=np.float64)))
+    return [_joined(slot, parts) for slot, parts in slots.items()]
+
+
+def _part(found: dict[str, Any], slot: str, to_world: Array) -> MeshPart:
+    faces = np.asarray(found["faces"])
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise ValueError("its faces are no triangles")
+    if faces.size and (faces.min() < 0 or faces.max() >= 2**32):
+        raise ValueError(f"a triangle wants vertex {int(faces.min())}")
+    vertices = np.asarray(found["vertices"], dtype=np.float64).reshape(-1, 3)
+    normals = found.get("vertex_normals")
+    linear = to_world[:3, :3]
+    if np.linalg.det(linear) < 0.0:  # a mirrored copy
+        faces = faces[:, ::-1]
+    if normals is not None and not np.array_equal(to_world, np.eye(4)):
+        normals = np.asarray(normals, dtype=np.float64) @ np.linalg.inv(linear)
+    return MeshPart(
+        slot,
+        vertices @ linear.T + to_world[:3, 3],
+        None if normals is None or len(normals) != len(vertices) else np.asarray(normals, dtype=np.float64),
+        faces.astype(np.uint32),
+    )
+
+
+def _joined(slot: str, parts: list[MeshPart]) -> MeshPart:
+    """Return pieces of one slot as one; flat where any of them is."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    normals = [part.normals for part in parts]
+    return MeshPart(
+        slot,
+        np.concatenate([part.vertices for part in parts]),
+        None
+        if any(one is None for one in normals)
+        else np.concatenate([one for one in normals if one is not None]),
+        np.concatenate([part.faces + np.uint32(at) for part, at in zip(parts, first, strict=False)]),
+    )
+
+
+def _stood_up(part: MeshPart) -> MeshPart:
+    """Return a part whose y is up with z up: x stays."""
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    normals = None if part.normals is None else part.normals @ turn.T
+    return MeshPart(part.slot, part.vertices @ turn.T, normals, part.faces)
