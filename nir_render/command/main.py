@@ -47,7 +47,7 @@ for command in (
     explain,
     compare,
     *(stress.stress, stress.experiment),
-    *(scenes.new, scenes.validate, scenes.schema, scenes.goniometer, scenes.doctor),
+    *(scenes.new, scenes.validate, scenes.schema, scenes.look, scenes.goniometer, scenes.doctor),
 ):
     app.command()(command)
 app.command("new-recording")(recordings.new_recording)

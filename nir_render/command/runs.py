@@ -53,7 +53,9 @@ def run(
 ) -> None:
     """Render, perceive, evaluate and report a scene in one go."""
     from nir_render.command.progress import progress_bar
+    from nir_render.look.sheet import look_png
     from nir_render.run.evaluate import evaluate_run
+    from nir_render.run.folder import LOOK, write_file
     from nir_render.run.follow import OwnParts
     from nir_render.run.perceive import perceive_run
     from nir_render.run.report import report_run
@@ -61,7 +63,9 @@ def run(
     chosen = chosen_estimators(estimators, time_limit_s)
     own = OwnParts.of(tracker, decoder)
     cache = light_cache(light_folder, light_gib)
-    folder = _render(read_scene(scene, settings, seed), output, overwrite, threads, keep_light, cache)
+    loaded = read_scene(scene, settings, seed)
+    folder = _render(loaded, output, overwrite, threads, keep_light, cache)
+    write_file(folder / LOOK, look_png(loaded, loaded.document.clock.start_s))
     with progress_bar("perceive") as progress:
         perceived = perceive_run(folder, estimators=chosen, progress=progress, own=own)
     if not perceived.detections:

@@ -1,6 +1,6 @@
 """The commands of scene files, what stands in them, and the machine that renders them.
 
-They are new, validate, schema, goniometer, doctor.
+They are new, validate, schema, look, goniometer, doctor.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nir_render.command.options import Json, Overwrite
+from nir_render.command.options import Json, Overwrite, SceneArgument, Settings, read_scene
 from nir_render.errors import InputError
 
 if TYPE_CHECKING:
@@ -102,6 +102,35 @@ def _schema_of(of: Format) -> "dict[str, Any]":
         Format.DETECTIONS: detections_schema,
     }
     return by_name[of]()
+
+
+def look(
+    scene: SceneArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", help="A PNG; outputs/NAME.look.png by default."),
+    ] = None,
+    time_s: Annotated[float, typer.Option("--time", metavar="S", help="When, in seconds.")] = 0.0,
+    settings: Settings = None,
+    as_json: Json = False,
+) -> None:
+    """Draw a scene from outside and from above, in seconds: to check it by before it is rendered."""
+    from nir_render.command.console import print_json
+    from nir_render.look.sheet import look_png
+    from nir_render.run.folder import write_file
+
+    if not math.isfinite(time_s):
+        raise InputError(f"--time {time_s:g}: wanted seconds, such as 2.5")
+    file = output or Path("outputs") / f"{scene.stem}.look.png"
+    if file.suffix.lower() != ".png":
+        raise InputError(f"-o {file}: a picture is written as .png; name it such as {file.stem}.png")
+    picture = look_png(read_scene(scene, settings, None), time_s)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_file(file, picture)
+    if as_json:
+        print_json({"picture": str(file)})
+    else:
+        typer.echo(f"open {file}")
 
 
 def goniometer(

@@ -40,6 +40,7 @@ def report_html(
     files: Sequence[str],
     said: Said | None = None,
     film: str = "",
+    look: str = "",
 ) -> str:
     """Write the page.
 
@@ -63,6 +64,8 @@ def report_html(
         Signals and messages, where there are any.
     film
         Name of the film beside the page, if there is one.
+    look
+        Name of the picture of the scene from outside beside the page, likewise.
 
     Returns
     -------
@@ -90,6 +93,7 @@ def report_html(
         around=around_section(result.around),
         over_time=time_section(result, said or Said()),
         film=film,
+        look=look,
         plots=_plots(by_estimator),
         cameras=_cameras(keys, result),
         more_cameras=counted(len(cameras) - MOST_CAMERAS, "more camera")

@@ -27,6 +27,7 @@ TRUTH = "truth.jsonl"
 LAMPS = "lamps.jsonl"
 SENT = "sent.jsonl"
 FILM = "preview.gif"
+LOOK = "look.png"
 POSES = "poses.jsonl"
 _DIGEST = ".digest"
 

@@ -52,6 +52,7 @@ def report_run(folder: Path, result: Evaluation) -> Path:
                 run_folder.lines_of(folder, "messages", names, parse_message),
             ),
             film=run_folder.FILM if film is not None else "",
+            look=run_folder.LOOK if (folder / run_folder.LOOK).is_file() else "",
         )
     except RecordingError as error:
         raise InputError(str(error)) from None

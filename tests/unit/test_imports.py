@@ -20,6 +20,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.compare": (),
     "nir_render.budget": (),
     "nir_render.run": ("goniometer", "recording"),
+    "nir_render.look": (),
     "nir_render.report": ("time",),
     "nir_render.evaluate": (),
     "nir_render.simulation": (),
