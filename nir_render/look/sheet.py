@@ -98,6 +98,9 @@ def _draw(
         _draw_sun(axes, outlook, np.array(snapshot.sun.direction), box_m)
     for name, placed in snapshot.sources.items():
         own = name in snapshot.carried_sources
+        if own:
+            below_m = snapshot.robots[name.split(".")[0]].pose.position_m
+            _line(axes, outlook, np.stack([below_m, placed.pose.position_m]), TRUTH, 0.6)
         _dot(axes, outlook, placed.pose.position_m, TRUTH if own else BEACON, 4.0 if own else 5.5)
     for name, robot in snapshot.robots.items():
         ahead_m = robot.pose.position_m + 0.25 * reach_m * robot.pose.rotation[:, 0]
