@@ -3,6 +3,7 @@
 import io
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -23,6 +24,7 @@ from nir_render.transport.backend.variant import backend
 from nir_render.transport.outside import Outlook, bodies_of, grey_picture
 
 Array = NDArray[np.float64]
+Dash = Literal["-", "--"]
 
 LAMP, BEACON, FRUSTUM, FOG = "#ffd166", "#ff9f1c", "#70e000", "#b392f0"
 _DPI = 130
@@ -109,7 +111,13 @@ def _draw(
             place, depth = outlook.project_px(robot.pose.position_m)
             if depth > 0.0:
                 axes.annotate(
-                    name, place, (5, 5), textcoords="offset points", color=TRUTH, fontsize=8, clip_on=True
+                    name,
+                    (float(place[0]), float(place[1])),
+                    (5, 5),
+                    textcoords="offset points",
+                    color=TRUTH,
+                    fontsize=8,
+                    clip_on=True,
                 )
 
 
@@ -152,7 +160,9 @@ def _draw_sun(axes: Axes, outlook: Outlook, towards: Array, box_m: Array) -> Non
         axes.annotate("sun", start, (4, -10), textcoords="offset points", color=LAMP, clip_on=True)
 
 
-def _line(axes: Axes, outlook: Outlook, points_m: Array, colour: str, width: float, style: str = "-") -> None:
+def _line(
+    axes: Axes, outlook: Outlook, points_m: Array, colour: str, width: float, style: Dash = "-"
+) -> None:
     place, depth = outlook.project_px(points_m)
     place = np.where(depth[:, None] > 0.0, place, np.nan)
     axes.plot(place[:, 0], place[:, 1], style, color=colour, linewidth=width, alpha=0.9)
@@ -189,7 +199,7 @@ def _key(snapshot: Snapshot) -> list[Line2D]:
     def dot(colour: str, label: str) -> Line2D:
         return Line2D([], [], color=colour, marker="o", linestyle="none", markersize=5, label=label)
 
-    def line(colour: str, label: str, style: str = "-") -> Line2D:
+    def line(colour: str, label: str, style: Dash = "-") -> Line2D:
         return Line2D([], [], color=colour, linestyle=style, label=label)
 
     shown = [dot(TRUTH, "a robot's source, and where it heads"), line(FRUSTUM, "what a camera sees")]
