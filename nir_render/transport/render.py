@@ -54,13 +54,13 @@ def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
 
 
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
-    """Return how many samples a pixel of the film gets on average, all wavelengths together.
+    """Return how many samples a pixel of the film gets on average; all wavelengths share them.
 
     0 without indirect light. Errors as `render`.
     """
     rendering = _rendering(snapshot, camera, seed, None)
     samples, _ = rendering.samples()
-    return 0.0 if samples is None else len(rendering.wavelengths_m) * float(np.mean(samples))
+    return 0.0 if samples is None else float(np.mean(samples))
 
 
 def geometry_of(snapshot: Snapshot, camera: str) -> str:

@@ -27,6 +27,7 @@ from nir_render.transport.cache import LightCache
 from nir_render.transport.indirect import groups
 from nir_render.transport.indirect.guide import group_power
 from nir_render.transport.indirect.sharpen import rendered_again
+from nir_render.transport.render import mean_samples
 from tests.paths import SCENES
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.vectorised]
@@ -122,6 +123,11 @@ def test_a_target_for_the_noise_is_kept_by_all_nodes_together(room: nr.Scene) ->
     noise = render_noise(mean_frame(light, wanted.at(0.0), 1e-3))
     assert noise.median_share <= 0.055
     assert noise.aperture_share <= 0.055
+
+
+def test_the_samples_that_an_estimate_of_time_counts_are_those_of_all_nodes_together(room: nr.Scene) -> None:
+    assert mean_samples(room.at(0.0), "r1.c", 1) == 16.0
+    assert len(nr.render(room, "r1.c", 0.0, seed=1).wavelengths_m) > 2
 
 
 def test_the_error_of_enlarging_is_measured_at_every_node(room: nr.Scene) -> None:
