@@ -296,17 +296,28 @@ def smooth(repeats: int) -> dict[str, float]:
 
 
 def nodes(repeats: int) -> dict[str, float]:
-    """Return what more wavelengths cost: walls that vary over the spectrum against walls of numbers."""
-    plain = build(4, ROOM, 640)
+    """Return what 2, 4 and 8 wavelengths cost over one, of 4 and of 32 light groups, by time.
+
+    One wall varies over the spectrum; direct light, which takes no time to speak of, is left out.
+    """
     dip = [["300 nm", 0.9], ["900 nm", 0.9], ["940 nm", 0.05], ["980 nm", 0.9], ["1100 nm", 0.9]]
-    varied = plain.with_({"materials.white.reflectance": {"points": dip}})
-    scenes = [varied.with_({"render.wavelengths": {"error": 1e-6, "most": most}}) for most in (3, 4, 8)]
-    carried = [len(nr.render(scene, "eye.c").wavelengths_m) for scene in scenes]
-    one_s, *several_s = seconds(
-        *(lambda scene=scene: nr.render(scene, "eye.c") for scene in (plain, *scenes)), repeats=repeats
-    )
-    ratios = {f"nodes_time_ratio_{n}": taken_s / one_s for n, taken_s in zip(carried, several_s, strict=True)}
-    return {"nodes_seconds_1": one_s, **ratios}
+    result = {}
+    for robots in (4, 32):
+        world = build(robots, ROOM, 640).with_({"materials.white.reflectance": {"points": dip}}).at(0.0)
+        rays = groups.rays_of(world.camera("eye.c").camera, world.camera("eye.c").pose)
+        power = np.ones(len(world.groups))
+        counts = (1, 2, 4, 8)
+        calls = [
+            partial(
+                groups.indirect, world, rays, 1, power, wavelengths_m=tuple(np.linspace(920e-9, 960e-9, n))
+            )
+            for n in counts
+        ]
+        one_s, *several_s = seconds(*calls, repeats=repeats)
+        result[f"nodes_seconds_1_groups_{robots}"] = one_s
+        for n, taken_s in zip(counts[1:], several_s, strict=True):
+            result[f"nodes_time_ratio_{n}_groups_{robots}"] = taken_s / one_s
+    return result
 
 
 def memory() -> dict[str, float]:

@@ -25,7 +25,7 @@ RETINA_LIMIT_W_PER_M_SR = 6000.0  # over α
 CORNEA_AT_1_S_W_PER_M2 = 18_000.0  # for one exposure, falling as t^(−3/4)
 RETINA_AT_1_S_W_PER_M_SR = 50_000.0  # over α, for one exposure, falling as t^(−1/4)
 LEAST_ANGLE_RAD, LARGEST_ANGLE_RAD = 0.011, 0.1
-PULSE_ANGLE_RAD, _STEADY_EYE_S = 0.0017, 0.25  # the least angle while the eye has not moved
+PULSE_ANGLE_RAD, STEADY_EYE_S = 0.0017, 0.25  # the least angle while the eye has not moved; it grows with √t
 _LASER_WIDTH_M = 5e-9
 _CORNEA_M, _RETINA_M = (780e-9, 3000e-9), (780e-9, 1400e-9)
 
@@ -112,7 +112,8 @@ def _angle_and_radiance(radiance: float, fills_rad: float, least_rad: float) -> 
 def _pulse_of_limit(pulse_s: float, cornea_w_per_m2: float, radiance: float, fills_rad: float) -> float:
     """Return by how much one pulse comes up to the nearer of its limits."""
     cornea_limit = max(CORNEA_AT_1_S_W_PER_M2 * math.pow(pulse_s, -0.75), CORNEA_LIMIT_W_PER_M2)
-    least_rad = PULSE_ANGLE_RAD if pulse_s <= _STEADY_EYE_S else LEAST_ANGLE_RAD
+    moved = math.sqrt(max(pulse_s / STEADY_EYE_S, 1.0))
+    least_rad = min(PULSE_ANGLE_RAD * moved, LEAST_ANGLE_RAD)
     angle_rad, retina = _angle_and_radiance(radiance, fills_rad, least_rad)
     limit = RETINA_AT_1_S_W_PER_M_SR / angle_rad * math.pow(min(max(pulse_s, 1e-5), 10.0), -0.25)
     return max(cornea_w_per_m2 / cornea_limit, retina / limit)

@@ -18,6 +18,7 @@ from nir_render.budget.tables import (
     view_table,
     view_title,
 )
+from nir_render.errors import InputError
 from nir_render.report.drawing import Drawing
 from nir_render.report.parts import Table, render_page
 from nir_render.report.wording import counted, degrees, share, significant
@@ -137,6 +138,13 @@ def budget_html(budget: Budget) -> str:
         ),
         rules=RULES,
     )
+
+
+def check_free(folder: Path) -> None:
+    """Raise InputError where a folder holds another budget's files."""
+    held = next((name for name in (RECORD, PAGE) if (folder / name).exists()), None)
+    if held is not None:
+        raise InputError(f"{folder / held} is there already; give a new folder, or --overwrite to replace it")
 
 
 def write_budget(budget: Budget, folder: Path) -> Path:

@@ -20,6 +20,9 @@ def explain(
         Path | None,
         typer.Option("-o", "--output", metavar="DIR", help="Write explain.html and explain.json there."),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the explain.html and explain.json that are there.")
+    ] = False,
     time_s: Annotated[
         float, typer.Option("--time", metavar="S", help="When robots are looked at, in seconds.")
     ] = 0.0,
@@ -38,12 +41,14 @@ def explain(
     """Tell electrons, saturation, σ of ranges by cause, ambient light and eye safety, without rendering."""
     from nir_render.budget.assumptions import assumptions_of
     from nir_render.budget.budget import photon_budget
-    from nir_render.budget.page import write_budget
+    from nir_render.budget.page import check_free, write_budget
     from nir_render.command.console import print_json
     from nir_render.command.progress import progress_bar
 
     if not math.isfinite(time_s):
         raise InputError(f"--time {time_s:g}: wanted seconds, such as 2.5")
+    if output is not None and not overwrite:
+        check_free(output)
     assumed = assumptions_of(assume or [])
     world = read_scene(scene, settings, None)
     with progress_bar("point spread") as progress:

@@ -40,14 +40,13 @@ def validate(
 ) -> None:
     """Check scene and campaign files: every error names file, line, field and what was wanted."""
     from nir_render.command.console import print_json
-    from nir_render.scene.load import load_scene
     from nir_render.stress.campaign import is_campaign, load_campaign
 
     valid: list[str] = []
     problems: list[str] = []
     for file in files:
         try:
-            load_campaign(file) if is_campaign(file) else load_scene(file)
+            load_campaign(file) if is_campaign(file) else _check_scene(file)
             valid.append(str(file))
         except InputError as error:
             problems += error.problems
@@ -58,6 +57,20 @@ def validate(
             typer.echo(f"{name}: valid")
     if problems:
         raise InputError(*problems)
+
+
+def _check_scene(file: Path) -> None:
+    from nir_render.scene.documents.materials import curves_of
+    from nir_render.scene.load import load_scene
+
+    scene = load_scene(file)
+    if any(curves_of(material) for material in scene.document.materials.values()):
+        # Whether curves reach as far as cameras see, emitters and filters tell.
+        from nir_render.transport.wavelengths import carried_wavelengths
+
+        world = scene.at(scene.document.clock.start_s)
+        for camera in scene.cameras():
+            carried_wavelengths(world, camera)
 
 
 class Format(StrEnum):

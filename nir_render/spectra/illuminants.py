@@ -98,12 +98,22 @@ def radiant_flux_w(luminous_flux_lm: float, spectrum: Curve) -> float:
     Φ_v = 683 lm/W ∫ V(λ) Φ_λ dλ with the CIE 1924 photopic V(λ), which colour-science tabulates. Where a
     spectrum begins later or ends earlier, nothing is seen.
     """
+    return luminous_flux_lm / _luminous_lm(spectrum)
+
+
+def efficacy_lm_per_w(spectrum: Curve) -> float:
+    """Return the luminous flux of a watt of light of a spectrum of any scale; of no light, 0."""
+    sent = spectrum.integral()
+    return _luminous_lm(spectrum) / sent if sent > 0.0 else 0.0
+
+
+def _luminous_lm(spectrum: Curve) -> float:
     photopic = _colour().SDS_LEFS["CIE 1924 Photopic Standard Observer"]
     wavelength_m, value = np.asarray(photopic.wavelengths) * 1e-9, np.asarray(photopic.values)
     within = (wavelength_m >= spectrum.low_m) & (wavelength_m <= spectrum.high_m)
     wavelength_m = wavelength_m[within]
     seen = np.trapezoid(value[within] * spectrum(wavelength_m), wavelength_m)
-    return float(luminous_flux_lm / (_EFFICACY_LM_PER_W * seen))
+    return float(_EFFICACY_LM_PER_W * seen)
 
 
 def _colour() -> Any:

@@ -54,13 +54,13 @@ def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
 
 
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
-    """Return how many samples a pixel of the film gets on average, all wavelengths together.
+    """Return how many samples a pixel of the film gets on average; all wavelengths share them.
 
     0 without indirect light. Errors as `render`.
     """
     rendering = _rendering(snapshot, camera, seed, None)
     samples, _ = rendering.samples()
-    return 0.0 if samples is None else len(rendering.wavelengths_m) * float(np.mean(samples))
+    return 0.0 if samples is None else float(np.mean(samples))
 
 
 def geometry_of(snapshot: Snapshot, camera: str) -> str:
@@ -118,8 +118,7 @@ class _Rendering:
 
     def _pilot(self) -> Light:
         key = groups.light_seed(self.seed, "pilot", self.site.name, self._geometry)
-        pilots = [groups.pilot(world, self._rays, key, self._power) for world in self._worlds]
-        return self._light(indirect_over_nodes(pilots))
+        return self._light(groups.pilot(self.site.snapshot, self._rays, key, self._power, self.wavelengths_m))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
@@ -127,26 +126,23 @@ class _Rendering:
         enlargement = part_of(self._enlargement, pixels)
         scale = site.snapshot.render.indirect.scale
         blocks = sample_plan.flare_blocks(self._light(None), site.camera, scale, enlargement)
-        pilots = [
-            flare_pilot(world, self._built_of(world), self._rays, key, blocks, enlargement)
-            for world in self._worlds
-        ]
-        return self._light(indirect_over_nodes(pilots))
+        return self._light(flare_pilot(site.snapshot, self._built, self._rays, key, blocks, enlargement))
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
-        if not self.site.snapshot.has_indirect_light():
+        site = self.site
+        if not site.snapshot.has_indirect_light():
             return None
-        # Nodes walk the same paths: what differs between them is the materials and no noise.
-        key = groups.light_seed(self.seed, "indirect", self.site.name, self._geometry)
-        return indirect_over_nodes([self._indirect_of(world, key, samples) for world in self._worlds])
-
-    def _indirect_of(self, world: Snapshot, key: int, samples: Samples | None) -> Indirect | None:
+        key = groups.light_seed(self.seed, "indirect", site.name, self._geometry)
         if not backend().vectorised:
-            return stock.indirect(world, self.site.name, key, self._direct)
-        light = groups.indirect(world, self._rays, key, self._power, samples)
+            return indirect_over_nodes(
+                [stock.indirect(world, site.name, key, self._direct) for world in self._worlds]
+            )
+        light = groups.indirect(
+            site.snapshot, self._rays, key, self._power, samples, wavelengths_m=self.wavelengths_m
+        )
         if light is None:
             return None
-        return sharpened(world, self._built_of(world), self._rays, key, light, self._enlargement)
+        return sharpened(site.snapshot, self._built, self._rays, key, light, self._enlargement)
 
     def _light(self, indirect: Indirect | None) -> Light:
         site = self.site
@@ -186,11 +182,7 @@ class _Rendering:
 
     @cached_property
     def _built(self) -> DeviceScene:
-        return groups.world_on_device(self._worlds[0], self._power)
-
-    def _built_of(self, world: Snapshot) -> DeviceScene:
-        """Return a world on the device; of several only the first stays there."""
-        return self._built if world is self._worlds[0] else groups.world_on_device(world, self._power)
+        return groups.world_on_device(self.site.snapshot, self._power, self.wavelengths_m)
 
     @cached_property
     def _enlargement(self) -> Enlargement:

@@ -27,6 +27,7 @@ from nir_render.transport.cache import LightCache
 from nir_render.transport.indirect import groups
 from nir_render.transport.indirect.guide import group_power
 from nir_render.transport.indirect.sharpen import rendered_again
+from nir_render.transport.render import mean_samples
 from tests.paths import SCENES
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.vectorised]
@@ -124,6 +125,11 @@ def test_a_target_for_the_noise_is_kept_by_all_nodes_together(room: nr.Scene) ->
     assert noise.aperture_share <= 0.055
 
 
+def test_the_samples_that_an_estimate_of_time_counts_are_those_of_all_nodes_together(room: nr.Scene) -> None:
+    assert mean_samples(room.at(0.0), "r1.c", 1) == 16.0
+    assert len(nr.render(room, "r1.c", 0.0, seed=1).wavelengths_m) > 2
+
+
 def test_the_error_of_enlarging_is_measured_at_every_node(room: nr.Scene) -> None:
     world = room.at(0.0)
     light = nr.render(world, "r1.c", seed=1)
@@ -214,3 +220,68 @@ def test_the_manifest_tells_nodes_and_error(room: nr.Scene) -> None:
     assert 0.0 < told["error"] <= 0.03
     plain = nr.load_scene(SCENES / "one_source.yaml")
     assert wavelength_facts(plain)["r1.front"] == {"nodes_nm": [940.0], "error": 0.0}
+
+
+PLASTIC = {"type": "plastic", "index": 1.5, "reflectance": CURVE}
+FOG = {"extinction": "0.2 /m", "albedo": 0.99, "phase": {"type": "henyey_greenstein", "g": 0.85}}
+MIRROR = {
+    "type": "rectangle",
+    "center": "[1, 1.5, 0] m",
+    "size": "[3, 2] m",
+    "normal": [0, -1, 0],
+    "material": "sheet",
+}
+PANE = {
+    "type": "rectangle",
+    "center": "[0.6, 0, 0] m",
+    "size": "[2, 2] m",
+    "normal": [-1, 0, 0],
+    "material": "sheet",
+}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"materials.sheet": {"type": "mirror", "reflectance": CURVE}, "shapes.sheet": MIRROR},
+        {"materials.paint": {**PLASTIC, "roughness": 0.0}},
+        pytest.param(
+            {"materials.sheet": {"type": "pane", "transmission": CURVE}, "shapes.sheet": PANE},
+            marks=pytest.mark.verify,
+        ),
+        pytest.param(
+            {"materials.paint": {**PLASTIC, "roughness": 0.3}, "fog": FOG}, marks=pytest.mark.verify
+        ),
+    ],
+    ids=["diffuse", "mirror", "coat", "pane", "glossy in fog"],
+)
+def test_each_node_is_a_render_of_materials_of_numbers(room: nr.Scene, changes: dict[str, Any]) -> None:
+    """Nodes along one path of up to five stretches, each against renders of its own at one wavelength.
+
+    The brightest is the same to the bit, as its paths are walked. Renders of others walk by their own reflectances:
+    with other chances, of going on where they are dim and of which part of a surface they take, but alike on the
+    mean. Over six seeds the mean of the relative differences is within 6.9 of its standard errors (Student, five
+    degrees of freedom, 1 in 1000), which are below 0.12 %.
+    """
+    wanted = {"render.indirect": {"samples": 16, "scale": 1, "max_depth": 5}, **changes}
+    world = room.with_(wanted).at(0.0)
+    camera = world.camera("r1.c")
+    rays, power, nodes_m = groups.rays_of(camera.camera, camera.pose), np.ones(1), (920e-9, 938e-9, 945e-9)
+    differences = []
+    for seed in range(6):
+        light = groups.indirect(world, rays, seed, power, wavelengths_m=nodes_m)
+        assert light is not None
+        of_seed = []
+        for node, wavelength_m in enumerate(nodes_m):
+            alone = groups.indirect(world.at_wavelength(wavelength_m), rays, seed, power)
+            assert alone is not None
+            ours, theirs = light.radiance_per_w[0, node], alone.radiance_per_w[0, 0]
+            if node == 0:
+                np.testing.assert_array_equal(ours, theirs)
+            else:
+                of_seed.append(float(ours.sum() / theirs.sum()) - 1.0)
+        differences.append(of_seed)
+    mean, error = np.mean(differences, axis=0), np.std(differences, axis=0, ddof=1) / 6**0.5
+    assert (error < 1.2e-3).all()
+    assert (np.abs(mean) <= 6.9 * error + 1e-6).all()

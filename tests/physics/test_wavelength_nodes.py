@@ -15,6 +15,7 @@ nodes are said to make, plus noise.
 """
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -200,6 +201,7 @@ def held_against_mitsuba(scene: nr.Scene, samples: int, most_off: float) -> None
     ours, theirs = by_nodes(scene), by_mitsuba(scene, samples)
     frame = difference(ours.mean(axis=(1, 2)), theirs.mean(axis=(1, 2)))
     told = f"{len(stated.wavelengths_m)} nodes: {frame.value:+.3%} ± {frame.error:.3%}"
+    logging.getLogger(__name__).info(told)  # pytest --log-cli-level=INFO shows it
     assert abs(frame.value) + frame.half_interval <= most_off, told
     thirds = [np.s_[:, :, first : first + COLUMNS // 3] for first in range(0, COLUMNS, COLUMNS // 3)]
     for part in thirds:

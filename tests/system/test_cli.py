@@ -142,6 +142,24 @@ def test_validate_refuses_what_a_plan_refuses(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["campaign.yaml"]
 
 
+def test_validate_refuses_curves_that_end_before_what_cameras_see(tmp_path: Path) -> None:
+    """A paint known from 400 to 780 nm says nothing of 940: `render` refuses it, and so must this."""
+    scene = yaml.safe_load(Path(SCENE).read_text(encoding="utf-8"))
+    paint = {"type": "diffuse", "reflectance": {"points": [["400 nm", 0.5], ["780 nm", 0.6]]}}
+    wall = {
+        "type": "rectangle",
+        "center": "[9, 0, 0] m",
+        "size": "[2, 2] m",
+        "normal": [-1, 0, 0],
+        "material": "paint",
+    }
+    document = {**scene, "materials": {"paint": paint}, "shapes": {"wall": wall}}
+    (tmp_path / "cut.yaml").write_text(yaml.safe_dump(document))
+    done = nir_render("validate", "cut.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "materials.paint.reflectance: covers 400 to 780 nm, but 100 %" in " ".join(done.stderr.split())
+
+
 BAD_SCENES: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"robots.r1.positon": "[0, 0, 0] m"}, "did you mean 'position'?"),
     "bare number": ({"robots.r1.rig.cameras.front.exposure": 0.001}, "is a bare number"),

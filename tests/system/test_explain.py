@@ -49,6 +49,10 @@ def test_the_command_prints_tables_and_writes_a_page(tmp_path: Path) -> None:
     assert "<script" not in page
     record = json.loads((tmp_path / "out" / "explain.json").read_text(encoding="utf-8"))
     assert record["cameras"][0]["in_view"][0]["range_m"] == pytest.approx(5.0996, abs=1e-3)
+    again = nir_render("explain", SCENE, "-o", str(tmp_path / "out"), cwd=tmp_path)
+    assert again.returncode == 2
+    assert "explain.json is there already" in " ".join(again.stderr.split())
+    assert json.loads((tmp_path / "out" / "explain.json").read_text(encoding="utf-8")) == record
 
 
 def test_json_is_one_object(tmp_path: Path) -> None:

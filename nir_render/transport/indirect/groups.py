@@ -21,18 +21,22 @@ from nir_render.scene.documents.materials import Dielectric, Pane
 from nir_render.scene.documents.shapes import Box
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
+from nir_render.spectra.nodes import BAND_M
 from nir_render.spectra.skies import CieSky, cie_sky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import guide
 from nir_render.transport.indirect.kernel.draws import lane_draws
-from nir_render.transport.indirect.kernel.paths import Film, walk
+from nir_render.transport.indirect.kernel.nodes import NodeTable, upload_nodes
+from nir_render.transport.indirect.kernel.paths import walk
 from nir_render.transport.indirect.kernel.tables import (
     DeviceScene,
+    Film,
     upload_fog,
     upload_guide,
     upload_lights,
     upload_surfaces,
 )
+from nir_render.transport.indirect.walked import Walked, is_coated, is_glossy, walked
 from nir_render.transport.world import mitsuba_scene
 from nir_render.transport.world.emitters import emitters
 from nir_render.transport.world.facets import PANE, Facets, facets
@@ -78,6 +82,7 @@ def indirect(
     power: NDArray[np.float64],
     samples: NDArray[np.int64] | int | None = None,
     values_at_once: int = _VALUES_AT_ONCE,
+    wavelengths_m: tuple[float, ...] = (BAND_M,),
 ) -> Indirect | None:
     """Return the indirect light of all groups, or None where nothing reflects or scatters and no lamp shines.
 
@@ -95,6 +100,8 @@ def indirect(
         without, the scene's, 16 where it has a target.
     values_at_once
         Float32 numbers that one launch may fill.
+    wavelengths_m
+        The nodes: all go along the same paths.
     """
     if not snapshot.has_indirect_light():
         return None
@@ -104,20 +111,26 @@ def indirect(
         samples = settings.samples or _DEFAULT_SAMPLES
     counts = np.broadcast_to(samples, shape)
     pixels = np.arange(counts.size)
-    built = world_on_device(snapshot, power)
+    built = world_on_device(snapshot, power, wavelengths_m)
     radiance, variance = render_pixels(
         snapshot, built, rays, seed, pixels, counts.ravel(), settings.scale, values_at_once
     )
     return Indirect(
-        radiance_per_w=radiance.reshape(-1, 1, *shape),
-        variance=variance.reshape(-1, 1, *shape),
+        radiance_per_w=radiance.reshape(*radiance.shape[:2], *shape),
+        variance=variance.reshape(*variance.shape[:2], *shape),
         scale=settings.scale,
         samples=int(np.median(counts)),
         counts=None if (counts == counts.flat[0]).all() else counts.astype(np.int32),
     )
 
 
-def pilot(snapshot: Snapshot, rays: Rays, seed: int, power: NDArray[np.float64]) -> Indirect | None:
+def pilot(
+    snapshot: Snapshot,
+    rays: Rays,
+    seed: int,
+    power: NDArray[np.float64],
+    wavelengths_m: tuple[float, ...] = (BAND_M,),
+) -> Indirect | None:
     """Return a few samples in some pixels of the film, every fourth along each axis: what noise there is.
 
     A small film's are closer, so that there are a thousand. The arguments are those of `indirect`.
@@ -129,10 +142,10 @@ def pilot(snapshot: Snapshot, rays: Rays, seed: int, power: NDArray[np.float64])
     step = int(np.clip((rows * columns / _PILOT_PIXELS) ** 0.5, 1, _PILOT_STEP))
     row, column = (_middles(count, step) for count in (rows, columns))
     pixels = (row[:, None] * columns + column).ravel()
-    built = world_on_device(snapshot, power)
+    built = world_on_device(snapshot, power, wavelengths_m)
     counts = np.full(pixels.size, PILOT_SAMPLES)
     radiance, variance = render_pixels(snapshot, built, rays, seed, pixels, counts, scale)
-    shape = (len(radiance), 1, row.size, column.size)
+    shape = (*radiance.shape[:2], row.size, column.size)
     return Indirect(radiance.reshape(shape), variance.reshape(shape), scale * step, PILOT_SAMPLES)
 
 
@@ -157,7 +170,7 @@ def render_pixels(
     scale: int,
     values_at_once: int = _VALUES_AT_ONCE,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return radiance per unit of each group in some pixels of a film, and its variance.
+    """Return radiance per unit of each group in some pixels of a film, at each node, and its variance.
 
     Parameters
     ----------
@@ -176,21 +189,23 @@ def render_pixels(
 
     Returns
     -------
-    Shape (groups, pixels) each.
+    Shape (groups, nodes, pixels) each.
     """
     groups, max_depth = len(snapshot.groups), snapshot.render.indirect.max_depth
-    radiance, variance = (_array((groups, pixels.size)) for _ in range(2))
+    layers = groups * built.node_count
+    radiance, variance = (_array((layers, pixels.size)) for _ in range(2))
     for count in np.unique(counts):
         places = np.flatnonzero(counts == count)
         batches = min(BATCHES, int(count))
-        part = int(np.clip(values_at_once // (groups * batches), 1, places.size))
+        part = int(np.clip(values_at_once // (layers * batches), 1, places.size))
         for first in range(0, places.size, part):
             some = places[first : first + part]
             film = film_on_device(rays, scale, pixels[some])
             radiance[:, some], variance[:, some] = sample_means(
                 built, film, seed, groups, int(count), max_depth
             )
-    return radiance, variance
+    shape = (groups, built.node_count, pixels.size)
+    return radiance.reshape(shape), variance.reshape(shape)
 
 
 def light_seed(*key: object) -> int:
@@ -202,7 +217,7 @@ def light_seed(*key: object) -> int:
 def sample_means(
     built: DeviceScene, film: Film, seed: int, groups: int, samples: int, max_depth: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return radiance per unit of each group in some pixels, and the variance of it, shape (groups, pixels).
+    """Return radiance per unit of each group in some pixels, and its variance, (groups × nodes, pixels).
 
     The samples make up to 8 batches, independent of each other; the variance is that of their mean.
     """
@@ -212,9 +227,10 @@ def sample_means(
     pixel = dr.gather(mi.UInt32, film.index, lane % film.pixels)
     draw = lane_draws(pixel, lane // film.pixels, seed, dr.opaque(mi.UInt32, samples // batches))
     sums = walk(built, film, pixel, draw, lanes, groups, dr.opaque(mi.UInt32, max_depth))
-    place = dr.arange(mi.UInt32, groups * pixels)
-    group = place // film.pixels
-    first = group * dr.opaque(mi.UInt32, lanes) + (place - group * film.pixels)
+    layers = groups * built.node_count
+    place = dr.arange(mi.UInt32, layers * pixels)
+    layer = place // film.pixels
+    first = layer * dr.opaque(mi.UInt32, lanes) + (place - layer * film.pixels)
     means = [
         dr.gather(mi.Float, sums, first + batch * film.pixels) / mi.Float(draw.samples)
         for batch in range(batches)
@@ -224,7 +240,7 @@ def sample_means(
     # Squares of rounding errors are nothing either (see `paths`).
     variance = dr.select(square > _NOTHING, square, 0.0) / max(batches * (batches - 1), 1)
     dr.eval(mean, variance)
-    return np.array(mean).reshape(groups, pixels), np.array(variance).reshape(groups, pixels)
+    return np.array(mean).reshape(layers, pixels), np.array(variance).reshape(layers, pixels)
 
 
 def film_on_device(rays: Rays, scale: int, pixels: NDArray[np.int64]) -> Film:
@@ -241,8 +257,12 @@ def film_on_device(rays: Rays, scale: int, pixels: NDArray[np.int64]) -> Film:
     )
 
 
-def world_on_device(snapshot: Snapshot, power: NDArray[np.float64]) -> DeviceScene:
-    """Bring a scene at a time to the device; `power` as for `indirect`."""
+def world_on_device(
+    snapshot: Snapshot, power: NDArray[np.float64], wavelengths_m: tuple[float, ...] = (BAND_M,)
+) -> DeviceScene:
+    """Bring a scene at a time to the device; `power` and `wavelengths_m` as for `indirect`."""
+    of_nodes = walked(snapshot, wavelengths_m)
+    snapshot = of_nodes.snapshot
     bodies = mitsuba_scene.build(snapshot)
     flat = facets(snapshot)
     shining = emitters(snapshot, flat)
@@ -256,16 +276,32 @@ def world_on_device(snapshot: Snapshot, power: NDArray[np.float64]) -> DeviceSce
         axes.append(np.eye(3) if placed is None else placed.pose.rotation)
     fog = medium(snapshot)
     opaque = mitsuba_scene.build(snapshot, panes=False) if panes else bodies
+    columns = _shape_columns(snapshot, (bodies, opaque), flat)
     return DeviceScene(
         bodies=bodies,
         opaque=opaque,
         lights=upload_lights(shining, power, patterns, np.array(axes), _sky_of(snapshot)),
-        surfaces=upload_surfaces(flat, _shape_columns(snapshot, (bodies, opaque), flat)),
+        surfaces=upload_surfaces(flat, columns),
         choice=upload_guide(
             guide(shining, flat, power, low_m, high_m, 0.0 if fog is None else fog.extinction_per_m)
         ),
         fog=None if fog is None else upload_fog(fog),
+        nodes=_node_table(of_nodes, columns["material"], len(wavelengths_m)),
     )
+
+
+def _node_table(of_nodes: Walked, material: NDArray[np.int64], nodes: int) -> NodeTable | None:
+    """Return what nodes keep on the device, None of one; `material` is each shape's, -1 for none."""
+    if nodes == 1:
+        return None
+    materials = of_nodes.snapshot.materials
+    whole = np.ones(nodes)
+    of_materials = np.array([*(of_nodes.kept.get(name, whole) for name in materials), whole])
+    coated, glossy = (
+        np.array([*(tells(one) and name in of_nodes.kept for name, one in materials.items()), False])
+        for tells in (is_coated, is_glossy)
+    )
+    return upload_nodes(of_materials[material], of_nodes.of_facets, coated[material], glossy[material])
 
 
 def _sky_of(snapshot: Snapshot) -> CieSky | None:
@@ -283,12 +319,13 @@ def _shape_columns(
         for shape in bodies.shapes()  # type: ignore[attr-defined]
     ]
     size = max((number for _, number in numbers), default=0) + 1
-    columns = {name: np.full(size, -1, dtype=np.int64) for name in ("light", "facet")}
+    columns = {name: np.full(size, -1, dtype=np.int64) for name in ("light", "facet", "material")}
     columns |= {name: np.zeros(size, dtype=np.int64) for name in ("box", "glass", "pane")}
     light_of_body = {
         f"lamp_{name.removeprefix('lamps.')}" if name.startswith("lamps.") else f"source_{group}": group
         for group, name in enumerate(snapshot.groups)
     }
+    material_number = {name: index for index, name in enumerate(snapshot.materials)}
     first_facet = {name: index for index, name in reversed(list(enumerate(flat.name)))}
     for body, number in numbers:
         columns["light"][number] = light_of_body.get(body, -1)
@@ -297,6 +334,7 @@ def _shape_columns(
             continue
         shape = snapshot.shapes[name]
         material = snapshot.materials[shape.material]
+        columns["material"][number] = material_number[shape.material]
         box = isinstance(shape, Box)
         place = place_of_shape(name)
         columns["facet"][number] = first_facet.get(f"{place}.0" if box else place, -1)

@@ -48,7 +48,7 @@ def sharpened(
     counts = np.broadcast_to(light.samples if light.counts is None else light.counts, blocks)[row, column]
     key = groups.light_seed(seed, "edges")
     radiance, variance = groups.render_pixels(snapshot, built, rays, key, pixels, counts, 1)
-    return replace(light, edges=Edges(enlargement, radiance[:, None], variance[:, None]))
+    return replace(light, edges=Edges(enlargement, radiance, variance))
 
 
 def flare_pilot(
@@ -77,8 +77,8 @@ def flare_pilot(
         for name, pixels, size in (("blocks", blocks, scale), ("edges", patch, 1))
     ]
     (radiance, variance), (alone, variance_alone) = parts
-    edges = Edges(enlargement, alone[:, None], variance_alone[:, None])
-    return Indirect(radiance[:, None, None], variance[:, None, None], scale, samples, edges=edges)
+    edges = Edges(enlargement, alone, variance_alone)
+    return Indirect(radiance[:, :, None], variance[:, :, None], scale, samples, edges=edges)
 
 
 def rendered_again(
@@ -107,15 +107,13 @@ def rendered_again(
     -------
     By scale, radiance per unit of each group, shape (groups, nodes, pixels).
     """
-    at_nodes = [snapshot.at_wavelength(wavelength_m) for wavelength_m in wavelengths_m]
-    built = [groups.world_on_device(world, power) for world in at_nodes]
+    built = groups.world_on_device(snapshot, power, wavelengths_m)
     renders: list[dict[int, NDArray[np.float32]]] = []
     for number in range(2):
         radiance = {}
         for scale, some in pixels.items():
             key = groups.light_seed(seed, "again", number, scale)
             counts = np.full(some.size, samples)
-            means = [groups.render_pixels(snapshot, one, rays, key, some, counts, scale)[0] for one in built]
-            radiance[scale] = np.stack(means, axis=1)
+            radiance[scale], _ = groups.render_pixels(snapshot, built, rays, key, some, counts, scale)
         renders.append(radiance)
     return renders

@@ -84,6 +84,19 @@ def test_a_short_pulse_meets_the_retinas_limit_first() -> None:
     assert eye_safety(["r2.top"], _source()).pulse_of_limit is None
 
 
+def test_an_eye_that_moves_spreads_a_pulse() -> None:
+    """1 s of the same: by then the least angle is 1.7 mrad √(1/0.25) = 3.4 mrad; at 10 s it is 11."""
+    spectrum = {"gaussian": {"centroid": "940 nm", "fwhm": "1 nm"}}
+    radiance = 0.2 / (4.0 * math.pi**2 * 0.1e-3**2) * R_940
+    for frequency_hz, duty, least_rad in ((0.1, 0.1, 3.4e-3), (2.0, 0.4, 1.7e-3), (0.01, 0.4, 11e-3)):
+        pulses = {"square": {"frequency": f"{frequency_hz} Hz", "duty": duty}}
+        found = eye_safety(["r2.top"], _source(radius="0.1 mm", drive=pulses, spectrum=spectrum))
+        pulse_s = duty / frequency_hz
+        limit = 50_000.0 / least_rad * min(pulse_s, 10.0) ** -0.25
+        assert found.pulse_s == pytest.approx(pulse_s)
+        assert found.pulse_of_limit == pytest.approx(radiance * (1e-3 / least_rad) ** 2 / limit, rel=1e-4)
+
+
 def test_weights_of_the_retina() -> None:
     weights = retinal_weight(np.array([700e-9, 940e-9, 1050e-9, 1100e-9, 1175e-9, 1300e-9]))
     expected = [1.0, R_940, 0.1995, 0.2, 0.2 * 10.0**-0.5, 0.02]

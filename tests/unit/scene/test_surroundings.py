@@ -121,6 +121,17 @@ def test_the_sun_stands_where_its_angles_say(scene: Scene) -> None:
     assert math.degrees(sun.angular_radius_rad) == pytest.approx(0.2666)
 
 
+def test_a_sun_brighter_than_the_sun_is_refused(scene: Scene) -> None:
+    """287 for 0.287, units a thousand times too small: the sun sends 0.84 W/m²/nm at 940 nm before any air."""
+    scene.with_({"sun": {**SUN, "irradiance": "1.04 W/m^2/nm"}})
+    for changes in (
+        {"sun": {**SUN, "irradiance": "1.05 W/m^2/nm"}},
+        {"sun": SUN, "sky": {"irradiance": "287 W/m^2/nm"}},
+    ):
+        with pytest.raises(InputError, match="is more than the sun sends at 940 nm"):
+            scene.with_(changes)
+
+
 GRID_CSV = "polar_deg,azimuth_deg,value\n" + "\n".join(
     f"{polar},{azimuth},{value}"
     for polar, row in ((180, (0, 0)), (0, (1, 1)), (90, (0.7, 0.5)))

@@ -1,9 +1,10 @@
 """Models of lamps, and of the illuminance that a scene's lamps are scaled to."""
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from nir_render.errors import shown
 from nir_render.scene.documents.base import (
     Direction,
     Document,
@@ -21,7 +22,9 @@ from nir_render.scene.documents.base import (
 from nir_render.scene.documents.curves import CurveDocument
 from nir_render.scene.documents.files import PresetDocument
 from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
-from nir_render.spectra.illuminants import CIE_END_M, SILICON_M, VISIBLE_M, CieLamp
+from nir_render.spectra.illuminants import CIE_END_M, SILICON_M, VISIBLE_M, CieLamp, efficacy_lm_per_w
+
+_LEAST_LM_PER_W = 0.1  # a black body of 950 K
 
 _DIRECTIONS = {"up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0)}
 
@@ -60,12 +63,22 @@ class Lamp(PresetDocument):
     size_m: Annotated[Size2, AfterValidator(positive_extents)]
     normal: Direction = (0.0, 0.0, -1.0)
     luminous_flux_lm: Annotated[LuminousFlux, Positive]
-    temperature_k: Annotated[Temperature, Field(ge=500, le=20000)] | None = None
+    temperature_k: Annotated[Temperature, Field(ge=1000, le=20000)] | None = None
     illuminant: CieLamp | CurveDocument | None = None
     infrared: Infrared | None = None
     drive: Drive = FULL_DRIVE
 
     _direction = field_validator("normal")(usable_direction)
+
+    @field_validator("illuminant", mode="before")
+    @classmethod
+    def _a_known_table(cls, illuminant: Any) -> Any:
+        if isinstance(illuminant, str) and illuminant not in get_args(CieLamp):
+            raise ValueError(
+                f"there is no table {shown(illuminant)}; known are {', '.join(get_args(CieLamp))} (CIE 15), "
+                "or 'points' or 'file' of one's own"
+            )
+        return illuminant
 
     @field_validator("illuminant")
     @classmethod
@@ -81,12 +94,11 @@ class Lamp(PresetDocument):
                     "what the eye sees of it: give values from 400 to 700 nm, 0 where nothing is sent (a "
                     "lamp of infrared alone has no lumens: write it among the 'beacons', by its 'flux')"
                 )
-            if not any(
-                value for place_m, value in illuminant.points if VISIBLE_M[0] <= place_m <= VISIBLE_M[1]
-            ):
+            seen = efficacy_lm_per_w(illuminant.curve("the table"))
+            if not seen >= _LEAST_LM_PER_W:
                 raise ValueError(
-                    "the table has no light from 400 to 700 nm, so no 'luminous_flux' tells how much it "
-                    "sends: write a lamp of infrared alone among the 'beacons', by its 'flux'"
+                    f"the eye sees {seen:.2g} lm of a watt of this table: no 'luminous_flux' tells how much "
+                    "it sends; write a lamp of infrared alone among the 'beacons', by its 'flux'"
                 )
         return illuminant
 

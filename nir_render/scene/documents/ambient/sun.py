@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import (
@@ -19,8 +20,22 @@ from nir_render.scene.documents.base import (
     SpectralIrradiance,
 )
 from nir_render.scene.documents.files import PresetDocument
-from nir_render.spectra.illuminants import SUN_RADIUS_RAD
+from nir_render.spectra.illuminants import SUN_RADIUS_RAD, sunlight_ceiling
+from nir_render.spectra.nodes import BAND_M
 from nir_render.spectra.sunlight import sun_position
+
+
+def _of_a_sun(irradiance_w_per_m3: float) -> float:
+    most = float(sunlight_ceiling(np.array([BAND_M]))[0])
+    if irradiance_w_per_m3 > most:
+        raise ValueError(
+            f"{1e-9 * irradiance_w_per_m3:.4g} W/m^2/nm is more than the sun sends at 940 nm, which is 0.84 "
+            "W/m^2/nm above the air; of ASTM G173's direct sun it is 0.287"
+        )
+    return irradiance_w_per_m3
+
+
+_Irradiance = Annotated[SpectralIrradiance, Positive, AfterValidator(_of_a_sun)]
 
 
 class Air(PresetDocument):
@@ -65,7 +80,7 @@ class Sun(Document):
 
     azimuth_rad: Angle
     elevation_rad: Annotated[Angle, Field(gt=0, le=math.pi / 2)]
-    irradiance_w_per_m3: Annotated[SpectralIrradiance, Positive] | None = None
+    irradiance_w_per_m3: _Irradiance | None = None
     air: Air | None = None
     day_of_year: Annotated[int, Field(ge=1, le=366)] | None = None
     clouds: Annotated[Fraction, Field(ge=0, le=1)] | None = None
@@ -132,7 +147,7 @@ class Sky(Document):
     example: ClassVar[str] = "{cie: 12}"
 
     cie: Annotated[int, Field(ge=1, le=15)] = 12
-    irradiance_w_per_m3: Annotated[SpectralIrradiance, Positive] | None = None
+    irradiance_w_per_m3: _Irradiance | None = None
     clouds: Annotated[Fraction, NotNegative] = 1.0
 
 

@@ -1,22 +1,24 @@
 """What arrives of a light's radiance along a ray, on the device: shadow, mirrors, panes, fog, pattern."""
 
 from nir_render.transport.backend.variant import dr, mi
-from nir_render.transport.indirect.kernel import connect
+from nir_render.transport.indirect.kernel import connect, nodes
 from nir_render.transport.indirect.kernel.fog import transmittance
 from nir_render.transport.indirect.kernel.tables import DeviceScene
-from nir_render.transport.indirect.kernel.types import Float, Mask, Point, UInt, Vector
+from nir_render.transport.indirect.kernel.types import Float, Mask, Point, Shares, UInt, Vector
+from nir_render.transport.world.facets import MIRROR
 
 
 def arriving_share(
     scene: DeviceScene, row: UInt, origin: Point, aim: connect.Aim, depth: UInt, max_depth: UInt, active: Mask
-) -> Float:
+) -> tuple[Float, Shares]:
     """Return the share of a light's mean radiance that reaches a place along a ray; 0 where it is in shadow.
 
     Mirrored images are followed by both their legs, each pane weakens and counts as a stretch of the path, as
-    it does where a path meets it by itself.
+    it does where a path meets it by itself. And what each node keeps of that share.
     """
     lights = scene.lights
     factor, stretches = mi.Float(1), depth + 1
+    shares = nodes.whole(scene.nodes)
     reach, leaving = aim.reach, -aim.direction
     second, shown = None, mi.Bool(False)
     facet = mi.Int32(-1)
@@ -26,19 +28,25 @@ def arriving_share(
         second = connect.mirror_ray(scene.surfaces, mi.UInt32(facet), origin, aim.direction, aim.reach, shown)
         active = active & (~shown | second.valid)
         factor = dr.select(shown, second.reflectance, factor)
+        mirror = shown & (dr.gather(mi.UInt32, scene.surfaces.kind, mi.UInt32(facet), shown) == MIRROR)
+        shares = nodes.where(mirror, nodes.off_facet(scene.nodes, facet, mirror), shares)
         stretches = dr.select(shown, stretches + 1, stretches)
         reach = dr.select(shown, second.distance, reach)
         leaving = dr.select(shown, -second.direction, leaving)
     if scene.surfaces.pane_count:
-        left, count = connect.pane_transmittance(scene.surfaces, origin, aim.direction, reach, facet, active)
+        left, count, kept = connect.pane_transmittance(
+            scene.surfaces, scene.nodes, origin, aim.direction, reach, facet, active
+        )
         factor, stretches = factor * left, stretches + count
+        shares = nodes.times(shares, kept)
     if scene.fog is not None:
         factor = factor * transmittance(scene.fog, origin, aim.direction, reach)
     if second is not None:
         if scene.surfaces.pane_count:
-            left, count = connect.pane_transmittance(
-                scene.surfaces, second.place, second.direction, second.rest, facet, shown
+            left, count, kept = connect.pane_transmittance(
+                scene.surfaces, scene.nodes, second.place, second.direction, second.rest, facet, shown
             )
+            shares = nodes.where(shown, nodes.times(shares, kept), shares)
             factor, stretches = (
                 dr.select(shown, factor * left, factor),
                 dr.select(shown, stretches + count, stretches),
@@ -51,8 +59,8 @@ def arriving_share(
     if second is None:
         active = active & _reaches(scene, row, light, origin, aim.direction, aim.reach, active)
     else:
-        mirror = reach * (1.0 - connect.SHORTER)
-        active = active & ~(shown & _hidden(scene, origin, aim.direction, mirror, active & shown))
+        before = reach * (1.0 - connect.SHORTER)
+        active = active & ~(shown & _hidden(scene, origin, aim.direction, before, active & shown))
         place, onward, rest = (
             dr.select(shown, leg, straight)
             for leg, straight in (
@@ -61,7 +69,7 @@ def arriving_share(
         )  # fmt: skip
         active = active & _reaches(scene, row, light, place, onward, rest, active)
     factor = factor * connect.pattern_factor(lights, light, leaving, active)
-    return dr.select(active, factor, 0.0)
+    return dr.select(active, factor, 0.0), shares
 
 
 def _reaches(

@@ -7,9 +7,11 @@ that crosses the facet goes on, mirrored, to the light itself. Panes weaken what
 from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.kernel import nodes as of_nodes
+from nir_render.transport.indirect.kernel.nodes import NodeTable
 from nir_render.transport.indirect.kernel.rectangle import RectangleInView
 from nir_render.transport.indirect.kernel.tables import Choice, Lights, Surfaces, along_table
-from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, UInt, Vector
+from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, Shares, UInt, Vector
 from nir_render.transport.world.emitters import RECTANGLE, SKY, SUN
 from nir_render.transport.world.facets import MIRROR, PANE
 
@@ -148,14 +150,20 @@ def reflectance(surfaces: Surfaces, facet: UInt, cosine: Float, active: Mask) ->
 
 
 def pane_transmittance(
-    surfaces: Surfaces, origin: Point, direction: Vector, reach: Float, without: Int, active: Mask
-) -> tuple[Float, UInt]:
-    """Return the transmittance of all panes on a straight way but `without`, and their number."""
+    surfaces: Surfaces,
+    nodes: NodeTable | None,
+    origin: Point,
+    direction: Vector,
+    reach: Float,
+    without: Int,
+    active: Mask,
+) -> tuple[Float, UInt, Shares]:
+    """Return what panes on a straight way, but `without`, pass; their number; what nodes keep of that."""
 
-    def more(k: UInt, _left: Float, _count: UInt) -> Mask:
+    def more(k: UInt, _left: Float, _count: UInt, _shares: Shares) -> Mask:
         return k < surfaces.pane_count
 
-    def step(k: UInt, left: Float, count: UInt) -> tuple[UInt, Float, UInt]:
+    def step(k: UInt, left: Float, count: UInt, shares: Shares) -> tuple[UInt, Float, UInt, Shares]:
         pane = dr.gather(mi.UInt32, surfaces.panes, k, active)
         normal = dr.gather(mi.Vector3f, surfaces.normal, pane, active)
         at = _crossing(surfaces, pane, origin, direction, active)
@@ -164,11 +172,14 @@ def pane_transmittance(
         )
         reflected = reflectance(surfaces, pane, dr.abs(dr.dot(direction, normal)), active)
         passed = (1.0 - reflected) * dr.gather(mi.Float, surfaces.transmission, pane, active)
-        return k + 1, dr.select(crossed, left * passed, left), dr.select(crossed, count + 1, count)
+        kept = of_nodes.times(shares, of_nodes.off_facet(nodes, pane, active))
+        left, count = dr.select(crossed, left * passed, left), dr.select(crossed, count + 1, count)
+        return k + 1, left, count, of_nodes.where(crossed, kept, shares)
 
     width = dr.zeros(mi.UInt32, dr.width(reach))
-    _, left, count = dr.while_loop((width, mi.Float(width) + 1.0, mi.UInt32(width)), more, step)
-    return left, count
+    start = (width, mi.Float(width) + 1.0, mi.UInt32(width), of_nodes.whole(nodes, dr.width(reach)))
+    _, left, count, shares = dr.while_loop(start, more, step)
+    return left, count, shares
 
 
 @dataclass(frozen=True, eq=False)

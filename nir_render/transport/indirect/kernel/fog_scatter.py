@@ -8,7 +8,7 @@ off the ray (equiangular sampling, Kulla & Fajardo 2012, with the phase function
 from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
-from nir_render.transport.indirect.kernel import connect, draws
+from nir_render.transport.indirect.kernel import connect, draws, nodes
 from nir_render.transport.indirect.kernel.arrive import arriving_share
 from nir_render.transport.indirect.kernel.fog import (
     absorbed_share,
@@ -66,8 +66,8 @@ def scatter_on_stretch(
     weight = fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin)) / density
     brought = state.weight * weight * phase_function(fog, turn) * aim.radiance / (chance * aim.density)
     seen = active & (brought > 0.0) & dr.isfinite(brought)
-    share = arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
-    add(brought * share, row, seen & (share > 0.0))
+    share, kept = arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
+    add(brought * share, nodes.times(state.shares, kept), row, seen & (share > 0.0))
     return FogScattering(lost, place, weight, turns)
 
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from nir_render.transport.backend.variant import dr, mi
-from nir_render.transport.indirect.kernel import connect, draws
+from nir_render.transport.indirect.kernel import connect, draws, nodes
 from nir_render.transport.indirect.kernel.arrive import arriving_share
 from nir_render.transport.indirect.kernel.draws import Draws
 from nir_render.transport.indirect.kernel.fog import fog_interval
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
-from nir_render.transport.indirect.kernel.tables import DeviceScene, Surfaces
+from nir_render.transport.indirect.kernel.tables import DeviceScene, Film, Surfaces, direction_in_pixel
 from nir_render.transport.indirect.kernel.types import (
     AddLight,
     Float,
@@ -31,6 +31,7 @@ from nir_render.transport.indirect.kernel.types import (
     PathState,
     Point,
     Random,
+    Shares,
     UInt,
     Vector,
 )
@@ -47,29 +48,10 @@ _DIM = 0.1
 _NOTHING = 1e-15
 
 
-@dataclass(frozen=True, eq=False)
-class Film:
-    """The rays of a camera and the part of its film to fill.
-
-    `corners` holds directions at the corners of the sensor's pixels, `rows` + 1 times `columns` + 1; a pixel
-    of the film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels`
-    and `pixel_count` how many.
-    """
-
-    origin: Point
-    corners: Float
-    rows: UInt
-    columns: UInt
-    scale: UInt
-    index: UInt
-    pixels: UInt
-    pixel_count: int
-
-
 def walk(
     scene: DeviceScene, film: Film, pixel: UInt, draw: Draws, lanes: int, groups: int, max_depth: UInt
 ) -> Float:
-    """Return the sum over a batch's samples of each pixel's radiance per unit of each group's emission.
+    """Return the sum over a batch's samples of each pixel's radiance per unit of each group, by node.
 
     Parameters
     ----------
@@ -82,21 +64,22 @@ def walk(
 
     Returns
     -------
-    Flat array, (group, batch, pixel).
+    Flat array, (group, node, batch, pixel).
     """
     lane = dr.arange(mi.UInt32, lanes)
-    out = dr.zeros(mi.Float, groups * lanes)
+    out = dr.zeros(mi.Float, groups * scene.node_count * lanes)
     stride = dr.opaque(mi.UInt32, lanes)
 
-    def add(value: Float, row: UInt, active: Mask) -> None:
+    def add(value: Float, shares: Shares, row: UInt, active: Mask) -> None:
         group = dr.gather(mi.UInt32, scene.lights.group, row, active)
-        dr.scatter_reduce(
-            dr.ReduceOp.Add, out, value, group * stride + lane, active & (value > _NOTHING),
-            dr.ReduceMode.NoConflicts,
-        )  # fmt: skip
+        if scene.nodes is not None:
+            group = group * scene.nodes.count
+        for node, part in enumerate([value * share for share in shares] or [value]):
+            place, some = (group + node) * stride + lane, active & (part > _NOTHING)
+            dr.scatter_reduce(dr.ReduceOp.Add, out, part, place, some, dr.ReduceMode.NoConflicts)
 
     def camera_direction(sample: UInt) -> Vector:
-        return _camera_direction(film, pixel, draw, sample)
+        return direction_in_pixel(film, pixel, draw, sample)
 
     def step(state: PathState) -> tuple[PathState]:
         return (_step(scene, state, draw, max_depth, add, camera_direction, film.origin),)
@@ -108,6 +91,7 @@ def walk(
         origin=film.origin + dr.zeros(mi.Point3f, lanes),
         direction=camera_direction(zero),
         weight=dr.ones(mi.Float, lanes),
+        shares=nodes.whole(scene.nodes, lanes),
         left=dr.ones(mi.Float, lanes),
         place=dr.zeros(mi.Point3f, lanes),
         cell=mi.UInt32(zero),
@@ -119,23 +103,6 @@ def walk(
     )
     dr.while_loop((state,), lambda state: state.active, step)
     return out
-
-
-def _camera_direction(film: Film, pixel: UInt, draw: Draws, sample: UInt) -> Vector:
-    """Return a unit direction in a pixel, evenly drawn between those at the sensor pixel's corners."""
-    width = film.columns // film.scale
-    row = pixel // width
-    u = (mi.Float(pixel - row * width) + draw.pixel(sample, draws.PIXEL_U)) * mi.Float(film.scale)
-    v = (mi.Float(row) + draw.pixel(sample, draws.PIXEL_V)) * mi.Float(film.scale)
-    # In float32 the sum can round up to the next whole number.
-    column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
-    corner = line * (film.columns + 1) + column
-    above, above_right, below, below_right = (
-        dr.gather(mi.Vector3f, film.corners, corner + offset)
-        for offset in (0, 1, film.columns + 1, film.columns + 2)
-    )
-    along, down = u - mi.Float(column), v - mi.Float(line)
-    return dr.normalize(dr.lerp(dr.lerp(above, above_right, along), dr.lerp(below, below_right, along), down))
 
 
 def _step(
@@ -242,7 +209,7 @@ def _add_unasked_light(
     share = dr.select(in_table, 0.0, share)
     radiance = dr.gather(mi.Float, lights.radiance, light, active)
     radiance = radiance * connect.pattern_factor(lights, light, -state.direction, active)
-    add(weight * radiance * share, light, active & (share > 0.0))
+    add(weight * radiance * share, state.shares, light, active & (share > 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,8 +252,10 @@ def _ask_light(
     to = aim.direction * aim.reach - (shadow.o - si.p)
     reach = dr.norm(to)
     lifted = replace(aim, direction=to / reach, reach=reach)
-    share = arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
-    add(brought * share, row, seen & (share > 0.0))
+    share, kept = arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
+    shares = nodes.off_surface(scene.nodes, si, bsdf, aim.direction, mi.Bool(False), seen)
+    shares = nodes.times(nodes.times(state.shares, shares), kept)
+    add(brought * share, shares, row, seen & (share > 0.0))
     return _SurfaceSample(bsdf, sample, sampled_weight[0], cell)
 
 
@@ -294,11 +263,12 @@ def _ask_light(
 class _NextStretch:
     """How a path leaves the vertex at the end of a stretch, if it does.
 
-    `origin` is that of its next stretch, `leaves` whether there is one, `evenly` whether the vertex scatters
-    evenly; `cell`, `way` and `inside` are those of `PathState`.
+    `shares` is what nodes keep there, `origin` that of its next stretch, `leaves` whether there is one,
+    `evenly` whether the vertex scatters evenly; `cell`, `way` and `inside` are those of `PathState`.
     """
 
     leaving: NextDirection
+    shares: Shares
     origin: Point
     cell: UInt
     leaves: Mask
@@ -333,10 +303,13 @@ def _scatter(
     )  # fmt: skip
     way = dr.select(passes, state.way, dr.select(mirrored, facet, _OTHERWISE))
     glass = dr.gather(mi.Bool, scene.surfaces.glass_of_shape, shape, surface)
+    sharp = smooth & mi.has_flag(sampled_type, mi.BSDFFlags.DeltaReflection)
+    shares = nodes.off_surface(scene.nodes, si, sampled.bsdf, leaving.direction, sharp, surface)
     onward = si.spawn_ray(leaving.direction)
     surface = surface & ~turned & (leaving.weight > 0.0)
     return _NextStretch(
         leaving=leaving,
+        shares=nodes.where(turned, nodes.whole(scene.nodes), shares),
         origin=dr.select(turned, leaving.place, onward.o),
         cell=sampled.cell,
         leaves=surface | turned,
@@ -356,6 +329,7 @@ def _survive(
 ) -> PathState:
     """Return the state of a path that goes on, by chance `u` where it is dim, or of the next sample's."""
     leaving, evenly = onward_path.leaving, onward_path.evenly
+    whole = tuple(mi.Float(1) for _ in state.shares)
     left = state.left * leaving.left
     survival = dr.minimum(left / _DIM, 1.0)
     goes_on = onward_path.leaves & (u < survival)
@@ -366,6 +340,7 @@ def _survive(
         origin=dr.select(goes_on, onward_path.origin, camera),
         direction=dr.select(goes_on, leaving.direction, camera_direction(sample_next)),
         weight=dr.select(goes_on, state.weight * leaving.weight / survival, 1.0),
+        shares=nodes.where(goes_on, nodes.times(state.shares, onward_path.shares), whole),
         left=dr.select(goes_on, left / survival, 1.0),
         place=dr.select(evenly, leaving.place, state.place),
         cell=dr.select(evenly, onward_path.cell, state.cell),

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from nir_render.spectra.skies import CieSky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import Guide
+from nir_render.transport.indirect.kernel import draws
+from nir_render.transport.indirect.kernel.draws import Draws
+from nir_render.transport.indirect.kernel.nodes import NodeTable
 from nir_render.transport.indirect.kernel.sky import SkyTable, upload_sky
 from nir_render.transport.indirect.kernel.types import Float, Int, Mask, MitsubaScene, Point, UInt, Vector
 from nir_render.transport.world.emitters import RECTANGLE, SKY, SPHERE, SUN, Emitters
@@ -104,8 +107,30 @@ class FogTable:
 
 
 @dataclass(frozen=True, eq=False)
+class Film:
+    """The rays of a camera and the part of its film to fill.
+
+    `corners` holds directions at the corners of the sensor's pixels, `rows` + 1 times `columns` + 1; a pixel
+    of the film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels`
+    and `pixel_count` how many.
+    """
+
+    origin: Point
+    corners: Float
+    rows: UInt
+    columns: UInt
+    scale: UInt
+    index: UInt
+    pixels: UInt
+    pixel_count: int
+
+
+@dataclass(frozen=True, eq=False)
 class DeviceScene:
-    """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes."""
+    """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes.
+
+    `nodes` is None where light of one wavelength alone is carried.
+    """
 
     bodies: MitsubaScene
     opaque: MitsubaScene
@@ -113,6 +138,12 @@ class DeviceScene:
     surfaces: Surfaces
     choice: Choice
     fog: FogTable | None
+    nodes: NodeTable | None = None
+
+    @property
+    def node_count(self) -> int:
+        """How many wavelengths are carried."""
+        return 1 if self.nodes is None else self.nodes.count
 
 
 def upload_lights(
@@ -241,6 +272,23 @@ def along_table(place: Float, end: float | Point) -> Float:
     As a whole number NaN is 2³¹ on processors without AVX-512: a gather there reads memory that is not ours.
     """
     return dr.select(place > 0.0, dr.minimum(place, end), 0.0)
+
+
+def direction_in_pixel(film: Film, pixel: UInt, draw: Draws, sample: UInt) -> Vector:
+    """Return a unit direction in a pixel, evenly drawn between those at the sensor pixel's corners."""
+    width = film.columns // film.scale
+    row = pixel // width
+    u = (mi.Float(pixel - row * width) + draw.pixel(sample, draws.PIXEL_U)) * mi.Float(film.scale)
+    v = (mi.Float(row) + draw.pixel(sample, draws.PIXEL_V)) * mi.Float(film.scale)
+    # In float32 the sum can round up to the next whole number.
+    column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
+    corner = line * (film.columns + 1) + column
+    above, above_right, below, below_right = (
+        dr.gather(mi.Vector3f, film.corners, corner + offset)
+        for offset in (0, 1, film.columns + 1, film.columns + 2)
+    )
+    along, down = u - mi.Float(column), v - mi.Float(line)
+    return dr.normalize(dr.lerp(dr.lerp(above, above_right, along), dr.lerp(below, below_right, along), down))
 
 
 def _real(values: NDArray[np.float64]) -> Float:

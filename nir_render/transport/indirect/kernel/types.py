@@ -18,7 +18,9 @@ Interaction = Any  # where rays meet surfaces: mi.SurfaceInteraction3f
 MitsubaScene = Any
 
 Random = Callable[[Any], Float]  # a number in [0, 1) for a path's vertex, by what it is for (see `draws`)
-AddLight = Callable[[Float, UInt, Mask], None]  # adds radiance per unit of a light's emission to the result
+Shares = tuple[Float, ...]  # what each node keeps of a path's light (see `nodes`); of one node alone none
+# Adds radiance per unit of a light's emission, the nodes' shares of it, to the result.
+AddLight = Callable[[Float, Shares, UInt, Mask], None]
 
 
 @dataclass
@@ -30,6 +32,7 @@ class PathState:
     origin: Point
     direction: Vector
     weight: Float
+    shares: Shares
     left: Float  # what surfaces and fog have left of a path's light
     place: Point  # the last vertex that scatters evenly
     cell: UInt
