@@ -256,14 +256,14 @@ def world_on_device(snapshot: Snapshot, power: NDArray[np.float64]) -> DeviceSce
         axes.append(np.eye(3) if placed is None else placed.pose.rotation)
     fog = medium(snapshot)
     opaque = mitsuba_scene.build(snapshot, panes=False) if panes else bodies
+    extinction_per_m = 0.0 if fog is None else fog.extinction_per_m
+    choice = guide(shining, flat, power, low_m, high_m, extinction_per_m)
     return DeviceScene(
         bodies=bodies,
         opaque=opaque,
-        lights=upload_lights(shining, power, patterns, np.array(axes), _sky_of(snapshot)),
+        lights=upload_lights(shining, power, patterns, np.array(axes), _sky_of(snapshot), choice.tier),
         surfaces=upload_surfaces(flat, _shape_columns(snapshot, (bodies, opaque), flat)),
-        choice=upload_guide(
-            guide(shining, flat, power, low_m, high_m, 0.0 if fog is None else fog.extinction_per_m)
-        ),
+        choice=upload_guide(choice),
         fog=None if fog is None else upload_fog(fog),
     )
 

@@ -28,10 +28,11 @@ class Aim:
     radiance: Float
 
 
-def guide_cell(choice: Choice, place: Point) -> UInt:
-    """Return the guide's cell of a place; outside the grid the nearest."""
+def guide_cell(choice: Choice, place: Point, tier: UInt | None = None) -> UInt:
+    """Return the guide's cell of a place, of all tiers' cells that of one; outside the grid the nearest."""
     at = mi.Point3u(along_table((place - choice.low) * choice.cells_per_m, choice.top))
-    return at.x + choice.stride_y * at.y + choice.stride_z * at.z
+    cell = at.x + choice.stride_y * at.y + choice.stride_z * at.z
+    return cell if tier is None else cell + choice.cells * tier
 
 
 def choose_light(choice: Choice, lights: Lights, cell: UInt, u: Float) -> tuple[UInt, Float]:
@@ -46,6 +47,11 @@ def choose_light(choice: Choice, lights: Lights, cell: UInt, u: Float) -> tuple[
 def light_chance(choice: Choice, lights: Lights, cell: UInt, row: UInt, active: Mask) -> Float:
     """Return the chance that the guide draws a light in a cell."""
     return dr.gather(mi.Float, choice.chance, cell * lights.count + row, active)
+
+
+def of_tier(lights: Lights, row: UInt, tier: UInt | None, weight: Float) -> Float:
+    """Return a weight where a light is of a tier, else 0; the weight itself where all are of one."""
+    return weight if tier is None else dr.select(dr.gather(mi.UInt32, lights.tier, row) == tier, weight, 0.0)
 
 
 def versine_of(radius: Float, distance2: Float) -> Float:

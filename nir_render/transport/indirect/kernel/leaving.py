@@ -88,7 +88,7 @@ def leave_in_fog(
     share = dr.select(turned, _FROM_FOG, dr.select(rough, _FROM_SURFACE, 0.0))
     in_halo = number(draws.HALO) < share
     place = dr.select(turned, scattering.place, sampled.place)
-    halos = Halos(scene, place, state.direction, turned, number(draws.HALO_LIGHT), turned | rough)
+    halos = Halos(scene, place, state.direction, turned, state.tier, number(draws.HALO_LIGHT), turned | rough)
     u, v = number(draws.HALO_U), number(draws.HALO_V)
     plain = dr.select(turned, draw_scattering(fog, state.direction, u, v), sampled.direction)
     direction = dr.select(in_halo, halos.direction(u, v), plain)

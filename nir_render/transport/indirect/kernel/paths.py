@@ -22,6 +22,7 @@ from nir_render.transport.indirect.kernel.fog import fog_interval
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
 from nir_render.transport.indirect.kernel.tables import DeviceScene, Surfaces
+from nir_render.transport.indirect.kernel.tiers import deal_of
 from nir_render.transport.indirect.kernel.types import (
     AddLight,
     Float,
@@ -45,6 +46,8 @@ _FAR = 1e15
 _DIM = 0.1
 # Less than this, in 1/(m² sr), is nothing: near 1e-38 some threads round to zero and others do not.
 _NOTHING = 1e-15
+
+_Begin = tuple[Vector, UInt | None, Float | None]  # of a path: direction, tier, and one over its share
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,18 +98,24 @@ def walk(
             dr.ReduceMode.NoConflicts,
         )  # fmt: skip
 
-    def camera_direction(sample: UInt) -> Vector:
-        return _camera_direction(film, pixel, draw, sample)
+    deal = deal_of(scene, film.origin, _camera_direction(film, pixel, mi.Float(0.5), mi.Float(0.5)))
+
+    def begin(sample: UInt) -> _Begin:
+        along, down, dealt = (
+            draw.pixel(sample, purpose) for purpose in (draws.PIXEL_U, draws.PIXEL_V, draws.TIER)
+        )
+        return _camera_direction(film, pixel, along, down), *deal.tier_of(dealt)
 
     def step(state: PathState) -> tuple[PathState]:
-        return (_step(scene, state, draw, max_depth, add, camera_direction, film.origin),)
+        return (_step(scene, state, draw, max_depth, add, begin, film.origin),)
 
     zero = dr.zeros(mi.UInt32, lanes)
+    direction, tier, dealt = begin(zero)
     state = PathState(
         sample=mi.UInt32(zero),
         depth=mi.UInt32(zero),
         origin=film.origin + dr.zeros(mi.Point3f, lanes),
-        direction=camera_direction(zero),
+        direction=direction,
         weight=dr.ones(mi.Float, lanes),
         left=dr.ones(mi.Float, lanes),
         place=dr.zeros(mi.Point3f, lanes),
@@ -115,18 +124,20 @@ def walk(
         scattered=dr.zeros(mi.Bool, lanes),
         way=dr.full(mi.Int32, _STRAIGHT, lanes),
         inside=dr.zeros(mi.Bool, lanes),
+        tier=tier,
+        dealt=dealt,
         active=dr.full(mi.Bool, True, lanes),
     )
     dr.while_loop((state,), lambda state: state.active, step)
     return out
 
 
-def _camera_direction(film: Film, pixel: UInt, draw: Draws, sample: UInt) -> Vector:
-    """Return a unit direction in a pixel, evenly drawn between those at the sensor pixel's corners."""
+def _camera_direction(film: Film, pixel: UInt, along: Float, down: Float) -> Vector:
+    """Return the unit direction at a place in a pixel, between those at the sensor pixel's corners."""
     width = film.columns // film.scale
     row = pixel // width
-    u = (mi.Float(pixel - row * width) + draw.pixel(sample, draws.PIXEL_U)) * mi.Float(film.scale)
-    v = (mi.Float(row) + draw.pixel(sample, draws.PIXEL_V)) * mi.Float(film.scale)
+    u = (mi.Float(pixel - row * width) + along) * mi.Float(film.scale)
+    v = (mi.Float(row) + down) * mi.Float(film.scale)
     # In float32 the sum can round up to the next whole number.
     column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
     corner = line * (film.columns + 1) + column
@@ -144,7 +155,7 @@ def _step(
     draw: Draws,
     max_depth: UInt,
     add: AddLight,
-    camera_direction: Callable[[UInt], Vector],
+    begin: Callable[[UInt], _Begin],
     camera: Point,
 ) -> PathState:
     """Return a lane's state after one more stretch of its path, its light added on the way."""
@@ -159,7 +170,7 @@ def _step(
     surface = met & (light < 0) & (state.depth + 1 < max_depth)
     sampled = _ask_light(scene, state, si, passing, surface, max_depth, number, add)
     onward_path = _scatter(scene, state, si, sampled, surface, scattering, number)
-    return _survive(state, onward_path, draw, number(draws.SURVIVAL), camera_direction, camera)
+    return _survive(state, onward_path, draw, number(draws.SURVIVAL), begin, camera)
 
 
 def _meet(scene: DeviceScene, state: PathState) -> Interaction:
@@ -220,6 +231,10 @@ def _add_unasked_light(
     Small lights that the camera sees straight, or by one facet, are left out: the direct table holds them.
     """
     lights = scene.lights
+    if state.tier is not None:
+        others = dr.gather(mi.UInt32, lights.tier, light, active) != state.tier
+        active = active & ~(state.scattered & others)
+        weight = dr.select(state.scattered, weight * state.dealt, weight)
     row = mi.Int32(light)
     towards = state.direction
     if lights.has_images:
@@ -270,7 +285,7 @@ def _ask_light(
     Both come from one call of Mitsuba's, which costs less than two.
     """
     bsdf = si.bsdf()
-    cell = connect.guide_cell(scene.choice, si.p)
+    cell = connect.guide_cell(scene.choice, si.p, state.tier)
     row, chance = connect.choose_light(scene.choice, scene.lights, cell, number(draws.LIGHT))
     aim = connect.aim_at_light(scene.lights, row, si.p, number(draws.LIGHT_U), number(draws.LIGHT_V), surface)
     value, density, sample, sampled_weight = bsdf.eval_pdf_sample(
@@ -279,6 +294,8 @@ def _ask_light(
     )  # fmt: skip
     asked = aim.density * chance
     brought = weight * value[0] * aim.radiance / asked * _power_heuristic(asked, density)
+    if state.dealt is not None:
+        brought = brought * state.dealt
     seen = surface & (brought > 0.0) & dr.isfinite(brought)
     shadow = si.spawn_ray(aim.direction)
     # Mitsuba lifts a ray's origin off the surface, up to 1e-4 of the coordinates; it aims at the same point.
@@ -351,7 +368,7 @@ def _survive(
     onward_path: _NextStretch,
     draw: Draws,
     u: Float,
-    camera_direction: Callable[[UInt], Vector],
+    begin: Callable[[UInt], _Begin],
     camera: Point,
 ) -> PathState:
     """Return the state of a path that goes on, by chance `u` where it is dim, or of the next sample's."""
@@ -360,11 +377,12 @@ def _survive(
     survival = dr.minimum(left / _DIM, 1.0)
     goes_on = onward_path.leaves & (u < survival)
     sample_next = state.sample + dr.select(goes_on, mi.UInt32(0), mi.UInt32(1))
+    direction, tier, dealt = begin(sample_next)
     return PathState(
         sample=sample_next,
         depth=dr.select(goes_on, state.depth + 1, 0),
         origin=dr.select(goes_on, onward_path.origin, camera),
-        direction=dr.select(goes_on, leaving.direction, camera_direction(sample_next)),
+        direction=dr.select(goes_on, leaving.direction, direction),
         weight=dr.select(goes_on, state.weight * leaving.weight / survival, 1.0),
         left=dr.select(goes_on, left / survival, 1.0),
         place=dr.select(evenly, leaving.place, state.place),
@@ -374,6 +392,8 @@ def _survive(
         scattered=goes_on & (state.scattered | evenly),
         way=dr.select(goes_on & ~evenly, onward_path.way, _STRAIGHT),
         inside=goes_on & onward_path.inside,
+        tier=None if tier is None else dr.select(goes_on, state.tier, tier),
+        dealt=None if dealt is None else dr.select(goes_on, state.dealt, dealt),
         active=state.active & (sample_next < draw.samples),
     )
 

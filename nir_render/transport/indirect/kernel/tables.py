@@ -39,6 +39,8 @@ class Lights:
     facet: Int
     image: Int
     power: Float
+    tier: UInt
+    tiers: int
     pattern: Float  # values of all patterns, one after the other
     pattern_first: Int  # where each light's begins, −1 for none
     pattern_azimuths: UInt
@@ -83,8 +85,10 @@ class Choice:
     top: Point
     stride_y: UInt
     stride_z: UInt
+    cells: UInt
     cumulative: Float
     chance: Float
+    tier_share: Float  # of each tier in each cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +125,7 @@ def upload_lights(
     patterns: list[Pattern | None],
     axes: NDArray[np.float64],
     sky: CieSky | None = None,
+    tier: NDArray[np.int64] | None = None,
 ) -> Lights:
     """Bring emitters to the device.
 
@@ -134,7 +139,10 @@ def upload_lights(
         World from the source's own axes, shape (lights, 3, 3).
     sky
         How bright the sky is over directions, None where there is none.
+    tier
+        The tier of each emitter (`guide.Guide`), shape (emitters,); without, all are of one.
     """
+    tier = np.zeros(len(emitters.kind), dtype=np.int64) if tier is None else tier
     values, first, azimuths = [np.ones(1)], [], []
     for pattern in patterns:
         first.append(-1 if pattern is None else sum(map(len, values)))
@@ -162,6 +170,8 @@ def upload_lights(
         facet=mi.Int32(emitters.facet.astype(np.int32)),
         image=mi.Int32(np.append(emitters.image.ravel(), -1).astype(np.int32)),
         power=_real(power[emitters.group]),
+        tier=_whole(tier),
+        tiers=int(tier.max(initial=0)) + 1,
         pattern=_real(np.concatenate(values)),
         pattern_first=mi.Int32(np.array(first, dtype=np.int32)),
         pattern_azimuths=_whole(np.array(azimuths)),
@@ -212,8 +222,10 @@ def upload_guide(guide: Guide) -> Choice:
         top=mi.Point3f(*(dr.opaque(mi.Float, float(count) - 0.5) for count in guide.counts)),
         stride_y=dr.opaque(mi.UInt32, x),
         stride_z=dr.opaque(mi.UInt32, x * y),
+        cells=dr.opaque(mi.UInt32, int(np.prod(guide.counts))),
         cumulative=mi.Float(guide.cumulative.ravel()),
         chance=mi.Float(guide.chance.ravel()),
+        tier_share=_real(guide.tier_share),
     )
 
 

@@ -1,0 +1,103 @@
+"""Which lights a path serves, on the device: the samples of a pixel are dealt out to tiers of lights.
+
+In fog lights say where paths turn and whereto. A path that serves them all goes where the strongest wants it,
+and what a weak source would need, turn after turn, is drawn so seldom that its light comes from few samples,
+most of it from none. So each path serves one tier: it asks for its lights, meets them, and goes as if the
+others were off. A tier gets samples by what it brings to the pixel's ray, roughly, and each a floor; the
+share is known beforehand, and one over it is the weight. What the camera sees straight is in all samples.
+"""
+
+from dataclasses import dataclass
+
+from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.kernel import connect
+from nir_render.transport.indirect.kernel.fog import absorbed_share, fog_interval
+from nir_render.transport.indirect.kernel.fog_scatter import brought_to_stretch, weighs_all
+from nir_render.transport.indirect.kernel.tables import DeviceScene
+from nir_render.transport.indirect.kernel.types import Float, Mask, Point, UInt, Vector
+
+FLOOR = 1.0 / 16.0
+_FAR = 1e15
+
+
+@dataclass(frozen=True, eq=False)
+class Deal:
+    """The share of each tier in the samples of each lane's pixel; none where all lights are of one tier."""
+
+    shares: list[Float]
+
+    def tier_of(self, u: Float) -> tuple[UInt | None, Float | None]:
+        """Return the tier that a sample serves, drawn with `u`, and one over its share."""
+        if not self.shares:
+            return None, None
+        tier, share, below = dr.zeros(mi.UInt32, dr.width(u)), self.shares[0], self.shares[0]
+        for number, more in enumerate(self.shares[1:], start=1):
+            later = u >= below
+            tier, share = dr.select(later, number, tier), dr.select(later, more, share)
+            below = below + more
+        return tier, 1.0 / share
+
+
+def deal_of(scene: DeviceScene, origin: Point, direction: Vector) -> Deal:
+    """Return how samples are dealt out for pixels with rays through their middles.
+
+    A tier's share goes with what it brings to the fog on the ray's first stretch, and to the surface behind,
+    by what the fog takes and leaves.
+    """
+    tiers = scene.lights.tiers
+    if tiers == 1:
+        return Deal([])
+    fog = scene.fog
+    assert fog is not None  # only there are tiers
+    si = scene.bodies.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=True)
+    met = si.is_valid()
+    begin, end = fog_interval(fog, origin, direction, dr.select(met, si.t, _FAR))
+    end = dr.maximum(begin, end)
+    lost = dr.select(met, absorbed_share(fog.extinction * (end - begin)), 1.0)
+    in_fog = _brought_to_fog(scene, origin, direction, begin, end)
+    surface = origin + direction * dr.select(met, si.t, 0.0)
+    on_surface = _brought_to_place(scene, surface)
+    even = dr.full(mi.Float, FLOOR, dr.width(direction))
+    shares = [
+        dr.fma(1.0 - FLOOR * tiers, dr.lerp(there, here, lost), even)
+        for here, there in zip(in_fog, on_surface, strict=True)
+    ]
+    # What rounding and places without light leave is the strongest tier's.
+    shares[0] = 1.0 - sum(shares[1:], mi.Float(0.0))
+    dr.eval(shares)
+    return Deal(shares)
+
+
+def _brought_to_fog(
+    scene: DeviceScene, origin: Point, direction: Vector, begin: Float, end: Float
+) -> list[Float]:
+    """Return each tier's share in what lights bring to the fog on a ray."""
+    if not weighs_all(scene):
+        return _brought_to_place(scene, origin + direction * dr.minimum(0.5 * (begin + end), _FAR))
+    active, tiers = mi.Bool(end > begin), scene.lights.tiers
+
+    def more(k: UInt, _sums: list[Float]) -> Mask:
+        return k < scene.lights.count
+
+    def add(k: UInt, sums: list[Float]) -> tuple[UInt, list[Float]]:
+        brought = brought_to_stretch(scene, k, origin, direction, begin, end, active)
+        sums = [
+            total + connect.of_tier(scene.lights, k, mi.UInt32(number), brought)
+            for number, total in enumerate(sums)
+        ]
+        return k + 1, sums
+
+    width = dr.width(direction)
+    start = dr.zeros(mi.UInt32, width), [dr.zeros(mi.Float, width) for _ in range(tiers)]
+    _, sums = dr.while_loop(start, more, add)
+    whole = sum(sums[1:], sums[0])
+    return [dr.select(whole > 0.0, one / whole, 0.0) for one in sums]
+
+
+def _brought_to_place(scene: DeviceScene, place: Point) -> list[Float]:
+    """Return each tier's share in what lights bring to places, by the guide's cells."""
+    cell = connect.guide_cell(scene.choice, place)
+    return [
+        dr.gather(mi.Float, scene.choice.tier_share, cell + scene.choice.cells * number)
+        for number in range(scene.lights.tiers)
+    ]
