@@ -71,7 +71,7 @@ def source_beside_sun(samples: int = 256, columns: int = 64) -> Scene:
 
 def _of_library(name: str, samples: int) -> Scene:
     scene = nr.load_scene(_SCENES / f"{name}.yaml")
-    return scene.with_({"render.indirect.samples": samples, "render.indirect.scale": 8})
+    return scene.with_({"render.indirect.samples": samples, "render.indirect.scale": 4})
 
 
 def alone(scene: Scene) -> Scene:

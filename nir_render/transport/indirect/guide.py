@@ -28,7 +28,7 @@ _CELLS = 4096
 _ENTRIES = 2**22  # cells × emitters
 _EVEN_SHARE = 0.05
 _STEP, _STEPS = 4, 6  # of the groups' power
-_GROUP_SHARE = 0.1  # of the picks, spread evenly over groups
+_GROUP_SHARE = 0.06  # of the picks, spread evenly over groups
 _TIER_RATIO, _MOST_TIERS = 16.0, 3
 
 

@@ -16,7 +16,7 @@ from nir_render.transport.indirect.kernel.fog_scatter import brought_to_stretch,
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import Float, Mask, Point, UInt, Vector
 
-FLOOR = 1.0 / 16.0
+FLOOR = 1.0 / 32.0
 _FAR = 1e15
 
 
