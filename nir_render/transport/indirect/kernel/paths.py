@@ -18,6 +18,7 @@ from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws
 from nir_render.transport.indirect.kernel.arrive import arriving_share
 from nir_render.transport.indirect.kernel.draws import Draws
+from nir_render.transport.indirect.kernel.film import Film, camera_direction
 from nir_render.transport.indirect.kernel.fog import fog_interval
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
@@ -50,25 +51,6 @@ _NOTHING = 1e-15
 _Begin = tuple[Vector, UInt | None, Float | None]  # of a path: direction, tier, and one over its share
 
 
-@dataclass(frozen=True, eq=False)
-class Film:
-    """The rays of a camera and the part of its film to fill.
-
-    `corners` holds directions at the corners of the sensor's pixels, `rows` + 1 times `columns` + 1; a pixel
-    of the film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels`
-    and `pixel_count` how many.
-    """
-
-    origin: Point
-    corners: Float
-    rows: UInt
-    columns: UInt
-    scale: UInt
-    index: UInt
-    pixels: UInt
-    pixel_count: int
-
-
 def walk(
     scene: DeviceScene, film: Film, pixel: UInt, draw: Draws, lanes: int, groups: int, max_depth: UInt
 ) -> Float:
@@ -98,13 +80,13 @@ def walk(
             dr.ReduceMode.NoConflicts,
         )  # fmt: skip
 
-    deal = deal_of(scene, film.origin, _camera_direction(film, pixel, mi.Float(0.5), mi.Float(0.5)))
+    deal = deal_of(scene, film.origin, camera_direction(film, pixel, mi.Float(0.5), mi.Float(0.5)))
 
     def begin(sample: UInt) -> _Begin:
         along, down, dealt = (
             draw.pixel(sample, purpose) for purpose in (draws.PIXEL_U, draws.PIXEL_V, draws.TIER)
         )
-        return _camera_direction(film, pixel, along, down), *deal.tier_of(dealt)
+        return camera_direction(film, pixel, along, down), *deal.tier_of(dealt)
 
     def step(state: PathState) -> tuple[PathState]:
         return (_step(scene, state, draw, max_depth, add, begin, film.origin),)
@@ -130,23 +112,6 @@ def walk(
     )
     dr.while_loop((state,), lambda state: state.active, step)
     return out
-
-
-def _camera_direction(film: Film, pixel: UInt, along: Float, down: Float) -> Vector:
-    """Return the unit direction at a place in a pixel, between those at the sensor pixel's corners."""
-    width = film.columns // film.scale
-    row = pixel // width
-    u = (mi.Float(pixel - row * width) + along) * mi.Float(film.scale)
-    v = (mi.Float(row) + down) * mi.Float(film.scale)
-    # In float32 the sum can round up to the next whole number.
-    column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
-    corner = line * (film.columns + 1) + column
-    above, above_right, below, below_right = (
-        dr.gather(mi.Vector3f, film.corners, corner + offset)
-        for offset in (0, 1, film.columns + 1, film.columns + 2)
-    )
-    along, down = u - mi.Float(column), v - mi.Float(line)
-    return dr.normalize(dr.lerp(dr.lerp(above, above_right, along), dr.lerp(below, below_right, along), down))
 
 
 def _step(

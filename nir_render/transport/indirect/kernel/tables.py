@@ -109,7 +109,10 @@ class FogTable:
 
 @dataclass(frozen=True, eq=False)
 class DeviceScene:
-    """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes."""
+    """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes.
+
+    `max_depth` is the longest path, in stretches, as Mitsuba counts.
+    """
 
     bodies: MitsubaScene
     opaque: MitsubaScene
@@ -117,6 +120,7 @@ class DeviceScene:
     surfaces: Surfaces
     choice: Choice
     fog: FogTable | None
+    max_depth: int
 
 
 def upload_lights(
