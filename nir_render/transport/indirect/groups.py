@@ -25,8 +25,8 @@ from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.skies import CieSky, cie_sky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import guide
+from nir_render.transport.indirect.kernel.begin import Film
 from nir_render.transport.indirect.kernel.draws import lane_draws
-from nir_render.transport.indirect.kernel.film import Film
 from nir_render.transport.indirect.kernel.paths import walk
 from nir_render.transport.indirect.kernel.tables import (
     DeviceScene,

@@ -7,7 +7,7 @@ Drawing one costs the same for four emitters and for thousands.
 
 In fog that is not enough: there lights also say where paths turn and whereto, and a group that is picked
 seldom at each of several vertices hardly ever gets the paths that it needs. Groups whose light differs much
-are therefore dealt out to *tiers*: each path serves one tier, as if the others were off (`kernel.tiers`).
+are therefore dealt out to *tiers*: each path serves one tier, as if the others were off (`kernel.begin`).
 """
 
 from dataclasses import dataclass

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws
-from nir_render.transport.indirect.kernel.arrive import arriving_share
 from nir_render.transport.indirect.kernel.fog import (
     absorbed_share,
     arc_integral,
@@ -77,7 +76,7 @@ def scatter_on_stretch(
     if state.dealt is not None:
         brought = brought * state.dealt
     seen = active & (brought > 0.0) & dr.isfinite(brought)
-    share = arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
+    share = connect.arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
     add(brought * share, row, seen & (share > 0.0))
     return FogScattering(lost, place, weight, turns)
 

@@ -16,14 +16,12 @@ from typing import Any
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws
-from nir_render.transport.indirect.kernel.arrive import arriving_share
+from nir_render.transport.indirect.kernel.begin import Film, camera_direction, deal_of
 from nir_render.transport.indirect.kernel.draws import Draws
-from nir_render.transport.indirect.kernel.film import Film, camera_direction
 from nir_render.transport.indirect.kernel.fog import fog_interval
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
 from nir_render.transport.indirect.kernel.tables import DeviceScene, Surfaces
-from nir_render.transport.indirect.kernel.tiers import deal_of
 from nir_render.transport.indirect.kernel.types import (
     AddLight,
     Float,
@@ -267,7 +265,7 @@ def _ask_light(
     to = aim.direction * aim.reach - (shadow.o - si.p)
     reach = dr.norm(to)
     lifted = replace(aim, direction=to / reach, reach=reach)
-    share = arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
+    share = connect.arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
     add(brought * share, row, seen & (share > 0.0))
     return _SurfaceSample(bsdf, sample, sampled_weight[0], cell)
 

@@ -1,10 +1,11 @@
-"""Which lights a path serves, on the device: the samples of a pixel are dealt out to tiers of lights.
+"""How a path begins, on the device: its ray through the film, and the tier of lights that it serves.
 
 In fog lights say where paths turn and whereto. A path that serves them all goes where the strongest wants it,
 and what a weak source would need, turn after turn, is drawn so seldom that its light comes from few samples,
-most of it from none. So each path serves one tier: it asks for its lights, meets them, and goes as if the
-others were off. A tier gets samples by what it brings to the pixel's ray, roughly, and each a floor; the
-share is known beforehand, and one over it is the weight. What the camera sees straight is in all samples.
+most of it from none. So samples are dealt out to tiers of lights: a path asks for the lights of
+its tier, meets them, and goes as if the others were off. A tier gets samples by what it brings to the pixel's
+ray, roughly, and each a floor; the share is known beforehand, and one over it is the weight. What the camera
+sees straight is in all samples.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,42 @@ from nir_render.transport.indirect.kernel.types import Float, Mask, Point, UInt,
 
 FLOOR = 1.0 / 32.0
 _FAR = 1e15
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """The rays of a camera and the part of its film to fill.
+
+    `corners` holds directions at the corners of the sensor's pixels, `rows` + 1 times `columns` + 1; a pixel
+    of the film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels`
+    and `pixel_count` how many.
+    """
+
+    origin: Point
+    corners: Float
+    rows: UInt
+    columns: UInt
+    scale: UInt
+    index: UInt
+    pixels: UInt
+    pixel_count: int
+
+
+def camera_direction(film: Film, pixel: UInt, along: Float, down: Float) -> Vector:
+    """Return the unit direction at a place in a pixel, between those at the sensor pixel's corners."""
+    width = film.columns // film.scale
+    row = pixel // width
+    u = (mi.Float(pixel - row * width) + along) * mi.Float(film.scale)
+    v = (mi.Float(row) + down) * mi.Float(film.scale)
+    # In float32 the sum can round up to the next whole number.
+    column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
+    corner = line * (film.columns + 1) + column
+    above, above_right, below, below_right = (
+        dr.gather(mi.Vector3f, film.corners, corner + offset)
+        for offset in (0, 1, film.columns + 1, film.columns + 2)
+    )
+    along, down = u - mi.Float(column), v - mi.Float(line)
+    return dr.normalize(dr.lerp(dr.lerp(above, above_right, along), dr.lerp(below, below_right, along), down))
 
 
 @dataclass(frozen=True, eq=False)
