@@ -19,6 +19,8 @@ from nir_render.transport.fingerprint import package_versions
 from nir_render.transport.indirect.sample_plan import MOST_SAMPLES
 
 _DIGITS = 6
+_MOST_LEFT_OUT = 0.005
+_UNTRUSTED, _SLIGHT_ERROR = 0.5, 0.005
 
 
 def versions() -> dict[str, str]:
@@ -212,6 +214,71 @@ def enlarging_facts(shot: Shot) -> dict[str, Any]:
         "pixels_rendered_one_by_one": len(enlargement.patch),
         "pixels_left_out": enlargement.left_out,
     }
+
+
+def truncation_facts(shot: Shot) -> dict[str, Any]:
+    """Return what a frame's light leaves out beyond the longest paths; null and why where it is not known."""
+    from nir_render.transport.indirect.truncation import truncation
+
+    left_out = truncation(shot.mean)
+    if isinstance(left_out, str):
+        return {"max_depth": None, "share": None, "reason": left_out}
+    return {
+        "max_depth": left_out.max_depth,
+        "share": _rounded(left_out.share),
+        "standard_error": _rounded(left_out.standard_error),
+        "share_by_group": {name: _rounded(share) for name, share in left_out.of_groups.items()},
+    }
+
+
+def truncation_warning(by_camera: Mapping[str, Mapping[str, Any]]) -> str | None:
+    """Return what to tell where the longest paths leave out more than 0.5 % of a frame's indirect light."""
+    worst = max(by_camera, key=lambda name: by_camera[name]["share"] or 0.0, default=None)
+    facts: Mapping[str, Any] = {"share": None} if worst is None else by_camera[worst]
+    if facts["share"] is None or facts["share"] <= _MOST_LEFT_OUT:
+        return None
+    return (
+        f"render.indirect.max_depth: paths of more than {facts['max_depth']} stretches would bring "
+        f"{100.0 * facts['share']:.2g} ± {100.0 * facts['standard_error']:.1g} % of the indirect light of "
+        f"{worst}, and are left out; a larger max_depth takes them in"
+    )
+
+
+def group_noise_facts(light: Light) -> dict[str, dict[str, float | None]]:
+    """Return how well the light of each group is known when it is exposed alone, by its name.
+
+    `error` is the standard error of the sum over the film, relative to it, by what batches saw; `uncertainty`
+    that of its square, from how few pixels bring it: near 1 it is the work of some rare samples, more of
+    which may never have been found, and neither figure is to be trusted. Null where a group brings nothing.
+    """
+    indirect = light.indirect
+    assert indirect is not None
+    facts: dict[str, dict[str, float | None]] = {}
+    for name, radiance, variance in zip(
+        light.groups, indirect.radiance_per_w, indirect.variance.astype(np.float64), strict=True
+    ):
+        total, noise = float(radiance.sum(dtype=np.float64)), float(variance.sum())
+        facts[name] = {
+            "error": _rounded(noise**0.5 / total) if total > 0.0 else None,
+            "uncertainty": _rounded(float((variance**2).sum()) ** 0.5 / noise) if noise > 0.0 else None,
+        }
+    return facts
+
+
+def group_noise_warning(by_camera: Mapping[str, Mapping[str, Any]]) -> str | None:
+    """Return what to tell of groups whose noise hangs on so few samples that it is not known."""
+    found = [
+        f"{name} in {camera}"
+        for camera, of_groups in by_camera.items()
+        for name, one in of_groups.items()
+        if (one["uncertainty"] or 0.0) > _UNTRUSTED and (one["error"] or 0.0) > _SLIGHT_ERROR
+    ]
+    if not found:
+        return None
+    return (
+        f"render noise: that of {', '.join(found)} hangs on few rare samples, and may be larger than stated "
+        "when these are exposed with the others off; render them alone, or take more samples"
+    )
 
 
 def _rounded(value: float | np.floating[Any]) -> float:

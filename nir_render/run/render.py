@@ -22,11 +22,15 @@ from nir_render.run.journal import Entry, Journal
 from nir_render.run.manifest import (
     ambient_facts,
     enlarging_facts,
+    group_noise_facts,
+    group_noise_warning,
     noise_facts,
     noise_warning,
     refresh_facts,
     sample_facts,
     spectral_facts,
+    truncation_facts,
+    truncation_warning,
     versions,
     wavelength_facts,
 )
@@ -99,8 +103,12 @@ def render_run(
         noise = noise_facts(scene.document.render.noise, writer.noises)
         seconds = time.perf_counter() - started
         run_folder.write_manifest(aside, _facts(scene, writer, noise, seconds))
-    warning = noise_warning(noise, len(writer.noises))
-    return _found_words(folder, found, begun.frames) + ([] if warning is None else [warning])
+    warnings = (
+        noise_warning(noise, len(writer.noises)),
+        group_noise_warning(writer.groups_by_camera),
+        truncation_warning(writer.truncation_by_camera),
+    )
+    return _found_words(folder, found, begun.frames) + [one for one in warnings if one is not None]
 
 
 def _found_words(folder: Path, found: str, frames: int) -> list[str]:
@@ -151,6 +159,8 @@ class _FrameWriter:
         self.noises: dict[str, RenderNoise] = {}
         self.samples_by_camera: dict[str, dict[str, Any]] = {}
         self.enlarging_by_camera: dict[str, dict[str, Any]] = {}
+        self.truncation_by_camera: dict[str, dict[str, Any]] = {}
+        self.groups_by_camera: dict[str, dict[str, Any]] = {}
         self.refresh: list[dict[str, Any]] = []
         self.lights = (0, 0)
         self._folder = folder
@@ -184,7 +194,12 @@ class _FrameWriter:
         if frame.camera not in self._cameras and shot.kind != "dark":
             self._cameras.add(frame.camera)
             samples = None if light.indirect is None else sample_facts(light)
-            first = {"samples": samples, "enlarging": enlarging_facts(shot)}
+            first = {
+                "samples": samples,
+                "enlarging": enlarging_facts(shot),
+                "truncation": truncation_facts(shot),
+                "groups": None if light.indirect is None else group_noise_facts(light),
+            }
         if self._keep_light:
             stem = self._folder / "light" / frame.camera / f"{frame.index:06d}"
             self._light_files[frame.camera] = _write_light(stem, light, self._light_files.get(frame.camera))
@@ -214,8 +229,10 @@ class _FrameWriter:
             self.refresh += entry.refresh
             if entry.first is not None:
                 self.enlarging_by_camera[entry.camera] = entry.first["enlarging"]
+                self.truncation_by_camera[entry.camera] = entry.first["truncation"]
                 if entry.first["samples"] is not None:
                     self.samples_by_camera[entry.camera] = entry.first["samples"]
+                    self.groups_by_camera[entry.camera] = entry.first["groups"]
         for name in (run_folder.FRAMES, run_folder.TRUTH, run_folder.LAMPS):
             of_frames = (record for entry in self._journal.entries() for record in entry.lines[name])
             first = next(of_frames, None)
@@ -273,6 +290,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
     by_camera = {
         "samples_by_camera": writer.samples_by_camera,
         "upsampling_error_share_of_temporal_variance": writer.enlarging_by_camera,
+        "truncation_by_camera": writer.truncation_by_camera,
     }
     return {
         "scene": scene.document.name,
@@ -282,7 +300,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
         "variant_reason": backend().reason,
         "seconds": {"render": round(seconds, 3)},
         "indirect": _indirect_facts(scene) | by_camera | refresh_facts(scene, writer.refresh),
-        "render_noise": noise,
+        "render_noise": noise | {"groups_by_camera": writer.groups_by_camera},
         "ambient": ambient_facts(scene),
         "spectral": spectral_facts(scene),
         "wavelengths": wavelength_facts(scene),

@@ -17,6 +17,7 @@ from nir_render.camera.optics.lens import corner_directions
 from nir_render.light.light import Indirect
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.document import CLEAR_DEPTH
 from nir_render.scene.documents.materials import Dielectric, Pane
 from nir_render.scene.documents.shapes import Box
 from nir_render.scene.pose import Pose
@@ -25,12 +26,12 @@ from nir_render.spectra.nodes import BAND_M
 from nir_render.spectra.skies import CieSky, cie_sky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import guide
+from nir_render.transport.indirect.kernel.begin import Film
 from nir_render.transport.indirect.kernel.draws import lane_draws
 from nir_render.transport.indirect.kernel.nodes import NodeTable, upload_nodes
 from nir_render.transport.indirect.kernel.paths import walk
 from nir_render.transport.indirect.kernel.tables import (
     DeviceScene,
-    Film,
     upload_fog,
     upload_guide,
     upload_lights,
@@ -40,7 +41,7 @@ from nir_render.transport.indirect.walked import Walked, is_coated, is_glossy, w
 from nir_render.transport.world import mitsuba_scene
 from nir_render.transport.world.emitters import emitters
 from nir_render.transport.world.facets import PANE, Facets, facets
-from nir_render.transport.world.medium import medium
+from nir_render.transport.world.medium import Medium, medium
 from nir_render.transport.world.pattern import pattern_of
 
 BATCHES = 8
@@ -48,6 +49,7 @@ _DEFAULT_SAMPLES = 16
 PILOT_SAMPLES = 16
 _PILOT_STEP = 4
 _PILOT_PIXELS = 1200
+_LEAST_FOG_DEPTH, _MOST_DEPTH, _DEPTH_PER_TURN = 12, 64, 3.0
 _VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
 _NOTHING = 1e-28  # 1/(m² sr)²
 _MAPPED_FROM_BYTES = 2**30  # larger arrays lie in a file that the system may page out
@@ -140,7 +142,7 @@ def pilot(
     scale = snapshot.render.indirect.scale
     rows, columns = film_shape(rays, scale)
     step = int(np.clip((rows * columns / _PILOT_PIXELS) ** 0.5, 1, _PILOT_STEP))
-    row, column = (_middles(count, step) for count in (rows, columns))
+    row, column = (middles(count, step) for count in (rows, columns))
     pixels = (row[:, None] * columns + column).ravel()
     built = world_on_device(snapshot, power, wavelengths_m)
     counts = np.full(pixels.size, PILOT_SAMPLES)
@@ -154,7 +156,7 @@ def film_shape(rays: Rays, scale: int) -> tuple[int, int]:
     return (rays.corners.shape[0] - 1) // scale, (rays.corners.shape[1] - 1) // scale
 
 
-def _middles(count: int, step: int) -> NDArray[np.int64]:
+def middles(count: int, step: int) -> NDArray[np.int64]:
     """Return the middles of equal parts of an axis of so many pixels, each part at most a step long."""
     parts = -(-count // step)
     return ((2 * np.arange(parts) + 1) * count) // (2 * parts)
@@ -191,7 +193,7 @@ def render_pixels(
     -------
     Shape (groups, nodes, pixels) each.
     """
-    groups, max_depth = len(snapshot.groups), snapshot.render.indirect.max_depth
+    groups = len(snapshot.groups)
     layers = groups * built.node_count
     radiance, variance = (_array((layers, pixels.size)) for _ in range(2))
     for count in np.unique(counts):
@@ -201,9 +203,7 @@ def render_pixels(
         for first in range(0, places.size, part):
             some = places[first : first + part]
             film = film_on_device(rays, scale, pixels[some])
-            radiance[:, some], variance[:, some] = sample_means(
-                built, film, seed, groups, int(count), max_depth
-            )
+            radiance[:, some], variance[:, some] = sample_means(built, film, seed, groups, int(count))
     shape = (groups, built.node_count, pixels.size)
     return radiance.reshape(shape), variance.reshape(shape)
 
@@ -215,7 +215,7 @@ def light_seed(*key: object) -> int:
 
 
 def sample_means(
-    built: DeviceScene, film: Film, seed: int, groups: int, samples: int, max_depth: int
+    built: DeviceScene, film: Film, seed: int, groups: int, samples: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return radiance per unit of each group in some pixels, and its variance, (groups × nodes, pixels).
 
@@ -226,7 +226,7 @@ def sample_means(
     lane = dr.arange(mi.UInt32, lanes)
     pixel = dr.gather(mi.UInt32, film.index, lane % film.pixels)
     draw = lane_draws(pixel, lane // film.pixels, seed, dr.opaque(mi.UInt32, samples // batches))
-    sums = walk(built, film, pixel, draw, lanes, groups, dr.opaque(mi.UInt32, max_depth))
+    sums = walk(built, film, pixel, draw, lanes, groups, dr.opaque(mi.UInt32, built.max_depth))
     layers = groups * built.node_count
     place = dr.arange(mi.UInt32, layers * pixels)
     layer = place // film.pixels
@@ -276,16 +276,17 @@ def world_on_device(
         axes.append(np.eye(3) if placed is None else placed.pose.rotation)
     fog = medium(snapshot)
     opaque = mitsuba_scene.build(snapshot, panes=False) if panes else bodies
+    extinction_per_m = 0.0 if fog is None else fog.extinction_per_m
+    choice = guide(shining, flat, power, low_m, high_m, extinction_per_m)
     columns = _shape_columns(snapshot, (bodies, opaque), flat)
     return DeviceScene(
         bodies=bodies,
         opaque=opaque,
-        lights=upload_lights(shining, power, patterns, np.array(axes), _sky_of(snapshot)),
+        lights=upload_lights(shining, power, patterns, np.array(axes), _sky_of(snapshot), choice.tier),
         surfaces=upload_surfaces(flat, columns),
-        choice=upload_guide(
-            guide(shining, flat, power, low_m, high_m, 0.0 if fog is None else fog.extinction_per_m)
-        ),
+        choice=upload_guide(choice),
         fog=None if fog is None else upload_fog(fog),
+        max_depth=snapshot.render.indirect.max_depth or default_depth(snapshot, fog, low_m, high_m),
         nodes=_node_table(of_nodes, columns["material"], len(wavelengths_m)),
     )
 
@@ -302,6 +303,22 @@ def _node_table(of_nodes: Walked, material: NDArray[np.int64], nodes: int) -> No
         for tells in (is_coated, is_glossy)
     )
     return upload_nodes(of_materials[material], of_nodes.of_facets, coated[material], glossy[material])
+
+
+def default_depth(
+    snapshot: Snapshot, fog: Medium | None, low_m: NDArray[np.float64], high_m: NDArray[np.float64]
+) -> int:
+    """Return the longest path where a scene does not say it: the thicker the fog, the longer.
+
+    `low_m` and `high_m` are corners of the box that holds the bodies; with the robots it says how far light
+    goes in fog. That length in optical depths is how often fog turns it on the way.
+    """
+    if fog is None:
+        return CLEAR_DEPTH
+    places_m = np.array([low_m, high_m, *(robot.pose.position_m for robot in snapshot.robots.values())])
+    low_m, high_m = np.maximum(places_m.min(axis=0), fog.low_m), np.minimum(places_m.max(axis=0), fog.high_m)
+    optical_depth = fog.extinction_per_m * float(np.linalg.norm(np.maximum(high_m - low_m, 0.0)))
+    return int(np.clip(_LEAST_FOG_DEPTH + _DEPTH_PER_TURN * optical_depth, _LEAST_FOG_DEPTH, _MOST_DEPTH))
 
 
 def _sky_of(snapshot: Snapshot) -> CieSky | None:

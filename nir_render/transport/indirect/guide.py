@@ -1,8 +1,13 @@
 """Which light to ask next: the chance of each emitter, by the place of the surface that is lit.
 
 The scene's box is cut into cells. In each cell an emitter's chance goes with what it would bring to the
-cell's middle if nothing stood in between: its power over the distance squared. A small share is spread
-evenly, so that no emitter is ever left out. Drawing one costs the same for four emitters and for thousands.
+cell's middle if nothing stood in between: its power over the distance squared. A share is spread evenly over
+the groups, and in each over its emitters: so the light of a group stands alone, whatever shines beside it.
+Drawing one costs the same for four emitters and for thousands.
+
+In fog that is not enough: there lights also say where paths turn and whereto, and a group that is picked
+seldom at each of several vertices hardly ever gets the paths that it needs. Groups whose light differs much
+are therefore dealt out to *tiers*: each path serves one tier, as if the others were off (`kernel.begin`).
 """
 
 from dataclasses import dataclass
@@ -23,6 +28,8 @@ _CELLS = 4096
 _ENTRIES = 2**22  # cells × emitters
 _EVEN_SHARE = 0.05
 _STEP, _STEPS = 4, 6  # of the groups' power
+_GROUP_SHARE = 0.06  # of the picks, spread evenly over groups
+_TIER_RATIO, _MOST_TIERS = 16.0, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +41,14 @@ class Guide:
     low_m, step_m, counts
         The grid's corner, the extent of a cell, and the number of cells, along x, y and z, shape (3,).
     cumulative
-        Cumulated chances, shape (cells, emitters), x runs fastest; the last is 1.
+        Cumulated chances, shape (tiers · cells, emitters), of one tier after the other, x runs fastest; the
+        last is 1.
     chance
-        Each emitter's chance, the exact differences of `cumulative`, float32, same shape.
+        Each emitter's chance, the exact differences of `cumulative`, float32, same shape; 0 in other tiers.
+    tier
+        The tier of each emitter, the strongest is 0, shape (emitters,).
+    tier_share
+        Share of each tier in what is brought to a cell, shape (tiers, cells).
     """
 
     low_m: Array
@@ -44,6 +56,8 @@ class Guide:
     counts: NDArray[np.int64]
     cumulative: NDArray[np.float32]
     chance: NDArray[np.float32]
+    tier: NDArray[np.int64]
+    tier_share: Array
 
 
 def guide(
@@ -78,16 +92,51 @@ def guide(
         [_unshadowed_irradiance(emitters, facets, row, places_m, step_m, extinction_per_m) for row in rows]
     )
     weight = (weight * power[emitters.group][:, None]).T
-    total = weight.sum(axis=1, keepdims=True)
-    even = 1.0 / len(emitters.kind)
-    chance = np.where(total > 0.0, weight / np.where(total > 0.0, total, 1.0), even)
-    chance = (1.0 - _EVEN_SHARE) * chance + _EVEN_SHARE * even
+    foggy = extinction_per_m > 0.0
+    tier = _tiers(weight.mean(axis=0), emitters) if foggy else np.zeros(len(emitters.kind), dtype=np.int64)
+    numbers = range(int(tier.max(initial=0)) + 1)
+    chance = np.concatenate([_chances(weight, emitters.group, tier == number) for number in numbers])
     cumulative = np.cumsum(chance, axis=1)
     cumulative = (cumulative / cumulative[:, -1:]).astype(np.float32)
-    cumulative[:, -1] = 1.0
+    last = len(tier) - 1 - np.argmax(chance[:, ::-1] > 0.0, axis=1)
+    cumulative[np.arange(len(tier)) >= last[:, None]] = 1.0
     before = np.concatenate([np.zeros((len(cumulative), 1), dtype=np.float32), cumulative[:, :-1]], axis=1)
     chance32 = np.asarray(cumulative - before, dtype=np.float32)
-    return Guide(low_m, step_m, counts, np.asarray(cumulative, dtype=np.float32), chance32)
+    brought = np.stack([weight[:, tier == number].sum(axis=1) for number in numbers])
+    share = brought / np.maximum(brought.sum(axis=0), 1e-300)
+    return Guide(
+        low_m, step_m, counts, np.asarray(cumulative, dtype=np.float32), chance32, tier, np.asarray(share)
+    )
+
+
+def _chances(weight: Array, group: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Array:
+    """Return the chances of the chosen emitters by their weights in each cell, shape (cells, emitters)."""
+    groups = np.unique(group[chosen])
+    total = weight[:, chosen].sum(axis=1, keepdims=True)
+    chance = np.zeros(weight.shape)
+    for one in groups:
+        own = chosen & (group == one)
+        own_weight = weight if own.all() else weight[:, own]
+        brought = own_weight.sum(axis=1, keepdims=True)
+        even = 1.0 / np.count_nonzero(own)
+        within = np.where(brought > 0.0, own_weight / np.where(brought > 0.0, brought, 1.0), even)
+        within = (1.0 - _EVEN_SHARE) * within + _EVEN_SHARE * even
+        if len(groups) > 1:
+            share = np.where(total > 0.0, brought / np.where(total > 0.0, total, 1.0), 1.0 / len(groups))
+            within = within * ((1.0 - _GROUP_SHARE) * share + _GROUP_SHARE / len(groups))
+        chance[:, own] = within
+    return chance
+
+
+def _tiers(brought: Array, emitters: Emitters) -> NDArray[np.int64]:
+    """Return the tier of each emitter, by what its group brings to the scene on the mean over it.
+
+    That is an irradiance for all kinds of light, and can be compared.
+    """
+    of_group = np.bincount(emitters.group, np.where(emitters.facet < 0, brought, 0.0))
+    ratio = of_group.max(initial=0.0) / np.maximum(of_group, 1e-300)
+    level = np.minimum(np.floor(np.log(ratio) / np.log(_TIER_RATIO)), _MOST_TIERS - 1)
+    return np.unique(level[emitters.group], return_inverse=True)[1].astype(np.int64)
 
 
 def _unshadowed_irradiance(

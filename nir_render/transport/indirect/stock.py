@@ -23,7 +23,7 @@ from nir_render.camera.optics.lens import intrinsics_of
 from nir_render.errors import InputError
 from nir_render.light.light import DirectTable, Indirect
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.documents.document import IndirectSettings
+from nir_render.scene.documents.document import CLEAR_DEPTH, IndirectSettings
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
@@ -70,7 +70,7 @@ def indirect(snapshot: Snapshot, name: str, seed: int, direct: DirectTable) -> I
         view = _view(snapshot, emitter, small=small and not smooth, seen=group in seen)
         keys = [_seed(seed, name, emitter, batch) for batch in range(batches)]
         renders = np.stack(
-            [_batch(view, sensor, samples // batches, settings.max_depth, key) for key in keys]
+            [_batch(view, sensor, samples // batches, settings.max_depth or CLEAR_DEPTH, key) for key in keys]
         )
         means.append(renders.mean(axis=0))
         variances.append(renders.var(axis=0, ddof=1) / batches)

@@ -11,8 +11,14 @@ from nir_render.camera.beams import blur
 from nir_render.camera.mean_frame import mean_frame
 from nir_render.camera.optics.lens import aperture_area_m2
 from nir_render.camera.render_noise import RenderNoise, render_noise
-from nir_render.light.light import DirectTable, Indirect, Light
-from nir_render.run.manifest import noise_facts, noise_warning
+from nir_render.light.light import NO_SOURCES, DirectTable, Indirect, Light
+from nir_render.run.manifest import (
+    group_noise_facts,
+    group_noise_warning,
+    noise_facts,
+    noise_warning,
+    truncation_warning,
+)
 from nir_render.simulation.clock import expected_electrons
 from tests.paths import SCENES
 
@@ -152,3 +158,32 @@ def test_exposing_changes_nothing_of_the_light(scene: Scene) -> None:
     expected_electrons(light, scene, 1e-3)
     expected_electrons(dataclasses.replace(light, time_s=3.0), scene, 2e-3)
     np.testing.assert_array_equal(light.indirect.radiance_per_w, before)
+
+
+def test_how_well_each_group_is_known() -> None:
+    """100 pixels of 2 ± 0.2: 1 % of the sum, by 100 pixels alike; one of them alone brings 99.0 % of the second's."""
+    variance = np.full((2, 1, 10, 10), 0.04, dtype=np.float32)
+    variance[1, 0, 3, 4] = 400.0
+    radiance = np.full((3, 1, 10, 10), 2.0, dtype=np.float32)
+    radiance[2] = 0.0
+    indirect = Indirect(radiance, np.concatenate([variance, 0.0 * variance[:1]]), 1, 16)
+    light = Light("c", 0.0, 1, ("a", "b", "dark"), (940e-9,), NO_SOURCES, indirect)
+    facts = group_noise_facts(light)
+    assert facts["a"] == {"error": pytest.approx(2.0 / 200.0), "uncertainty": pytest.approx(0.1)}
+    assert facts["b"]["error"] == pytest.approx((403.96**0.5) / 200.0, abs=1e-6)
+    assert facts["b"]["uncertainty"] == pytest.approx(400.0 / 403.96, rel=1e-3)
+    assert facts["dark"] == {"error": None, "uncertainty": None}
+    assert group_noise_warning({"r.c": {name: facts[name] for name in ("a", "dark")}}) is None
+    told = group_noise_warning({"r.c": facts})
+    assert told is not None
+    assert "b in r.c hangs" in told
+
+
+def test_what_is_left_out_is_told_above_half_a_percent() -> None:
+    facts = {"max_depth": 8, "share": 0.0049, "standard_error": 0.0004}
+    nothing = {"max_depth": None, "share": None, "reason": "no indirect light"}
+    assert truncation_warning({}) is None
+    assert truncation_warning({"r.c": facts, "r.d": nothing}) is None
+    told = truncation_warning({"r.c": facts, "r.d": facts | {"share": 0.034}})
+    assert told is not None
+    assert "more than 8 stretches would bring 3.4 ± 0.04 % of the indirect light of r.d" in told

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import nodes as of_nodes
+from nir_render.transport.indirect.kernel.fog import transmittance
 from nir_render.transport.indirect.kernel.nodes import NodeTable
 from nir_render.transport.indirect.kernel.rectangle import RectangleInView
-from nir_render.transport.indirect.kernel.tables import Choice, Lights, Surfaces, along_table
+from nir_render.transport.indirect.kernel.tables import Choice, DeviceScene, Lights, Surfaces, along_table
 from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, Shares, UInt, Vector
 from nir_render.transport.world.emitters import RECTANGLE, SKY, SUN
 from nir_render.transport.world.facets import MIRROR, PANE
@@ -30,10 +31,11 @@ class Aim:
     radiance: Float
 
 
-def guide_cell(choice: Choice, place: Point) -> UInt:
-    """Return the guide's cell of a place; outside the grid the nearest."""
+def guide_cell(choice: Choice, place: Point, tier: UInt | None = None) -> UInt:
+    """Return the guide's cell of a place, of all tiers' cells that of one; outside the grid the nearest."""
     at = mi.Point3u(along_table((place - choice.low) * choice.cells_per_m, choice.top))
-    return at.x + choice.stride_y * at.y + choice.stride_z * at.z
+    cell = at.x + choice.stride_y * at.y + choice.stride_z * at.z
+    return cell if tier is None else cell + choice.cells * tier
 
 
 def choose_light(choice: Choice, lights: Lights, cell: UInt, u: Float) -> tuple[UInt, Float]:
@@ -48,6 +50,11 @@ def choose_light(choice: Choice, lights: Lights, cell: UInt, u: Float) -> tuple[
 def light_chance(choice: Choice, lights: Lights, cell: UInt, row: UInt, active: Mask) -> Float:
     """Return the chance that the guide draws a light in a cell."""
     return dr.gather(mi.Float, choice.chance, cell * lights.count + row, active)
+
+
+def of_tier(lights: Lights, row: UInt, tier: UInt | None, weight: Float) -> Float:
+    """Return a weight where a light is of a tier, else 0; the weight itself where all are of one."""
+    return weight if tier is None else dr.select(dr.gather(mi.UInt32, lights.tier, row) == tier, weight, 0.0)
 
 
 def versine_of(radius: Float, distance2: Float) -> Float:
@@ -276,3 +283,91 @@ def _aim_at_rectangle(
     # Zero from behind: a density beyond all bounds.
     density = dr.select(dr.dot(direction, flat.normal) < 0.0, flat.density(direction), 1e30)
     return direction, distance, density
+
+
+def arriving_share(
+    scene: DeviceScene, row: UInt, origin: Point, aim: Aim, depth: UInt, max_depth: UInt, active: Mask
+) -> tuple[Float, Shares]:
+    """Return the share of a light's mean radiance that reaches a place along a ray; 0 where it is in shadow.
+
+    Mirrored images are followed by both their legs, each pane weakens and counts as a stretch of the path, as
+    it does where a path meets it by itself. And what each node keeps of that share.
+    """
+    lights = scene.lights
+    factor, stretches = mi.Float(1), depth + 1
+    shares = of_nodes.whole(scene.nodes)
+    reach, leaving = aim.reach, -aim.direction
+    second, shown = None, mi.Bool(False)
+    facet = mi.Int32(-1)
+    if lights.has_images:
+        facet = dr.gather(mi.Int32, lights.facet, row, active)
+        shown = active & (facet >= 0)
+        second = mirror_ray(scene.surfaces, mi.UInt32(facet), origin, aim.direction, aim.reach, shown)
+        active = active & (~shown | second.valid)
+        factor = dr.select(shown, second.reflectance, factor)
+        mirror = shown & (dr.gather(mi.UInt32, scene.surfaces.kind, mi.UInt32(facet), shown) == MIRROR)
+        shares = of_nodes.where(mirror, of_nodes.off_facet(scene.nodes, facet, mirror), shares)
+        stretches = dr.select(shown, stretches + 1, stretches)
+        reach = dr.select(shown, second.distance, reach)
+        leaving = dr.select(shown, -second.direction, leaving)
+    if scene.surfaces.pane_count:
+        left, count, kept = pane_transmittance(
+            scene.surfaces, scene.nodes, origin, aim.direction, reach, facet, active
+        )
+        factor, stretches = factor * left, stretches + count
+        shares = of_nodes.times(shares, kept)
+    if scene.fog is not None:
+        factor = factor * transmittance(scene.fog, origin, aim.direction, reach)
+    if second is not None:
+        if scene.surfaces.pane_count:
+            left, count, kept = pane_transmittance(
+                scene.surfaces, scene.nodes, second.place, second.direction, second.rest, facet, shown
+            )
+            shares = of_nodes.where(shown, of_nodes.times(shares, kept), shares)
+            factor, stretches = (
+                dr.select(shown, factor * left, factor),
+                dr.select(shown, stretches + count, stretches),
+            )
+        if scene.fog is not None:
+            further = transmittance(scene.fog, second.place, second.direction, second.rest)
+            factor = dr.select(shown, factor * further, factor)
+    active = active & (stretches < max_depth) & (factor > 0.0)
+    light = dr.gather(mi.UInt32, lights.group, row, active)
+    if second is None:
+        active = active & _reaches(scene, row, light, origin, aim.direction, aim.reach, active)
+    else:
+        before = reach * (1.0 - SHORTER)
+        active = active & ~(shown & _hidden(scene, origin, aim.direction, before, active & shown))
+        place, onward, rest = (
+            dr.select(shown, leg, straight)
+            for leg, straight in (
+                (second.place, origin), (second.direction, aim.direction), (second.rest, aim.reach),
+            )
+        )  # fmt: skip
+        active = active & _reaches(scene, row, light, place, onward, rest, active)
+    factor = factor * pattern_factor(lights, light, leaving, active)
+    return dr.select(active, factor, 0.0), shares
+
+
+def _reaches(
+    scene: DeviceScene, row: UInt, light: UInt, origin: Point, direction: Vector, reach: Float, active: Mask
+) -> Mask:
+    """Tell whether a ray reaches the light that it aims at.
+
+    The first body that it meets, as far as the light's other side, is the light's own, or there is none:
+    float32 places the surface of a small far sphere too badly to end before it. Nothing behind a lamp counts,
+    which may lie in a ceiling.
+    """
+    radius = dr.gather(mi.Float, scene.lights.radius, row, active)
+    ray = mi.Ray3f(origin, direction)
+    ray.maxt = dr.select(radius > 0.0, reach + 2.0 * radius, reach * (1.0 - SHORTER))
+    met = scene.opaque.ray_intersect_preliminary(ray, coherent=False, active=active)
+    shape = dr.reinterpret_array(mi.UInt32, met.shape)
+    hit_light = dr.gather(mi.Int32, scene.surfaces.light_of_shape, shape, active & met.is_valid())
+    return ~met.is_valid() | (hit_light == mi.Int32(light))
+
+
+def _hidden(scene: DeviceScene, origin: Point, direction: Vector, reach: Float, active: Mask) -> Mask:
+    ray = mi.Ray3f(origin, direction)
+    ray.maxt = reach
+    return scene.opaque.ray_test(ray, coherent=mi.Bool(False), active=active)

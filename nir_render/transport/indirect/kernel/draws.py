@@ -13,6 +13,7 @@ from nir_render.transport.indirect.kernel.types import Float, Mask, UInt
 
 # What a number is for. A vertex has STEP of them; those of the camera come first.
 PIXEL_U, PIXEL_V, CAMERA_DIMENSIONS = 0, 1, 2
+TIER = 2**20  # beyond all vertices
 LIGHT, LIGHT_U, LIGHT_V, LOBE, LOBE_U, LOBE_V, SURVIVAL = range(7)
 FOG_LIGHT, FOG_PLACE, FOG_U, FOG_V, FLIGHT, HALO, HALO_LIGHT, HALO_U, HALO_V = range(7, 16)
 FOG_CANDIDATES = 16  # two for each
@@ -31,7 +32,7 @@ class Draws:
     samples: UInt
 
     def pixel(self, sample: UInt, dimension: int) -> Float:
-        """Return a stratified number in [0, 1) for a sample's place in the pixel."""
+        """Return a stratified number in [0, 1) for a sample's place in the pixel, or its tier."""
         bits = self._bits(sample, mi.UInt32(dimension))
         return self._even(sample, mi.UInt32(dimension), _unit(bits))
 

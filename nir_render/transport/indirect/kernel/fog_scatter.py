@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws, nodes
-from nir_render.transport.indirect.kernel.arrive import arriving_share
 from nir_render.transport.indirect.kernel.fog import (
     absorbed_share,
     arc_integral,
@@ -18,7 +17,16 @@ from nir_render.transport.indirect.kernel.fog import (
     table_slope,
 )
 from nir_render.transport.indirect.kernel.tables import DeviceScene
-from nir_render.transport.indirect.kernel.types import AddLight, Float, Mask, PathState, Point, Random, UInt
+from nir_render.transport.indirect.kernel.types import (
+    AddLight,
+    Float,
+    Mask,
+    PathState,
+    Point,
+    Random,
+    UInt,
+    Vector,
+)
 from nir_render.transport.world.emitters import SKY, SUN
 
 # Up to so many lights fog weighs each of them for each stretch; with more, the guide proposes so many.
@@ -65,8 +73,10 @@ def scatter_on_stretch(
     turn = 0.5 * dr.squared_norm(aim.direction - state.direction)
     weight = fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin)) / density
     brought = state.weight * weight * phase_function(fog, turn) * aim.radiance / (chance * aim.density)
+    if state.dealt is not None:
+        brought = brought * state.dealt
     seen = active & (brought > 0.0) & dr.isfinite(brought)
-    share, kept = arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
+    share, kept = connect.arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
     add(brought * share, nodes.times(state.shares, kept), row, seen & (share > 0.0))
     return FogScattering(lost, place, weight, turns)
 
@@ -85,13 +95,15 @@ def _light_for_stretch(
 
     def weigh(k: UInt) -> tuple[UInt, Float]:
         row, chance = (k, 1.0) if few else _candidate(scene, state, begin, end, k, number)
-        return row, _brought_to_stretch(scene, row, state, begin, end, active) / chance
+        weight = brought_to_stretch(scene, row, state.origin, state.direction, begin, end, active)
+        return row, connect.of_tier(scene.lights, row, state.tier, weight) / chance
 
     count = scene.lights.count if few else _CANDIDATES
     row, weight, total = draws.draw_by_weight(count, weigh, number(draws.FOG_LIGHT))
     if few:
         return row, weight / total
-    return row, _CANDIDATES * _brought_to_stretch(scene, row, state, begin, end, active) / total
+    weight = brought_to_stretch(scene, row, state.origin, state.direction, begin, end, active)
+    return row, _CANDIDATES * weight / total
 
 
 def weighs_all(scene: DeviceScene) -> bool:
@@ -105,12 +117,12 @@ def _candidate(
     """Return a light that the guide draws at one of some places on a stretch, and its chance."""
     along, pick = (number(draws.FOG_CANDIDATES + 2 * k + which) for which in range(2))
     distance = _flight_within(scene, begin, end, (mi.Float(k) + along) / _CANDIDATES)
-    cell = connect.guide_cell(scene.choice, state.origin + state.direction * distance)
+    cell = connect.guide_cell(scene.choice, state.origin + state.direction * distance, state.tier)
     return connect.choose_light(scene.choice, scene.lights, cell, pick)
 
 
-def _brought_to_stretch(
-    scene: DeviceScene, row: UInt, state: PathState, begin: Float, end: Float, active: Mask
+def brought_to_stretch(
+    scene: DeviceScene, row: UInt, origin: Point, direction: Vector, begin: Float, end: Float, active: Mask
 ) -> Float:
     """Return what a light brings to the fog on a stretch, towards its begin, if nothing hides it, roughly.
 
@@ -118,14 +130,14 @@ def _brought_to_stretch(
     """
     fog, lights = scene.fog, scene.lights
     assert fog is not None  # only called in fog
-    _, off, low, high = _arcs(scene, row, state, begin, end, active)
+    _, off, low, high = _arcs(scene, row, origin, direction, begin, end, active)
     weight = dr.maximum(high - low, 1e-6) / (4.0 * dr.pi * off)
-    to = dr.gather(mi.Point3f, lights.center, row, active) - state.origin
+    to = dr.gather(mi.Point3f, lights.center, row, active) - origin
     weight = weight * dr.maximum(dr.exp(-fog.extinction * dr.norm(to)), 1e-6)
     if lights.sun >= 0:
         kind = dr.gather(mi.UInt32, lights.kind, row, active)
         to_sun = dr.gather(mi.Vector3f, lights.normal, row, active)
-        turn = 0.5 * dr.squared_norm(to_sun - state.direction)
+        turn = 0.5 * dr.squared_norm(to_sun - direction)
         of_sun = phase_function(fog, turn) * absorbed_share(fog.extinction * (end - begin)) / fog.extinction
         weight = dr.select(kind == SUN, of_sun, weight)
     if lights.sky >= 0:
@@ -145,7 +157,7 @@ def _place_on_stretch(
     """
     fog = scene.fog
     assert fog is not None  # only called in fog
-    middle, off, low, high = _arcs(scene, row, state, begin, end, active)
+    middle, off, low, high = _arcs(scene, row, state.origin, state.direction, begin, end, active)
     far = high - low <= 1e-4
     if scene.lights.sun >= 0:
         far = far | (dr.gather(mi.UInt32, scene.lights.kind, row, active) == SUN)
@@ -164,12 +176,12 @@ def _place_on_stretch(
 
 
 def _arcs(
-    scene: DeviceScene, row: UInt, state: PathState, begin: Float, end: Float, active: Mask
+    scene: DeviceScene, row: UInt, origin: Point, direction: Vector, begin: Float, end: Float, active: Mask
 ) -> tuple[Float, Float, Float, Float]:
     """Return where a ray is nearest to a light, how near, and `arc` at both ends of a stretch of it."""
-    to = dr.gather(mi.Point3f, scene.lights.center, row, active) - state.origin
-    middle = dr.dot(to, state.direction)
-    off = dr.norm(to - state.direction * middle)
+    to = dr.gather(mi.Point3f, scene.lights.center, row, active) - origin
+    middle = dr.dot(to, direction)
+    off = dr.norm(to - direction * middle)
     off = dr.maximum(off, dr.gather(mi.Float, scene.lights.spread, row, active))
     fog = scene.fog
     assert fog is not None  # only called in fog

@@ -94,7 +94,8 @@ def leave_in_fog(
     share = dr.select(turned, _FROM_FOG, dr.select(rough, _FROM_SURFACE, 0.0))
     in_halo = number(draws.HALO) < share
     place = dr.select(turned, scattering.place, sampled.place)
-    halos = _Halos(scene, place, state.direction, turned, number(draws.HALO_LIGHT), turned | rough)
+    light = number(draws.HALO_LIGHT)
+    halos = _Halos(scene, place, state.direction, turned, state.tier, light, turned | rough)
     u, v = number(draws.HALO_U), number(draws.HALO_V)
     plain = dr.select(turned, draw_scattering(fog, state.direction, u, v), sampled.direction)
     direction = dr.select(in_halo, halos.direction(u, v), plain)
@@ -133,17 +134,27 @@ class _Halos:
     """
 
     def __init__(
-        self, scene: DeviceScene, place: Point, heading: Vector, turned: Mask, u: Float, active: Mask
+        self,
+        scene: DeviceScene,
+        place: Point,
+        heading: Vector,
+        turned: Mask,
+        tier: UInt | None,
+        u: Float,
+        active: Mask,
     ) -> None:
-        """Draw a light with the number `u`; a path that turns in fog prefers those ahead of its `heading`."""
+        """Draw a light, of a tier where there are several, with the number `u`.
+
+        A path that turns in fog prefers those ahead of its `heading`.
+        """
         assert scene.fog is not None  # only in fog
         self.fog, self.lights = scene.fog, scene.lights
         self.place, self.heading, self.turned, self.active = place, heading, turned, active
-        self.total = None
+        self.tier, self.total = tier, None
         if weighs_all(scene):
             self.row, _, self.total = draws.draw_by_weight(self.lights.count, self._weigh, u)
         else:
-            cell = connect.guide_cell(scene.choice, place)
+            cell = connect.guide_cell(scene.choice, place, tier)
             self.row, _ = connect.choose_light(scene.choice, scene.lights, cell, u)
 
     def direction(self, u: Float, v: Float) -> Vector:
@@ -181,7 +192,8 @@ class _Halos:
         ahead = phase_function(self.fog, turn) + dr.minimum(
             self._density(axis, self.heading), _BRIGHTEST_PER_SR
         )
-        return row, dr.maximum(dr.select(self.turned, weight * ahead, weight), 1e-12)
+        weight = dr.maximum(dr.select(self.turned, weight * ahead, weight), 1e-12)
+        return row, connect.of_tier(self.lights, row, self.tier, weight)
 
     def _axis(self, row: UInt) -> tuple[Vector, Float]:
         """Return the direction of a light, and its distance; the sun counts as a metre away."""

@@ -16,12 +16,12 @@ from typing import Any
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws, nodes
-from nir_render.transport.indirect.kernel.arrive import arriving_share
+from nir_render.transport.indirect.kernel.begin import Film, camera_direction, deal_of
 from nir_render.transport.indirect.kernel.draws import Draws
 from nir_render.transport.indirect.kernel.fog import fog_interval
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
-from nir_render.transport.indirect.kernel.tables import DeviceScene, Film, Surfaces, direction_in_pixel
+from nir_render.transport.indirect.kernel.tables import DeviceScene, Surfaces
 from nir_render.transport.indirect.kernel.types import (
     AddLight,
     Float,
@@ -46,6 +46,8 @@ _FAR = 1e15
 _DIM = 0.1
 # Less than this, in 1/(m² sr), is nothing: near 1e-38 some threads round to zero and others do not.
 _NOTHING = 1e-15
+
+_Begin = tuple[Vector, UInt | None, Float | None]  # of a path: direction, tier, and one over its share
 
 
 def walk(
@@ -78,18 +80,24 @@ def walk(
             place, some = (group + node) * stride + lane, active & (part > _NOTHING)
             dr.scatter_reduce(dr.ReduceOp.Add, out, part, place, some, dr.ReduceMode.NoConflicts)
 
-    def camera_direction(sample: UInt) -> Vector:
-        return direction_in_pixel(film, pixel, draw, sample)
+    deal = deal_of(scene, film.origin, camera_direction(film, pixel, mi.Float(0.5), mi.Float(0.5)))
+
+    def begin(sample: UInt) -> _Begin:
+        along, down, dealt = (
+            draw.pixel(sample, purpose) for purpose in (draws.PIXEL_U, draws.PIXEL_V, draws.TIER)
+        )
+        return camera_direction(film, pixel, along, down), *deal.tier_of(dealt)
 
     def step(state: PathState) -> tuple[PathState]:
-        return (_step(scene, state, draw, max_depth, add, camera_direction, film.origin),)
+        return (_step(scene, state, draw, max_depth, add, begin, film.origin),)
 
     zero = dr.zeros(mi.UInt32, lanes)
+    direction, tier, dealt = begin(zero)
     state = PathState(
         sample=mi.UInt32(zero),
         depth=mi.UInt32(zero),
         origin=film.origin + dr.zeros(mi.Point3f, lanes),
-        direction=camera_direction(zero),
+        direction=direction,
         weight=dr.ones(mi.Float, lanes),
         shares=nodes.whole(scene.nodes, lanes),
         left=dr.ones(mi.Float, lanes),
@@ -99,6 +107,8 @@ def walk(
         scattered=dr.zeros(mi.Bool, lanes),
         way=dr.full(mi.Int32, _STRAIGHT, lanes),
         inside=dr.zeros(mi.Bool, lanes),
+        tier=tier,
+        dealt=dealt,
         active=dr.full(mi.Bool, True, lanes),
     )
     dr.while_loop((state,), lambda state: state.active, step)
@@ -111,7 +121,7 @@ def _step(
     draw: Draws,
     max_depth: UInt,
     add: AddLight,
-    camera_direction: Callable[[UInt], Vector],
+    begin: Callable[[UInt], _Begin],
     camera: Point,
 ) -> PathState:
     """Return a lane's state after one more stretch of its path, its light added on the way."""
@@ -126,7 +136,7 @@ def _step(
     surface = met & (light < 0) & (state.depth + 1 < max_depth)
     sampled = _ask_light(scene, state, si, passing, surface, max_depth, number, add)
     onward_path = _scatter(scene, state, si, sampled, surface, scattering, number)
-    return _survive(state, onward_path, draw, number(draws.SURVIVAL), camera_direction, camera)
+    return _survive(state, onward_path, draw, number(draws.SURVIVAL), begin, camera)
 
 
 def _meet(scene: DeviceScene, state: PathState) -> Interaction:
@@ -187,6 +197,10 @@ def _add_unasked_light(
     Small lights that the camera sees straight, or by one facet, are left out: the direct table holds them.
     """
     lights = scene.lights
+    if state.tier is not None:
+        others = dr.gather(mi.UInt32, lights.tier, light, active) != state.tier
+        active = active & ~(state.scattered & others)
+        weight = dr.select(state.scattered, weight * state.dealt, weight)
     row = mi.Int32(light)
     towards = state.direction
     if lights.has_images:
@@ -237,7 +251,7 @@ def _ask_light(
     Both come from one call of Mitsuba's, which costs less than two.
     """
     bsdf = si.bsdf()
-    cell = connect.guide_cell(scene.choice, si.p)
+    cell = connect.guide_cell(scene.choice, si.p, state.tier)
     row, chance = connect.choose_light(scene.choice, scene.lights, cell, number(draws.LIGHT))
     aim = connect.aim_at_light(scene.lights, row, si.p, number(draws.LIGHT_U), number(draws.LIGHT_V), surface)
     value, density, sample, sampled_weight = bsdf.eval_pdf_sample(
@@ -246,13 +260,15 @@ def _ask_light(
     )  # fmt: skip
     asked = aim.density * chance
     brought = weight * value[0] * aim.radiance / asked * _power_heuristic(asked, density)
+    if state.dealt is not None:
+        brought = brought * state.dealt
     seen = surface & (brought > 0.0) & dr.isfinite(brought)
     shadow = si.spawn_ray(aim.direction)
     # Mitsuba lifts a ray's origin off the surface, up to 1e-4 of the coordinates; it aims at the same point.
     to = aim.direction * aim.reach - (shadow.o - si.p)
     reach = dr.norm(to)
     lifted = replace(aim, direction=to / reach, reach=reach)
-    share, kept = arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
+    share, kept = connect.arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
     shares = nodes.off_surface(scene.nodes, si, bsdf, aim.direction, mi.Bool(False), seen)
     shares = nodes.times(nodes.times(state.shares, shares), kept)
     add(brought * share, shares, row, seen & (share > 0.0))
@@ -324,7 +340,7 @@ def _survive(
     onward_path: _NextStretch,
     draw: Draws,
     u: Float,
-    camera_direction: Callable[[UInt], Vector],
+    begin: Callable[[UInt], _Begin],
     camera: Point,
 ) -> PathState:
     """Return the state of a path that goes on, by chance `u` where it is dim, or of the next sample's."""
@@ -334,11 +350,12 @@ def _survive(
     survival = dr.minimum(left / _DIM, 1.0)
     goes_on = onward_path.leaves & (u < survival)
     sample_next = state.sample + dr.select(goes_on, mi.UInt32(0), mi.UInt32(1))
+    direction, tier, dealt = begin(sample_next)
     return PathState(
         sample=sample_next,
         depth=dr.select(goes_on, state.depth + 1, 0),
         origin=dr.select(goes_on, onward_path.origin, camera),
-        direction=dr.select(goes_on, leaving.direction, camera_direction(sample_next)),
+        direction=dr.select(goes_on, leaving.direction, direction),
         weight=dr.select(goes_on, state.weight * leaving.weight / survival, 1.0),
         shares=nodes.where(goes_on, nodes.times(state.shares, onward_path.shares), whole),
         left=dr.select(goes_on, left / survival, 1.0),
@@ -349,6 +366,8 @@ def _survive(
         scattered=goes_on & (state.scattered | evenly),
         way=dr.select(goes_on & ~evenly, onward_path.way, _STRAIGHT),
         inside=goes_on & onward_path.inside,
+        tier=None if tier is None else dr.select(goes_on, state.tier, tier),
+        dealt=None if dealt is None else dr.select(goes_on, state.dealt, dealt),
         active=state.active & (sample_next < draw.samples),
     )
 

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from nir_render.spectra.skies import CieSky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import Guide
-from nir_render.transport.indirect.kernel import draws
-from nir_render.transport.indirect.kernel.draws import Draws
 from nir_render.transport.indirect.kernel.nodes import NodeTable
 from nir_render.transport.indirect.kernel.sky import SkyTable, upload_sky
 from nir_render.transport.indirect.kernel.types import Float, Int, Mask, MitsubaScene, Point, UInt, Vector
@@ -42,6 +40,8 @@ class Lights:
     facet: Int
     image: Int
     power: Float
+    tier: UInt
+    tiers: int
     pattern: Float  # values of all patterns, one after the other
     pattern_first: Int  # where each light's begins, −1 for none
     pattern_azimuths: UInt
@@ -86,8 +86,10 @@ class Choice:
     top: Point
     stride_y: UInt
     stride_z: UInt
+    cells: UInt
     cumulative: Float
     chance: Float
+    tier_share: Float  # of each tier in each cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,29 +109,11 @@ class FogTable:
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
-    """The rays of a camera and the part of its film to fill.
-
-    `corners` holds directions at the corners of the sensor's pixels, `rows` + 1 times `columns` + 1; a pixel
-    of the film is `scale` × `scale` of these. `index` are the numbers of the film's pixels to fill, `pixels`
-    and `pixel_count` how many.
-    """
-
-    origin: Point
-    corners: Float
-    rows: UInt
-    columns: UInt
-    scale: UInt
-    index: UInt
-    pixels: UInt
-    pixel_count: int
-
-
-@dataclass(frozen=True, eq=False)
 class DeviceScene:
     """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes.
 
-    `nodes` is None where light of one wavelength alone is carried.
+    `max_depth` is the longest path, in stretches, as Mitsuba counts; `nodes` is None where light of one
+    wavelength alone is carried.
     """
 
     bodies: MitsubaScene
@@ -138,6 +122,7 @@ class DeviceScene:
     surfaces: Surfaces
     choice: Choice
     fog: FogTable | None
+    max_depth: int
     nodes: NodeTable | None = None
 
     @property
@@ -152,6 +137,7 @@ def upload_lights(
     patterns: list[Pattern | None],
     axes: NDArray[np.float64],
     sky: CieSky | None = None,
+    tier: NDArray[np.int64] | None = None,
 ) -> Lights:
     """Bring emitters to the device.
 
@@ -165,7 +151,10 @@ def upload_lights(
         World from the source's own axes, shape (lights, 3, 3).
     sky
         How bright the sky is over directions, None where there is none.
+    tier
+        The tier of each emitter (`guide.Guide`), shape (emitters,); without, all are of one.
     """
+    tier = np.zeros(len(emitters.kind), dtype=np.int64) if tier is None else tier
     values, first, azimuths = [np.ones(1)], [], []
     for pattern in patterns:
         first.append(-1 if pattern is None else sum(map(len, values)))
@@ -193,6 +182,8 @@ def upload_lights(
         facet=mi.Int32(emitters.facet.astype(np.int32)),
         image=mi.Int32(np.append(emitters.image.ravel(), -1).astype(np.int32)),
         power=_real(power[emitters.group]),
+        tier=_whole(tier),
+        tiers=int(tier.max(initial=0)) + 1,
         pattern=_real(np.concatenate(values)),
         pattern_first=mi.Int32(np.array(first, dtype=np.int32)),
         pattern_azimuths=_whole(np.array(azimuths)),
@@ -243,8 +234,10 @@ def upload_guide(guide: Guide) -> Choice:
         top=mi.Point3f(*(dr.opaque(mi.Float, float(count) - 0.5) for count in guide.counts)),
         stride_y=dr.opaque(mi.UInt32, x),
         stride_z=dr.opaque(mi.UInt32, x * y),
+        cells=dr.opaque(mi.UInt32, int(np.prod(guide.counts))),
         cumulative=mi.Float(guide.cumulative.ravel()),
         chance=mi.Float(guide.chance.ravel()),
+        tier_share=_real(guide.tier_share),
     )
 
 
@@ -272,23 +265,6 @@ def along_table(place: Float, end: float | Point) -> Float:
     As a whole number NaN is 2³¹ on processors without AVX-512: a gather there reads memory that is not ours.
     """
     return dr.select(place > 0.0, dr.minimum(place, end), 0.0)
-
-
-def direction_in_pixel(film: Film, pixel: UInt, draw: Draws, sample: UInt) -> Vector:
-    """Return a unit direction in a pixel, evenly drawn between those at the sensor pixel's corners."""
-    width = film.columns // film.scale
-    row = pixel // width
-    u = (mi.Float(pixel - row * width) + draw.pixel(sample, draws.PIXEL_U)) * mi.Float(film.scale)
-    v = (mi.Float(row) + draw.pixel(sample, draws.PIXEL_V)) * mi.Float(film.scale)
-    # In float32 the sum can round up to the next whole number.
-    column, line = dr.minimum(mi.UInt32(u), film.columns - 1), dr.minimum(mi.UInt32(v), film.rows - 1)
-    corner = line * (film.columns + 1) + column
-    above, above_right, below, below_right = (
-        dr.gather(mi.Vector3f, film.corners, corner + offset)
-        for offset in (0, 1, film.columns + 1, film.columns + 2)
-    )
-    along, down = u - mi.Float(column), v - mi.Float(line)
-    return dr.normalize(dr.lerp(dr.lerp(above, above_right, along), dr.lerp(below, below_right, along), down))
 
 
 def _real(values: NDArray[np.float64]) -> Float:

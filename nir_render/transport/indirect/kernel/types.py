@@ -42,4 +42,6 @@ class PathState:
     scattered: Mask  # whether there is such a vertex
     way: Int
     inside: Mask  # a transparent solid
+    tier: UInt | None  # of lights that the path serves; None where all are of one
+    dealt: Float | None  # one over the share of samples that serve it
     active: Mask
