@@ -2,8 +2,8 @@
 
     .venv/bin/python tools/droplet_tables.py [NAME ...]
 
-Run it after a change of a preset, of an index, or of the angles; `tests/unit/scattering` holds the tables against what
-is computed anew. Drizzle takes minutes, the others seconds.
+Run it after a change of a preset, of an index, or of the angles; `tests/unit/scattering` holds the tables
+against what is computed anew. It takes minutes; with MIEPYTHON_USE_JIT=1 in the environment, one.
 """
 
 import sys

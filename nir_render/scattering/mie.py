@@ -67,9 +67,10 @@ def cloud_of(
     radius_m, number = size_nodes(sizes, nodes)
     x = 2.0 * math.pi * radius_m / wavelength_m
     if x[-1] > _LARGEST_X:
+        most_mm = 1e3 * _LARGEST_X * wavelength_m / (2.0 * math.pi)
         raise InputError(
-            f"droplets of {1e3 * radius_m[-1]:.3g} mm in radius count here; wanted at most "
-            f"{1e3 * _LARGEST_X * wavelength_m / (2.0 * math.pi):.3g} mm, for Mie theory's sums; check numbers and units"
+            f"droplets of {1e3 * radius_m[-1]:.3g} mm in radius count here; wanted at most {most_mm:.3g} mm, "
+            "for Mie theory's sums; check numbers and units"
         )
     found = [np.asarray(coefficients(index, float(one))) for one in x]
     pi, tau = _angular(max(one.shape[1] for one in found), np.cos(angle_rad))

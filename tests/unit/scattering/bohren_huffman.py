@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def sphere_sums(
-    index: complex, x: Array, cosine: Array
-) -> tuple[Array, Array, Array, Array]:
+def sphere_sums(index: complex, x: Array, cosine: Array) -> tuple[Array, Array, Array, Array]:
     """Return Q_ext, Q_sca, Q_sca g, shape (sizes,), and (|S₁|² + |S₂|²)/2, shape (sizes, angles); index n + ik.
 
     ψ and χ by upward recurrence, the logarithmic derivative D downwards from far above; each sphere's sum stops at
@@ -56,7 +54,12 @@ def sphere_sums(
 
 
 def fog_sums(
-    power: float, slope_per_um: float, index: complex, wavelength_um: float, edges_deg: Array, sizes: int = 400
+    power: float,
+    slope_per_um: float,
+    index: complex,
+    wavelength_um: float,
+    edges_deg: Array,
+    sizes: int = 400,
 ) -> tuple[float, float, float, Array]:
     """Return σ of one droplet in µm², 1 − albedo, g, and the shares that are scattered between angles.
 

@@ -87,8 +87,12 @@ def test_small_and_large_spheres_are_rayleighs_and_twice_their_area(index: compl
     wave = 2.0 * math.pi / 940e-9
     polarised = (index**2 - 1.0) / (index**2 + 2.0)
     sixth_m6 = 1e-54 * math.exp(18.0 * math.log(1.02) ** 2)
-    assert tiny.scattering_m2 == pytest.approx(8.0 / 3.0 * math.pi * wave**4 * sixth_m6 * abs(polarised) ** 2, rel=1e-3)
-    np.testing.assert_allclose(tiny.phase_per_sr, 3.0 * (1.0 + np.cos(angles) ** 2) / (16.0 * math.pi), rtol=1e-3)
+    assert tiny.scattering_m2 == pytest.approx(
+        8.0 / 3.0 * math.pi * wave**4 * sixth_m6 * abs(polarised) ** 2, rel=1e-3
+    )
+    np.testing.assert_allclose(
+        tiny.phase_per_sr, 3.0 * (1.0 + np.cos(angles) ** 2) / (16.0 * math.pi), rtol=1e-3
+    )
     if index.imag:
         large = cloud_of(Lognormal(200e-6, 1.02), index, 940e-9, angles[:0], nodes=20)
         x = 2.0 * math.pi * 200e-6 / 940e-9  # 2 (1 + 0.9 x^(−2/3)), Nussenzveig and Wiscombe 1980
@@ -140,7 +144,9 @@ def test_sizes_cover_volume_and_area(sizes: ModifiedGamma | Lognormal) -> None:
     else:
         second_m2 = sizes.median_m**2 * math.exp(2.0 * math.log(sizes.spread) ** 2)
     assert float(number @ radius_m**2) == pytest.approx(second_m2, rel=1e-6)
-    assert 4.0 / 3.0 * math.pi * float(number @ radius_m**3) == pytest.approx(sizes.mean_volume_m3(), rel=1e-5)
+    assert 4.0 / 3.0 * math.pi * float(number @ radius_m**3) == pytest.approx(
+        sizes.mean_volume_m3(), rel=1e-5
+    )
 
 
 def test_what_is_too_large_is_refused() -> None:
