@@ -3,7 +3,7 @@
     .venv/bin/python tools/droplet_tables.py [NAME ...]
 
 Run it after a change of a preset, of an index, or of the angles; `tests/unit/scattering` holds the tables
-against what is computed anew. It takes minutes; with MIEPYTHON_USE_JIT=1 in the environment, one.
+against what is computed anew. It takes some minutes.
 """
 
 import sys
@@ -14,8 +14,9 @@ from nir_render.scene.documents.ambient.droplets import Droplets
 from nir_render.scene.documents.files import preset_names
 
 FOLDER = Path(__file__).parents[1] / "nir_render" / "data" / "droplets" / "tables"
-NODES = 2400
-NODES_OF_DROPS = 500  # each of them takes a thousand times as long; their resonances are narrow
+NODES = 8000  # 1 - albedo hangs on resonances of large spheres: to 2 % then
+NODES_OF_DROPS = 1000  # each of them takes a hundred times as long
+MOST_X = 30_000.0
 LARGE_M = 50e-6
 
 
@@ -26,7 +27,7 @@ def main() -> None:
         droplets = Droplets.model_validate(name)
         particles = Particles(droplets.sizes.sizes(), droplets.index.value, droplets.index_550.value)
         large = particles.sizes.mean_volume_m3() > LARGE_M**3
-        optics = computed(particles, NODES_OF_DROPS if large else NODES)
+        optics = computed(particles, NODES_OF_DROPS if large else NODES, MOST_X)
         (FOLDER / f"{name}.csv").write_text(table_text(particles, optics), encoding="utf-8")
         print(
             f"{name}: sigma(940)/sigma(550) {optics.ratio:.4f}, g {optics.asymmetry:.4f}, "

@@ -1,8 +1,9 @@
 """Mie theory for many spheres: what a cloud of them takes from light, absorbs, and throws where.
 
-The coefficients a_n and b_n of each size are miepython's; the sums over n, angles and sizes are made here, as
-products of matrices. Symbols are those of Bohren & Huffman (Absorption and Scattering of Light by Small
-Particles, 1983, chapter 4).
+All spheres are summed at once, over n, angles and sizes, as products of matrices; a test holds the
+coefficients against miepython's, which takes spheres one by one and a hundred times as long. Symbols and
+equations are those of Bohren & Huffman (Absorption and Scattering of Light by Small Particles, 1983,
+chapter 4).
 """
 
 import math
@@ -15,12 +16,15 @@ from nir_render.errors import InputError
 from nir_render.scattering.sizes import Sizes, size_nodes
 
 Array = NDArray[np.float64]
+Waves = NDArray[np.complex128]
 
-NODES = 600
-"""Sizes that stand for a distribution: σ, g and the ratio of σ come out to 0.2 %."""
+NODES = 2400
+"""Sizes that stand for a distribution: σ, g and the ratio of σ come out to 0.1 %, light backwards to 0.5 %."""
 
-_AT_ONCE = 40  # sizes
-_LARGEST_X = 30_000.0  # 2π r / λ: drops of 4 mm radius at 940 nm; beyond them it lasts hours
+MOST_X = 2000.0
+"""2π r / λ of the largest spheres, 0.3 mm in radius at 940 nm: a scene with them loads within seconds."""
+
+_AT_ONCE = 250  # sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,12 @@ class Cloud:
 
 
 def cloud_of(
-    sizes: Sizes, index: complex, wavelength_m: float, angle_rad: Array, nodes: int = NODES
+    sizes: Sizes,
+    index: complex,
+    wavelength_m: float,
+    angle_rad: Array,
+    nodes: int = NODES,
+    most_x: float = MOST_X,
 ) -> Cloud:
     """Return what a cloud of spheres of some sizes does to light.
 
@@ -56,31 +65,29 @@ def cloud_of(
         Angles of turning at which the phase function is wanted, shape (angles,); may be empty.
     nodes
         Sizes that stand for all.
+    most_x
+        2π r / λ beyond which spheres are refused.
 
     Raises
     ------
     InputError
         The spheres are so large that the sums would last hours.
     """
-    from miepython import coefficients  # half a second
-
     radius_m, number = size_nodes(sizes, nodes)
     x = 2.0 * math.pi * radius_m / wavelength_m
-    if x[-1] > _LARGEST_X:
-        most_mm = 1e3 * _LARGEST_X * wavelength_m / (2.0 * math.pi)
+    if x[-1] > most_x:
+        most_mm = 1e3 * most_x * wavelength_m / (2.0 * math.pi)
         raise InputError(
             f"droplets of {1e3 * radius_m[-1]:.3g} mm in radius count here; wanted at most {most_mm:.3g} mm, "
             "for Mie theory's sums; check numbers and units"
         )
-    found = [np.asarray(coefficients(index, float(one))) for one in x]
-    pi, tau = _angular(max(one.shape[1] for one in found), np.cos(angle_rad))
+    pi, tau = _angular(_terms(x[-1]), np.cos(angle_rad))
     extinction, scattering, forward = 0.0, 0.0, 0.0
     intensity = np.zeros(len(angle_rad))
     for first in range(0, len(x), _AT_ONCE):
-        some = found[first : first + _AT_ONCE]
-        terms = max(one.shape[1] for one in some)
-        a, b = (np.stack([_padded(one[row], terms) for one in some], axis=1) for row in range(2))
-        weight = number[first : first + _AT_ONCE]
+        some = slice(first, first + _AT_ONCE)
+        a, b = coefficients(index, x[some])
+        weight, terms = number[some], len(a)
         n = np.arange(1.0, terms + 1.0)[:, None]
         # Of each sphere, over 2π/k²: equations (4.61) and (4.62), and Q_sca⟨cos θ⟩ after (4.62).
         extinction += float(weight @ ((2.0 * n + 1.0) * (a + b).real).sum(axis=0))
@@ -104,8 +111,42 @@ def cloud_of(
     )
 
 
-def _padded(values: NDArray[np.complex128], length: int) -> NDArray[np.complex128]:
-    return np.pad(values, (0, length - len(values)))
+def coefficients(index: complex, x: Array) -> tuple[Waves, Waves]:
+    """Return a_n and b_n of spheres, equation (4.88) in the book's signs, shape (terms, spheres) each.
+
+    Parameters
+    ----------
+    index
+        n − ik.
+    x
+        2π r / λ, increasing, shape (spheres,). Where terms vanish (Wiscombe 1980) they are 0.
+    """
+    index = index.conjugate()  # the book's time dependence makes it n + ik
+    y, terms = index * x, _terms(x[-1])
+    last = np.array([_terms(one) for one in x])
+    derivative = np.zeros((terms + 1, len(x)), dtype=np.complex128)
+    running = np.zeros(len(x), dtype=np.complex128)
+    # Downwards, (4.89), from where nothing is left of what it starts with: errors shrink beyond |y| alone.
+    furthest = float(abs(y).max())
+    for n in range(max(terms, int(furthest + 8.0 * math.cbrt(furthest))) + 16, 0, -1):
+        running = n / y - 1.0 / (running + n / y)
+        if n <= terms + 1:
+            derivative[n - 1] = running
+    a, b = (np.zeros((terms, len(x)), dtype=np.complex128) for _ in range(2))
+    psi_before, psi = np.cos(x), np.sin(x)
+    xi_before, xi = psi_before + 1j * psi, psi - 1j * psi_before
+    for n in range(1, terms + 1):
+        # Small spheres' terms have ended, and their recurrences rest: they would overflow.
+        on = n <= last
+        psi_before, psi = psi, np.where(on, (2 * n - 1) / x * psi - psi_before, psi)
+        xi_before, xi = xi, np.where(on, (2 * n - 1) / x * xi - xi_before, xi)
+        for row, factor in ((a, derivative[n] / index + n / x), (b, derivative[n] * index + n / x)):
+            row[n - 1] = np.where(on, (factor * psi - psi_before) / (factor * xi - xi_before), 0.0)
+    return a, b
+
+
+def _terms(x: float) -> int:
+    return int(x + 4.05 * math.cbrt(x) + 2.0)
 
 
 def _angular(terms: int, cosine: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.scattering.mie import NODES, cloud_of
+from nir_render.scattering.mie import MOST_X, NODES, cloud_of
 from nir_render.scattering.sizes import Sizes
 
 Array = NDArray[np.float64]
@@ -74,10 +74,10 @@ def optics_of(particles: Particles) -> Optics:
     return computed(particles) if known is None else known
 
 
-def computed(particles: Particles, nodes: int = NODES) -> Optics:
-    """Return what droplets do to light, by Mie theory at so many sizes."""
-    here = cloud_of(particles.sizes, particles.index, BAND_M, ANGLE_RAD, nodes)
-    there = cloud_of(particles.sizes, particles.index_550, VISIBLE_M, np.zeros(0), nodes)
+def computed(particles: Particles, nodes: int = NODES, most_x: float = MOST_X) -> Optics:
+    """Return what droplets do to light, by Mie theory at so many sizes, none larger than `most_x`."""
+    here = cloud_of(particles.sizes, particles.index, BAND_M, ANGLE_RAD, nodes, most_x)
+    there = cloud_of(particles.sizes, particles.index_550, VISIBLE_M, np.zeros(0), nodes, 2.0 * most_x)
     # Rounding may bring the albedo of what absorbs nothing above 1.
     absorbed = max(1.0 - here.scattering_m2 / here.extinction_m2, 0.0)
     return Optics(

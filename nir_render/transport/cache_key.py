@@ -37,7 +37,7 @@ from nir_render.scene.snapshot import PlacedCamera, Snapshot
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.fingerprint import code_hash, matching, package_versions
 
-_PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy", "miepython")
+_PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
 # Files of this package that decide the bits of light: a change of one is another version.
 _CODE = (
     "transport/**/*.py",

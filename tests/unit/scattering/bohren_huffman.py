@@ -1,7 +1,5 @@
 """Mie's sums as Bohren and Huffman print them (1983, appendix A), for many spheres at once: a second program."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +17,7 @@ def sphere_sums(index: complex, x: Array, cosine: Array) -> tuple[Array, Array, 
     y = index * x
     log_derivative = np.zeros((terms + 1, len(x)), dtype=complex)
     running = np.zeros(len(x), dtype=complex)
-    for n in range(int(max(terms, abs(y).max())) + 16, 0, -1):
+    for n in range(int(max(terms, 1.1 * abs(y).max())) + 60, 0, -1):
         running = n / y - 1.0 / (running + n / y)
         if n - 1 <= terms:
             log_derivative[n - 1] = running
@@ -51,34 +49,3 @@ def sphere_sums(index: complex, x: Array, cosine: Array) -> tuple[Array, Array, 
         a_before, b_before = a, b
     over = 2.0 / x**2
     return over * extinction, over * scattering, 2.0 * over * forward, 0.5 * (abs(s1) ** 2 + abs(s2) ** 2)
-
-
-def fog_sums(
-    power: float,
-    slope_per_um: float,
-    index: complex,
-    wavelength_um: float,
-    edges_deg: Array,
-    sizes: int = 400,
-) -> tuple[float, float, float, Array]:
-    """Return σ of one droplet in µm², 1 − albedo, g, and the shares that are scattered between angles.
-
-    Midpoints evenly in r up to where 1e-8 of the cross-section is left; Gauss–Legendre in cos θ between the edges.
-    """
-    high_um = (power + 2.0 + 8.0 * math.sqrt(power + 3.0) + 12.0) / slope_per_um
-    radius_um = high_um * (np.arange(sizes) + 0.5) / sizes
-    number = radius_um**power * np.exp(-slope_per_um * radius_um)
-    number /= math.gamma(power + 1.0) / slope_per_um ** (power + 1.0) * sizes / high_um
-    kept = number * radius_um**2 > 1e-8 * (number * radius_um**2).max()
-    radius_um, number = radius_um[kept], number[kept]
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    edges = np.cos(np.radians(edges_deg))
-    half = 0.5 * (edges[:-1] - edges[1:])
-    cosine = (edges[1:, None] + half[:, None] * (nodes + 1.0)).ravel()
-    q_ext, q_sca, q_forward, intensity = sphere_sums(index, 2.0 * math.pi * radius_um / wavelength_um, cosine)
-    area = number * math.pi * radius_um**2
-    extinction, scattering = float(area @ q_ext), float(area @ q_sca)
-    wave = 2.0 * math.pi / wavelength_um
-    per_sr = (number @ intensity).reshape(len(half), -1) / (wave**2 * scattering)
-    shares = 2.0 * math.pi * half * (per_sr @ weights)
-    return extinction, 1.0 - scattering / extinction, float(area @ q_forward) / scattering, shares

@@ -134,7 +134,7 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"fog": {"visibility": "9 m", "droplets": "smoke", "albedo": 0.9}}, "fog: wanted either 'droplets', which tell albedo and phase"),
     ({"fog": {"visibility": "9 m", "droplets": "smok"}}, "there is no preset 'smok' in droplets; did you mean 'smoke'?"),
     ({"fog": {"visibility": "9 m", "phase": {"type": "mie"}}}, "fog: phase: the type 'mie' needs 'droplets', such as droplets: advection_heavy"),
-    ({"fog": {"visibility": "9 m", "droplets": {"sizes": {"type": "modified_gamma", "power": 6, "slope": "1 /mm"}}}}, "mm in radius count here; wanted at most 4.49 mm"),
+    ({"fog": {"visibility": "9 m", "droplets": {"sizes": {"type": "modified_gamma", "power": 6, "slope": "1 /mm"}}}}, "mm in radius count here; wanted at most 0.299 mm"),
     ({"fog": {**FOG, "albedo": 1.1}}, "fog.albedo: input should be less than or equal to 1"),
     ({"fog": {**FOG, "phase": {"type": "henyey_greenstein", "g": 1.0}}}, "fog.phase.g: input should be less than"),
     ({"fog": {**FOG, "phase": {"type": "isotropic"}}}, "fog.phase: there is no type 'isotropic'; known: henyey_greenstein, table, mie; write it such as"),

@@ -263,7 +263,6 @@ def test_the_versions_name_the_variant_the_packages_the_machine_and_this_code() 
         "mitsuba",
         "drjit",
         "numpy",
-        "miepython",
     ]
     assert processor == cpu_name() != ""
     assert len(own) == 64
