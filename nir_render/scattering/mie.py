@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Waves = NDArray[np.complex128]
 
 NODES = 2400
-"""Sizes that stand for a distribution: σ, g and the ratio of σ come out to 0.1 %, light backwards to 0.5 %."""
+"""Sizes that stand for a distribution: σ, g and the ratio of σ come out to 0.1 %, light back to 0.5 %."""
 
 MOST_X = 2000.0
 """2π r / λ of the largest spheres, 0.3 mm in radius at 940 nm: a scene with them loads within seconds."""

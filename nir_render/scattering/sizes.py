@@ -74,8 +74,8 @@ Sizes = ModifiedGamma | Lognormal
 def size_nodes(sizes: Sizes, count: int) -> tuple[Array, Array]:
     """Return radii, and how many of one droplet in all each stands for, shape (count,).
 
-    Midpoints of even steps: of what vanishes at both ends they make sums as good as any. Only sizes that count
-    in the sum of all cross-sections (π r²) are covered: what they stand for is below 1 in all.
+    Midpoints of even steps: of what vanishes at both ends they make sums as good as any. Only sizes that
+    count in the sum of all cross-sections (π r²) are covered: what they stand for is below 1 in all.
     """
     low_m, high_m = sizes.widest_m()
     tried_m = np.geomspace(low_m, high_m, 20_000)

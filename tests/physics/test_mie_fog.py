@@ -35,7 +35,13 @@ def _fog(make: Loader, droplets: str) -> Medium:
 
 
 @pytest.mark.parametrize(
-    "droplets", ["radiation_moderate", "radiation_heavy", "advection_moderate", "advection_heavy"]
+    "droplets",
+    [
+        "radiation_moderate",
+        pytest.param("radiation_heavy", marks=pytest.mark.verify),
+        pytest.param("advection_moderate", marks=pytest.mark.verify),
+        "advection_heavy",
+    ],
 )
 def test_turns_are_drawn_as_mie_theory_has_them(make: Loader, droplets: str) -> None:
     """Shares of the turns that the kernel draws within 1, 5 and 30 degrees and backwards, against Mie sums at other angles.

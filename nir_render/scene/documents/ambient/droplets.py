@@ -28,7 +28,7 @@ class Lognormal(Document):
 
     type: Literal["lognormal"]
     median_m: Annotated[Length, Field(ge=1e-9, le=1e-3)]
-    spread: Annotated[float, Field(ge=1.02, le=4)]
+    spread: Annotated[float, Field(ge=1.02, le=2.5)]
 
     def sizes(self) -> sizes.Sizes:
         """Return the distribution."""
