@@ -125,11 +125,11 @@ def coefficients(index: complex, x: Array) -> tuple[Waves, Waves]:
     y, terms = index * x, _terms(x[-1])
     last = np.array([_terms(one) for one in x])
     derivative = np.zeros((terms + 1, len(x)), dtype=np.complex128)
-    running = np.zeros(len(x), dtype=np.complex128)
+    running: Waves = np.zeros(len(x), dtype=np.complex128)
     # Downwards, (4.89), from where nothing is left of what it starts with: errors shrink beyond |y| alone.
     furthest = float(abs(y).max())
     for n in range(max(terms, int(furthest + 8.0 * math.cbrt(furthest))) + 16, 0, -1):
-        running = n / y - 1.0 / (running + n / y)
+        running = np.asarray(n / y - 1.0 / (running + n / y), dtype=np.complex128)
         if n <= terms + 1:
             derivative[n - 1] = running
     a, b = (np.zeros((terms, len(x)), dtype=np.complex128) for _ in range(2))
