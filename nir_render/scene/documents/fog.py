@@ -91,7 +91,7 @@ class Fog(Document):
 
     `extinction` is σ_t at 940 nm in light lost per metre; 0 /m is clear air. Or `visibility`, the
     meteorologist's, 3.912/σ_t at 550 nm: it becomes the extinction at 940 nm when the scene is loaded, by the
-    droplets' σ(940)/σ(550), without droplets by that of `radiation_heavy`, 1.028 ± 0.014 (assumed).
+    droplets' σ(940)/σ(550), without droplets by that of `radiation_heavy`, 1.0275 ± 0.014 (assumed).
 
     `droplets` say all else by Mie theory. Without them `albedo` is the share of what is lost that is
     scattered, and not absorbed, and `phase` where to.
