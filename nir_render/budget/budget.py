@@ -90,12 +90,13 @@ class CameraBudget:
 
 @dataclass(frozen=True)
 class Budget:
-    """The photon budget of a scene at a time."""
+    """The photon budget of a scene at a time; `fog` is what `Fog.facts` tells, None in clear air."""
 
     name: str
     scene: str
     time_s: float
     extinction_per_m: float
+    fog: Mapping[str, Any] | None
     assumptions: Assumptions
     cameras: tuple[CameraBudget, ...]
     eye_safety: tuple[EyeSafety, ...]
@@ -140,6 +141,7 @@ def photon_budget(
         scene=scene.path,
         time_s=time_s,
         extinction_per_m=_extinction_per_m(snapshot),
+        fog=None if snapshot.fog is None else snapshot.fog.facts(),
         assumptions=assumed,
         cameras=tuple(
             _camera_budget(snapshot, camera, alike, assumed, progress) for (camera, _), alike in kinds.items()

@@ -13,6 +13,7 @@ from nir_render.budget.tables import (
     ambient_table,
     cause_table,
     eye_table,
+    fog_sentence,
     range_table,
     source_sentences,
     view_table,
@@ -121,6 +122,7 @@ def budget_html(budget: Budget) -> str:
             counted(sum(len(one.cameras) for one in budget.cameras), "camera"),
             "nothing rendered, nothing hidden",
         ],
+        fog=None if budget.fog is None else fog_sentence(budget.fog),
         cameras=[_camera_section(one) for one in budget.cameras],
         eyes=eye_table(budget) if budget.eye_safety else None,
         assumed=Table(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from nir_render.budget.budget import Budget, CameraBudget, SourceBudget
 from nir_render.budget.curves import Curve
@@ -152,6 +153,21 @@ def eye_table(budget: Budget) -> Table:
         for one in budget.eye_safety
     ]
     return Table(("source", "mW/sr", "cornea", "retina", "a pulse", "group"), rows)
+
+
+def fog_sentence(fog: Mapping[str, Any]) -> str:
+    """Say what the fog takes, how far eyes see in it, and how it scatters."""
+    seen = "" if fog["visibility_m"] is None else f", a visibility of {metres(fog['visibility_m'])} at 550 nm"
+    sigma = "" if fog["ratio_sigma"] is None else f" ± {fog['ratio_sigma']:.3f}"
+    text = (
+        f"Fog: extinction {fog['extinction_per_m']:.4g} /m at 940 nm{seen} "
+        f"(σ(940)/σ(550) = {fog['ratio_940_to_550']:.3f}{sigma}, that of {fog['ratio_of']}); "
+        f"1 − albedo {fog['absorbed_share']:.2g}, g {fog['asymmetry']:.3f}"
+    )
+    if fog["droplets_per_cm3"] is None:
+        return f"{text}."
+    number, volume = fog["droplets_per_cm3"], fog["volume_cm3_per_m3"]
+    return f"{text}; {number:.3g} droplets per cm³, {volume:.3g} cm³ of them in a m³."
 
 
 def source_sentences(source: SourceBudget) -> str:

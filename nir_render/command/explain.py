@@ -69,12 +69,15 @@ def _show(budget: "Budget") -> None:
         ambient_table,
         cause_table,
         eye_table,
+        fog_sentence,
         range_table,
         source_sentences,
         view_table,
         view_title,
     )
 
+    if budget.fog is not None:
+        typer.echo(f"{fog_sentence(budget.fog)}\n")
     for camera in budget.cameras:
         name = alike(camera.cameras)
         typer.echo(f"{name}: {camera_sentence(camera)}\n")

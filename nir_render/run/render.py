@@ -302,6 +302,7 @@ def _facts(scene: Scene, writer: _FrameWriter, noise: dict[str, Any], seconds: f
         "indirect": _indirect_facts(scene) | by_camera | refresh_facts(scene, writer.refresh),
         "render_noise": noise | {"groups_by_camera": writer.groups_by_camera},
         "ambient": ambient_facts(scene),
+        "fog": None if scene.document.fog is None else scene.document.fog.facts(),
         "spectral": spectral_facts(scene),
         "wavelengths": wavelength_facts(scene),
         "lights": {"rendered": writer.lights[0], "reused": writer.lights[1]},

@@ -42,7 +42,7 @@ class Scene:
         >>> from nir_render import load_scene
         >>> scene = load_scene("scenes/arena.yaml").with_({"fog.visibility": "50 m"})
         >>> round(scene.document.fog.extinction_per_m, 3)
-        0.078
+        0.08
         """
         return parse_scene(apply_overrides(self.raw, overrides), self.folder, self.path, overrides)
 

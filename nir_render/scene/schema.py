@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from nir_render.scene.documents.ambient.droplets import Droplets
 from nir_render.scene.documents.ambient.lamps import Lamp
 from nir_render.scene.documents.ambient.sun import Air
 from nir_render.scene.documents.camera import Camera, Rig
@@ -24,6 +25,7 @@ _PRESET_MODELS: tuple[type[PresetDocument], ...] = (
     Rig,
     Lamp,
     Air,
+    Droplets,
 )
 
 
@@ -39,7 +41,7 @@ def scene_schema() -> dict[str, Any]:
     _describe_curves(definitions)
     fog = definitions["Fog"]
     fog["properties"]["visibility"] = {**fog["properties"]["extinction"], "examples": [VISIBILITY.example]}
-    fog["properties"]["visibility"]["description"] = "3.912 / extinction, in place of it"
+    fog["properties"]["visibility"]["description"] = "3.912 / extinction at 550 nm, in place of it"
     del fog["required"]
     fog["oneOf"] = [{"required": ["extinction"]}, {"required": ["visibility"]}]
     for name, key in (("Waypoint", "time"), ("Circle", "period")):

@@ -28,6 +28,7 @@ from pydantic import BaseModel
 from nir_render.camera.optics.lens import corner_directions
 from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera
+from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.shapes import Mesh, ShapeDocument
 from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter
@@ -41,6 +42,8 @@ _PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
 _CODE = (
     "transport/**/*.py",
     "scene/**/*.py",
+    "scattering/*.py",
+    "data/droplets/tables/*.csv",
     "light/enlarge.py",
     "camera/optics/lens.py",
     "geometry.py",
@@ -95,7 +98,7 @@ def geometry_key(site: Site) -> str:
                 + (() if placed.source.pattern is None else (placed.source.pattern, placed.pose.rotation))
                 for name, placed in snapshot.sources.items()
             ],
-            "fog": snapshot.fog,
+            "fog": _fog(snapshot.fog),
             "camera": (site.name, site.pose.position_m, site.pose.rotation, _corners(site.camera)),
         }
     )
@@ -178,6 +181,16 @@ def _shape(shape: ShapeDocument) -> tuple[str, dict[str, Any]]:
         state = file.stat()
         fields["file"] = (file.suffix.lower(), _content(str(file), state.st_mtime_ns, state.st_size))
     return type(shape).__name__, fields
+
+
+def _fog(fog: Fog | None) -> tuple[str, dict[str, Any]] | None:
+    """Return a fog; droplets count only where there are some, so that others keep their random numbers."""
+    if fog is None:
+        return None
+    fields = {name: getattr(fog, name) for name in type(fog).model_fields}
+    if fog.droplets is None:
+        del fields["droplets"]
+    return type(fog).__name__, fields
 
 
 @lru_cache(maxsize=64)

@@ -94,10 +94,16 @@ def test_fog_takes_its_share_by_beer_and_lambert(
     assert _per_w(scene) == pytest.approx(expected, rel=1e-3)
 
 
-def test_visibility_is_3_912_over_the_extinction(scene_with: SceneMaker) -> None:
-    """Visibility 50 m, 5 m ahead, 10 mm: 2 % contrast is left at 50 m, so exp(−0.3912) at 5 m."""
-    scene = scene_with({**source_at(5.0), "fog": {"visibility": "50 m"}})
-    assert _per_w(scene) * 4.0 * math.pi * 25.0 == pytest.approx(math.exp(-0.3912), rel=1e-3)
+@pytest.mark.parametrize(
+    ("droplets", "ratio"), [("advection_heavy", 1.0126), ("radiation_moderate", 1.0433), (None, 1.0275)]
+)
+def test_visibility_is_3_912_over_the_extinction(
+    scene_with: SceneMaker, droplets: str | None, ratio: float
+) -> None:
+    """Visibility 50 m, 5 m ahead, 10 mm: 2 % contrast is left at 50 m and 550 nm, so exp(−0.3912 σ(940)/σ(550)) at 5 m."""
+    scene = scene_with({**source_at(5.0), "fog": {"visibility": "50 m", "droplets": droplets}})
+    left = math.exp(-0.3912 * ratio)
+    assert _per_w(scene) * 4.0 * math.pi * 25.0 == pytest.approx(left, rel=1e-3)
 
 
 def test_fog_lies_on_both_legs_of_a_ghost(scene_with: SceneMaker) -> None:

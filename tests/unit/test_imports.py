@@ -33,6 +33,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.scene.documents": ("built", "ambient", "times", "spectral"),
     "nir_render.truth": (),
     "nir_render.spectra": (),
+    "nir_render.scattering": (),
     "nir_render.randomness": (),
     "nir_render.geometry": (),
     "nir_render.errors": (),

@@ -25,6 +25,7 @@ _ALTERNATIVES = (
     {"peak_transmission", "table"},
     {"edge", "table"},
     {"extinction", "visibility"},
+    {"phase", "droplets"},
     {"full_well", "saturation_capacity"},
     {"values", "file"},
     {"constant", "square", "bits", "flicker"},
@@ -34,7 +35,10 @@ _ALTERNATIVES = (
 )
 
 # What a change of one key takes away with it: what a preset knows of another quantum efficiency, say.
-_GOES_WITH = {"quantum_efficiency": {"efficiency_envelope", "efficiency_taken"}}
+_GOES_WITH = {
+    "quantum_efficiency": {"efficiency_envelope", "efficiency_taken"},
+    "droplets": {"albedo"},  # which they tell
+}
 
 
 class PresetDocument(Document):

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.scene.documents.fog import HenyeyGreenstein
+from nir_render.scattering.optics import ANGLE_RAD
+from nir_render.scene.documents.fog import HenyeyGreenstein, TabulatedPhase
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.world.phase import PhaseTable, henyey_greenstein, phase_table, tabulated
 
@@ -30,7 +31,10 @@ def medium(snapshot: Snapshot) -> Medium | None:
     phase = fog.phase
     if isinstance(phase, HenyeyGreenstein):
         function = henyey_greenstein(phase.g)
-    else:
+    elif isinstance(phase, TabulatedPhase):
         angle_rad, value = np.array(phase.points).T
         function = tabulated(angle_rad, value)
+    else:
+        assert fog.droplets is not None  # their document sees to it
+        function = tabulated(ANGLE_RAD, fog.droplets.optics.phase_per_sr)
     return Medium(fog.extinction_per_m, fog.albedo, low_m, high_m, phase_table(function))

@@ -9,6 +9,7 @@ from nir_render import SourceTruth, calibration, load_scene
 from nir_render.budget.assumptions import Assumptions, assumptions_of
 from nir_render.budget.budget import CameraBudget, photon_budget
 from nir_render.budget.causes import LIMIT_CAUSES, OTHER_CAUSES
+from nir_render.budget.tables import fog_sentence
 from nir_render.errors import InputError
 from nir_render.evaluate.metrics import source_limits
 from tests.paths import SCENES
@@ -130,3 +131,17 @@ def test_assumptions_are_read_with_their_units() -> None:
     ):
         with pytest.raises(InputError, match=said):
             assumptions_of([text])
+
+
+def test_the_fog_is_told_in_a_sentence() -> None:
+    """Heavy advection fog at V = 136.1 m: 20 droplets per cm³, 0.372 g/m³; without droplets the ratio has a σ."""
+    scene = load_scene(SCENES / "one_source.yaml")
+    known = photon_budget(scene.with_({"fog": {"visibility": "136.1 m", "droplets": "advection_heavy"}})).fog
+    assert known is not None
+    said = fog_sentence(known)
+    for words in ("extinction 0.0291 /m at 940 nm", "visibility of 136 m", "that of advection_heavy", "g 0.868", "20 droplets per cm³", "0.372 cm³"):  # fmt: skip
+        assert words in said
+    unnamed = photon_budget(scene.with_({"fog": {"visibility": "50 m"}})).fog
+    assert unnamed is not None
+    assert "± 0.014, that of radiation_heavy (assumed)" in fog_sentence(unnamed)
+    assert photon_budget(scene).fog is None

@@ -41,8 +41,50 @@ def test_extinction_is_per_metre(scene: Scene, text: str, per_m: float) -> None:
 
 
 def test_visibility_becomes_extinction(scene: Scene) -> None:
-    """docs/physics.md, Fog: 3.912/σ; the heavy advection fog of 136 m has 28.8 per km."""
-    assert _fog(scene, visibility="136 m").extinction_per_m == pytest.approx(0.028765, rel=1e-4)
+    """docs/physics.md, Fog: 3.912/V at 550 nm; at 940 nm 1.028 of it, or what droplets have: 29.1 per km at 136 m."""
+    assert _fog(scene, visibility="136 m").extinction_per_m == pytest.approx(0.028765 * 1.0275, rel=5e-4)
+    fog = _fog(scene, visibility="136.1 m", droplets="advection_heavy")
+    assert fog.extinction_per_m == pytest.approx(0.0291, rel=0.002)
+    facts = fog.facts()
+    assert facts["visibility_m"] == pytest.approx(136.1, rel=1e-12)
+    assert facts["droplets_per_cm3"] == pytest.approx(20.0, rel=0.002)
+    assert facts["volume_cm3_per_m3"] == pytest.approx(0.372, rel=0.003)
+    assert (facts["ratio_of"], facts["ratio_sigma"], facts["phase"]) == ("advection_heavy", None, "mie")
+    unnamed = _fog(scene, visibility="50 m").facts()
+    assert (unnamed["ratio_of"], unnamed["ratio_sigma"]) == ("radiation_heavy (assumed)", 0.014)
+    assert (unnamed["asymmetry"], unnamed["droplets_per_cm3"]) == (0.85, None)
+
+
+def test_droplets_and_what_else_may_be_said_of_light_replace_each_other(scene: Scene) -> None:
+    """By a change of one key: droplets take albedo and phase away, a phase takes droplets away."""
+    plain = scene.with_(
+        {"fog": {"visibility": "50 m", "albedo": 0.9, "phase": {"type": "henyey_greenstein", "g": 0.3}}}
+    )
+    smoke = plain.with_({"fog.droplets": "smoke"})
+    assert smoke.document.fog is not None
+    assert smoke.document.fog.droplets is not None
+    assert smoke.document.fog.albedo == pytest.approx(0.784, abs=0.002)
+    assert smoke.document.fog.extinction_per_m * 50.0 / 3.912 == pytest.approx(0.2604, abs=0.001)
+    coarse = smoke.with_(
+        {
+            "fog.droplets": {
+                "preset": "smoke",
+                "sizes": {"type": "lognormal", "median": "0.5 um", "spread": 1.2},
+            }
+        }
+    )
+    assert coarse.document.fog is not None
+    assert coarse.document.fog.facts()["ratio_of"] == "the scene's droplets"
+    again = smoke.with_({"fog.phase": {"type": "henyey_greenstein", "g": 0.3}}).document.fog
+    assert again is not None
+    assert again.droplets is None
+    assert again.albedo == 0.9995
+
+
+def test_g_of_a_table_is_told(scene: Scene) -> None:
+    """1 at 0 deg falling to 0 at 180 deg: mean cosine ¼."""
+    phase = {"type": "table", "points": [["0 deg", 1], ["180 deg", 0]]}
+    assert _fog(scene, extinction="0.1 /m", phase=phase).facts()["asymmetry"] == pytest.approx(0.25, rel=1e-3)
 
 
 def test_fog_without_more_has_the_phase_function_of_heavy_fog(scene: Scene) -> None:
@@ -70,7 +112,7 @@ def test_either_way_to_write_fog_replaces_the_other(scene: Scene, tmp_path: Path
     thick = scene.with_({"fog": {"extinction": "0.5 /m", "albedo": 0.9}})
     thin = thick.with_({"fog.visibility": "391.2 m"}).document.fog
     assert thin is not None
-    assert thin.extinction_per_m == pytest.approx(0.01)
+    assert thin.extinction_per_m == pytest.approx(0.010275, rel=5e-4)
     assert thin.albedo == 0.9
     (tmp_path / "ground.yaml").write_text(
         "format: 1\nobserve: [a]\nrobots: {a: {rig: infra_swarm}}\nfog: {visibility: 50 m, albedo: 0.9}\n"
@@ -201,6 +243,7 @@ def test_a_preset_of_a_source_may_have_its_pattern_replaced(scene: Scene, tmp_pa
         {"fog": {"extinction": "0.07 /m", "center": "[1, 2, 3] m", "size": "[2, 1, 4] m"}},
         {"fog": {"extinction": "0.07 /m", "phase": {"type": "table", "points": [["0 deg", 9], ["1.1 deg", 3], ["180 deg", 1]]}}},
         {"fog": {"extinction": "0.07 /m", "phase": {"type": "henyey_greenstein", "g": 0.5}}},
+        {"fog": {"visibility": "60 m", "droplets": "radiation_heavy", "top": "4 m"}},
         {PATTERN: {"points": [["0 deg", 1.0], ["33.3 deg", 0.3], ["180 deg", 0]]}},
         {
             PATTERN: {"grid": {"polar": "[0, 33.3, 180] deg", "azimuth": "[0, 120.1] deg", "values": ["[1, 1]", "[0.3, 0.7]", "[0, 0]"]}},
@@ -208,7 +251,7 @@ def test_a_preset_of_a_source_may_have_its_pattern_replaced(scene: Scene, tmp_pa
         },
         {"materials.g": {"type": "pane"}, "shapes.w": {"type": "rectangle", "center": "[3, 0, 0] m", "size": "[1, 1] m", "material": "g"}},
     ],
-    ids=["fog with a top, sun", "bank", "phase table", "g", "pattern", "pattern on a grid", "pane"],
+    ids=["fog with a top, sun", "bank", "phase table", "g", "droplets", "pattern", "pattern on a grid", "pane"],
 )  # fmt: skip
 def test_a_resolved_scene_loads_to_the_same(scene: Scene, changes: dict[str, Any], tmp_path: Path) -> None:
     changed = scene.with_(changes)

@@ -168,9 +168,9 @@ def test_what_is_wrong_is_refused_before_anything_runs(
 
 def test_two_combinations_that_are_one_scene_are_refused(tmp_path: Path) -> None:
     """Their jobs would be one, and stand at one of two places."""
-    axes = {"a": {"path": "fog", "values": [None, {"extinction": "0.1 /m"}, {"visibility": "39.12 m"}]}}
+    axes = {"a": {"path": "fog", "values": [None, {"extinction": "0.1 /m"}, {"extinction": "100 /km"}]}}
     with pytest.raises(
-        InputError, match=r"at a = \{visibility: 39\.12 m\}: the same scene as at a = \{extinction"
+        InputError, match=r"at a = \{extinction: 100 /km\}: the same scene as at a = \{extinction"
     ):
         planned(tmp_path, axes=axes)
 

@@ -258,7 +258,12 @@ def test_the_versions_name_the_variant_the_packages_the_machine_and_this_code() 
     """Lights of another compiler or processor may have other bits: they are no lights of the same key."""
     variant, compiler, *packages, processor, own = versions("llvm_ad_mono", "LLVM 19.1.7")
     assert (variant, compiler) == ("llvm_ad_mono", "LLVM 19.1.7")
-    assert [package.split()[0] for package in packages] == ["nir-render", "mitsuba", "drjit", "numpy"]
+    assert [package.split()[0] for package in packages] == [
+        "nir-render",
+        "mitsuba",
+        "drjit",
+        "numpy",
+    ]
     assert processor == cpu_name() != ""
     assert len(own) == 64
 
