@@ -1,4 +1,4 @@
-"""What `robust` makes of flares that move within an exposure: one JSON object. A minute; `--frames 40` for more.
+"""What `robust` makes of flares that move in an exposure: one JSON object. A minute; `--frames 40` for more.
 
 Spheres of the paper's rig, 0.7 to 6 m away, each drawn out evenly along a line of up to 5 px; their images by
 brute force on a fine grid, photons and read noise by NumPy. For each length: how many are taken for two and
