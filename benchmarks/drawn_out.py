@@ -55,7 +55,7 @@ def drawn_out_e(
     spread = np.exp(-2.0 * np.pi**2 * camera.psf_sigma_px**2 * (k_u**2 + k_v**2))
     spread *= np.sinc(k_u * way_px[0] + k_v * way_px[1])
     blurred = np.fft.irfft2(np.fft.rfft2(light) * spread, light.shape)
-    share = blurred.reshape(2 * HALF + 1, FINE, 2 * HALF + 1, FINE).sum(axis=(1, 3))
+    share = blurred.reshape(2 * HALF + 1, FINE, 2 * HALF + 1, FINE).sum(axis=(1, 3)).clip(0.0)
     at_1_m_e = camera.range_constant_dn_m2_per_s / camera.system_gain_dn_per_e * EXPOSURE_S
     return left, top, at_1_m_e * cos_theta / range_m**2 * share / share.sum()
 
