@@ -36,7 +36,7 @@ _MISSED, _MOST_MISSED, _MERGE = 3e-4, 0.2, 3.0
 _REACH = 4.0
 """Half a window, in standard deviations of the image, and what counts as a neighbour beyond its edge."""
 
-_LARGEST_PX, _RESOLVED_PX = 40.0, 0.5
+_LARGEST_PX, _RESOLVED_PX, _MOST_STRETCH = 40.0, 0.5, 8.0
 _LEAST_PIXELS = 9
 
 
@@ -180,7 +180,8 @@ def sample_at(
         return None
     # The image of a source whose place is not known well is its mean over where it may be.
     shapes = [_gaussian(expected.u_px, expected.v_px, blurred_px, window)]
-    for hit, hit_rad, hit_px in _sizes(found, calibration):
+    near = [hit for hit in found if _may_reach(hit, expected, half_px, calibration)]
+    for hit, hit_rad, hit_px in _sizes(near, calibration):
         if max(abs(hit.u_px - expected.u_px), abs(hit.v_px - expected.v_px)) < half_px + _REACH * hit_px:
             resolved = hit_rad * calibration.fx_px > _RESOLVED_PX
             if resolved and has_image(hit.u_px, hit.v_px, hit_rad, calibration):
@@ -202,6 +203,15 @@ def sample_at(
     if not 0.0 < sigma_e < lit_e:
         return None
     return _sample(flux_e / lit_e, sigma_e / lit_e, expected, frame, calibration)
+
+
+def _may_reach(hit: Detection, expected: Expected, half_px: float, calibration: Calibration) -> bool:
+    """Tell cheaply whether a detection's image may reach into a window: with room for any lens's stretch."""
+    off_px = max(abs(hit.u_px - expected.u_px), abs(hit.v_px - expected.v_px))
+    if math.isnan(hit.range_m):
+        return off_px < half_px + _REACH * calibration.psf_sigma_px
+    radius_px = _MOST_STRETCH * calibration.fx_px * calibration.source_radius_m / max(hit.range_m, 0.01)
+    return off_px < half_px + _REACH * (calibration.psf_sigma_px + radius_px)
 
 
 def _sizes(found: Sequence[Detection], calibration: Calibration) -> list[tuple[Detection, float, float]]:

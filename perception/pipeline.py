@@ -188,7 +188,7 @@ class Pipeline:
         if not frames:
             tracks = self._tracker.predicted(self._latest_s, odometry)
             return Heard(self._latest_s, measure_set([], [], self._calibrations), tracks, ())
-        seen = measure_set(frames, detections, self._calibrations)
+        seen = measure_set(frames, detections, self._calibrations, odometry=odometry)
         time_s = set_time_s(frames)
         tracks = self._tracker.update(time_s, seen.measurements, odometry)
         messages = self._listen(time_s, frames, seen, tracks, odometry)

@@ -52,7 +52,7 @@ def associated(sightings: Sightings) -> list[Group]:
         left = set(new.tolist())
         if groups:
             best = np.array([group.best(noise) for group in groups])
-            chi2, scaled = chi2_of_pairs(sightings.rays, best, new, SPEED_SIGMA_M_PER_S)
+            chi2, scaled = chi2_of_pairs(sightings.together, best, new, SPEED_SIGMA_M_PER_S)
             cost = np.minimum(chi2, scaled + SCALE_COST)
             if cost.min() < GATE_CHI2:
                 rows, columns = linear_sum_assignment(np.minimum(cost, GATE_CHI2))
@@ -118,9 +118,9 @@ def _fused(sightings: Sightings, group: Group) -> Joined:
     else:
         used = list(by_camera.values())
         rows = np.array(used)
-        weight = 1.0 / np.trace(rays.angular_rad2[rows], axis1=1, axis2=2)
+        weight = 1.0 / np.trace(sightings.together.angular_rad2[rows], axis1=1, axis2=2)
         time_s = float(weight @ rays.time_s[rows] / weight.sum())
-        place = _together(rays, rows, time_s)
+        place = _together(sightings.together, rows, time_s)
     flagged = all(sightings.ghost[k] for k in members)
     claimed = bool(sightings.claimed[best])
     measurement = Measurement(

@@ -10,8 +10,17 @@ from perception.rig.frame_sets import Exposed, robot_of
 from perception.rig.fusion import associated, fused
 from perception.rig.ghosts import told_ghosts
 from perception.rig.mirror_planes import check_planes
+from perception.rig.moving import at_one_time
 from perception.rig.sightings import sightings_of
-from perception.types import Calibration, Detection, Measurement, MirrorPlane, RawFrame, SetMeasurements
+from perception.types import (
+    Calibration,
+    Detection,
+    Measurement,
+    MirrorPlane,
+    Odometry,
+    RawFrame,
+    SetMeasurements,
+)
 
 _FOG_PASSES = 3
 
@@ -55,13 +64,20 @@ def measure_set(
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
     planes: Sequence[MirrorPlane] = (),
+    odometry: Sequence[Odometry] = (),
 ) -> SetMeasurements:
     """As `detect_set`, from the detections of each frame, or record of a frame.
+
+    Parameters
+    ----------
+    odometry
+        The robot's records around the set, by time: where its cameras do not expose all at once, and it turns
+        or drives, their rays meet only if that is reckoned with. Without any it stands still.
 
     Raises
     ------
     ValueError
-        If a camera has no calibration, or the frames are of several robots.
+        If a camera has no calibration, the frames are of several robots, or odometry is not by time.
     """
     robots = sorted({robot_of(frame.camera) for frame in frames})
     if len(robots) > 1:
@@ -69,7 +85,7 @@ def measure_set(
     if unknown := sorted({frame.camera for frame in frames} - set(calibrations)):
         raise ValueError(f"no calibration for {', '.join(unknown)}")
     check_planes(planes)
-    measurements, mirrors = _measured(frames, detections, calibrations, planes)
+    measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
     extinction: Extinction | None = None
     as_found = detections
     images: set[tuple[str, int, int]] | None = None
@@ -83,7 +99,7 @@ def measure_set(
         if extinction is None:
             break
         detections = corrected(frames, as_found, calibrations, extinction)
-        measurements, mirrors = _measured(frames, detections, calibrations, planes)
+        measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
     return SetMeasurements(
         measurements,
         tuple(map(tuple, detections)),
@@ -97,8 +113,11 @@ def _measured(
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
     planes: Sequence[MirrorPlane],
+    odometry: Sequence[Odometry],
 ) -> tuple[tuple[Measurement, ...], tuple[MirrorPlane, ...]]:
     """Join detections to measurements, and tell mirror images from robots."""
-    found = sightings_of(frames, detections, calibrations)
+    known = at_one_time(sightings_of(frames, detections, calibrations), odometry)
+    found = known.sightings
     own_sources_body_m = calibrations[frames[0].camera].own_sources_body_m if frames else np.empty((0, 3))
-    return told_ghosts(fused(found, associated(found)), own_sources_body_m, planes)
+    measurements, mirrors = told_ghosts(fused(found, associated(found)), own_sources_body_m, planes)
+    return known.back(measurements), mirrors

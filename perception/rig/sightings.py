@@ -42,6 +42,8 @@ class Sightings:
         Which frame of the set, shape (n,).
     rays
         What they say of the source's place.
+    together
+        The same for sightings of several cameras: less sure where the observer moved between (`moving`).
     claimed
         Whether the estimator claims the standard deviations, shape (n,).
     saturated, merged, ghost
@@ -51,6 +53,7 @@ class Sightings:
     keys: tuple[tuple[str, int, int], ...]
     frame: NDArray[np.int64]
     rays: Rays
+    together: Rays
     claimed: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
     merged: NDArray[np.bool_]
@@ -120,20 +123,22 @@ def sightings_of(
         turned_rad = calibration.sigma.get("rotation_body_camera", 0.0)
         moved_rad = calibration.sigma.get("position_body_m", 0.0) / at_m[these]
         angular_rad2[these] += (turned_rad**2 + moved_rad**2)[:, None, None] * np.eye(2)
+    rays = Rays(
+        origin_m,
+        axes,
+        angular_rad2,
+        np.where(known, range_m, np.nan),
+        np.where(known, noise, UNKNOWN_RANGE),
+        common,
+        time_s,
+    )
     return Sightings(
         keys=tuple(
             (hit.camera, hit.index, number) for found in detections for number, hit in enumerate(found)
         ),
         frame=frame,
-        rays=Rays(
-            origin_m,
-            axes,
-            angular_rad2,
-            np.where(known, range_m, np.nan),
-            np.where(known, noise, UNKNOWN_RANGE),
-            common,
-            time_s,
-        ),
+        rays=rays,
+        together=rays,
         claimed=np.isfinite(u_sigma_px + v_sigma_px) & (claimed | ~known),
         saturated=saturated,
         merged=merged,

@@ -103,6 +103,10 @@ def newborn(seen: Observations, time_s: float, settings: TrackerSettings) -> Ban
     mean[:, :3] = seen.origin_m + range_m[:, None] * seen.bearing
     covariance[:, :3, :3] = seen.axes.transpose(0, 2, 1) @ noise @ seen.axes
     covariance[:, 3:, 3:] = settings.speed_sigma_m_per_s**2 * np.eye(3)
+    # It was there at its own time: since then, or until then, it moved with a velocity that is not known.
+    drift = -seen.after_s[:, None, None] * covariance[:, 3:, 3:]
+    covariance[:, :3, :3] -= seen.after_s[:, None, None] * drift
+    covariance[:, :3, 3:] = covariance[:, 3:, :3] = drift
     # A range that came out too long by its shared error, u = +1, puts the estimate beyond the truth.
     common[:, :3] = -load_m[:, None] * seen.bearing
     at = np.full(m, time_s)

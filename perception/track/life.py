@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.odometry import Pose
 from perception.track.bank import Bank
-from perception.track.odometry import Pose
 from perception.track.settings import TrackerSettings
 from perception.types import Ghost, Track
 
@@ -44,7 +44,7 @@ def survivors(bank: Bank, time_s: float, period_s: float, settings: TrackerSetti
     merged_s = np.clip(
         bank.alone_s - bank.born_s, settings.merged_life_s, _MERGED_MOST * settings.merged_life_s
     )
-    alive = (unseen_s <= lives_s) & (time_s - bank.alone_s <= merged_s)
+    alive = (unseen_s <= lives_s) & (time_s - bank.alone_s <= np.maximum(merged_s, lives_s))
     return bank.taken(alive & (confirmed | (bank.odds > LEAST_ODDS)))
 
 

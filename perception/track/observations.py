@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.odometry import Poses
 from perception.track.kalman import Innovations, States
-from perception.track.odometry import Poses
 from perception.track.settings import TrackerSettings
 from perception.types import Measurement, bearing_axes
 

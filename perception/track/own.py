@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from perception.odometry import AT_REST, Pose, pose_at
 from perception.own_code import error_line, kind_of, load_function
-from perception.track.odometry import AT_REST, Pose, pose_at
 from perception.types import Measurement, Odometry, Track
 
 TRACKERS = ("sound", "paper")

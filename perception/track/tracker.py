@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.odometry import Pose, pose_at, poses_at
 from perception.track import life
 from perception.track.association import Pairs, assigned, gated_pairs, paper_pairs
 from perception.track.bank import Bank, newborn, replaced, taken_states
@@ -13,7 +14,6 @@ from perception.track.fed import fed, swerved
 from perception.track.kalman import predicted, wandered
 from perception.track.merging import Shared, Sums, dimmed, shared_flares, split_in_doubt
 from perception.track.observations import Beat, Observations, beaten, observed, usable
-from perception.track.odometry import Pose, pose_at, poses_at
 from perception.track.rejoin import continued, rejoined
 from perception.track.settings import TrackerSettings
 from perception.types import Measurement, Odometry, Track
@@ -98,11 +98,12 @@ class Tracker:
             raise ValueError(f"time of a set is {time_s}; wanted seconds")
         measurements = [measurements[k] for k in usable(measurements)]
         self._name(measurements)
-        odometry = self._last_known(odometry)
         if time_s < self._time_s - self.settings.late_s:
             self._bank, self._time_s, self._rhythm, self._sharing = _nobody(), -math.inf, {}, {}
+            self._odometry = ()
         if time_s < self._time_s:
             return self.predicted(time_s, odometry)
+        odometry = self._last_known(odometry)
         pose = pose_at(odometry, time_s)
         after_s = time_s - self._time_s if math.isfinite(self._time_s) else 0.0
         self._bank = self._moved(after_s, pose)
@@ -220,7 +221,7 @@ class Tracker:
         period_s = period_s[taken[alone]]
         dawn = (when - old.seen_s[alone] > 1.5 * period_s) & (period_s < DAWN_S)
         bearing_only = dawn | split_in_doubt(seen, how)[taken[alone]]
-        spread = np.where(bearing_only, 0.0, doubtful[alone])
+        spread = np.where(bearing_only, np.nan_to_num(doubtful[alone]), doubtful[alone])
         old = fed(old, alone, seen.taken(taken[alone]), chi2[alone], when, how, spread)
         old = life.judged_ghosts(old, alone, seen.ghost[taken[alone]])
         if len(both):

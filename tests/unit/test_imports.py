@@ -51,6 +51,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.robust": ("search",),
     "perception.files": (),
     "perception.model": (),
+    "perception.odometry": (),
     "perception.own_code": (),
     "perception.compiled": (),
     "perception.types": (),

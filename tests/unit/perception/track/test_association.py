@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from perception.odometry import poses_at
 from perception.track.association import RANGE_NATS, Pairs, assigned, gated_pairs, paper_pairs
 from perception.track.bank import Bank, newborn
 from perception.track.observations import Observations, observed
-from perception.track.odometry import poses_at
 from perception.track.settings import TrackerSettings
 from tests.unit.perception.simulation import random
 from tests.unit.perception.track.world import Array, measurement

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from perception.track.kalman import States
+from perception.odometry import poses_at
+from perception.track.bank import newborn
+from perception.track.kalman import States, predicted
 from perception.track.observations import innovations, observed
-from perception.track.odometry import poses_at
 from perception.track.settings import TrackerSettings
 from perception.types import Odometry
 from tests.unit.perception.simulation import random
@@ -49,6 +50,16 @@ def test_a_measurement_counts_at_its_own_time() -> None:
     here = innovations(_states([3.0, 0.5, 0.0], (0.0, 2.0, 0.0)), seen).residual_m[0]
     there = innovations(_states([3.0, 0.52, 0.0]), seen._replace(after_s=np.zeros(1))).residual_m[0]
     np.testing.assert_allclose(here, there, atol=1e-5)
+
+
+def test_a_track_that_begins_does_not_know_how_far_it_moved_since() -> None:
+    one = measurement(np.array([3.0, 0.5, 0.0]), 0.02, random(1625), common=0.0, claimed_common=0.0)
+    how = TrackerSettings(speed_sigma_m_per_s=0.5)
+    at_once, later = (newborn(observed([one], STILL, when, how), when, how).states for when in (0.02, 0.0))
+    # Brought to the measurement's own time, the track is the one that began there.
+    there = predicted(later, 0.02, 0.0)
+    np.testing.assert_allclose(there.covariance, at_once.covariance, atol=1e-12)
+    assert later.covariance[0, 1, 1] - at_once.covariance[0, 1, 1] == pytest.approx(1e-4, rel=1e-6)
 
 
 def test_what_claims_nothing_gets_the_defaults() -> None:

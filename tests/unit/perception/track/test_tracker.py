@@ -259,7 +259,7 @@ def test_cameras_that_take_turns_range_as_well_as_one() -> None:
         assert np.sqrt(along @ track.covariance[:3, :3] @ along) < relative_noise(3.0) * 3.0
 
 
-@pytest.mark.parametrize("fps", [0.5, 2.0])
+@pytest.mark.parametrize("fps", [0.25, 0.5, 2.0])
 def test_rare_sets_make_tracks_too(fps: float) -> None:
     rng = random(1667)
     tracker = Tracker()
@@ -267,7 +267,7 @@ def test_rare_sets_make_tracks_too(fps: float) -> None:
         tracks = tracker.update(n / fps, [measurement(np.array([3.0, 0.0, 0.0]), n / fps, rng)])
     assert [track.track for track in tracks] == [1]
     assert tracker.update(12 / fps, [])[0].track == 1
-    assert tracker.update(12 / fps + 6.0, []) == ()
+    assert tracker.update(12 / fps + 3.0 / fps, []) == ()
 
 
 # --- ranges that are not known, ghosts, partial light ---

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from perception.track import pose_at
+from perception.odometry import pose_at
 from perception.types import Odometry
 from tests.unit.perception.track.world import turn
 
