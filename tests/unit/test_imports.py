@@ -41,6 +41,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.photometry": (),
     "perception.track": (),
     "perception.messages": (),
+    "perception.extrinsics": (),
     "perception.rig": (),
     "perception.calibration": (),
     "perception.command_estimator": (),
