@@ -113,6 +113,10 @@ def perceive(
     tracker: OwnTracker = None,
     decoder: OwnDecoder = None,
     calibration: CalibrationFile = None,
+    causes: Annotated[
+        bool,
+        typer.Option("--causes", help="Also write what each range's σ is made of: causes.NAME.jsonl."),
+    ] = False,
     time_limit_s: TimeLimit = 60.0,
     as_json: Json = False,
 ) -> None:
@@ -126,7 +130,7 @@ def perceive(
     own = OwnParts.of(tracker, decoder)
     with progress_bar("perceive") as progress:
         perceived = perceive_run(
-            folder, estimators=chosen, progress=progress, own=own, calibration=calibration
+            folder, estimators=chosen, progress=progress, own=own, calibration=calibration, causes=causes
         )
     if as_json:
         told: dict[str, Any] = {"failed": dict(perceived.failures)} if perceived.failures else {}

@@ -17,6 +17,7 @@ from perception import (
     read_frame,
     read_frame_records,
 )
+from perception.files.detections import parse_causes
 from perception.types import FrameKey
 
 
@@ -52,6 +53,7 @@ def report_run(folder: Path, result: Evaluation) -> Path:
                 run_folder.lines_of(folder, "messages", names, parse_message),
             ),
             film=run_folder.FILM if film is not None else "",
+            causes=run_folder.lines_of(folder, "causes", names, parse_causes),
         )
     except RecordingError as error:
         raise InputError(str(error)) from None

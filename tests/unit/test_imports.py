@@ -49,6 +49,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.paper": (),
     "perception.robust": ("search",),
     "perception.files": (),
+    "perception.causes": (),
     "perception.model": (),
     "perception.own_code": (),
     "perception.compiled": (),
