@@ -68,17 +68,18 @@ _HEIGHT_SIGMA_M = 0.02
 _SAME_HEIGHT = 0.8
 _LOG_RANGE_SPAN = math.log(100.0)
 _OWN_SIGMA_M = 2e-3
+_ONE_ROBOT_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A plane, its kind and covariance, whom each image shows, and ln of its odds against none."""
+    """A plane and its kind, whom each image shows, its covariance, and ln of its odds against none."""
 
     plane: Array
     kind: int
-    covariance: Array
     parents: Indices
     images: Indices
+    covariance: Array
     log_odds: float
 
 
@@ -262,21 +263,53 @@ def _fitted(
     )
     if not len(parents):
         return None
+    of_all = parents, shown, covariance
+    robot = _one_of_each(flares, parents, shown)
+    if len(robot) < len(parents):
+        parents, shown = parents[robot], shown[robot]
+        chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane.copy(), kind, prior, precision)
+        if len(parents) < (1 if is_known else 2) or not (np.diagonal(covariance) > 0.0).all():
+            return None
     log_gain = log_peak - 0.5 * chi2 - float(log_chance[shown].sum())
     log_gain += _log_seen(flares, robots, parents, plane, kind, len(log_chance))
     log_volume = 0.5 * (np.linalg.slogdet(2.0 * math.pi * covariance)[1])
     if is_known:
         log_prior = 0.5 * (np.linalg.slogdet(precision / (2.0 * math.pi))[1])
-        return _Found(plane, kind, covariance, parents, shown, log_gain + log_volume + log_prior)
+        return _Found(plane, kind, *of_all, log_gain + log_volume + log_prior)
     log_prior = -math.log(4.0 * math.pi) - math.log(MOST_PLANE_DISTANCE_M)
     log_odds = math.log(MIRROR_PROBABILITY / len(KINDS)) + log_gain + log_volume + log_prior
     log_odds += _log_parameter_prior(plane[4], math.sqrt(covariance[3, 3]), kind)
     if log_odds < _LOG_NEVER:
-        return _Found(plane, kind, covariance, parents, shown, log_odds)
+        return _Found(plane, kind, *of_all, log_odds)
     by_symmetry = _log_symmetry(flares, parents, shown, plane, log_gain + 0.5 * chi2 - log_peak, log_prior)
     # Against there being neither a mirror nor a formation.
     against = math.log1p(math.exp(min(by_symmetry, 700.0)))
-    return _Found(plane, kind, covariance, parents, shown, log_odds - against)
+    return _Found(plane, kind, *of_all, log_odds - against)
+
+
+def _one_of_each(flares: Flares, parents: Indices, images: Indices) -> list[int]:
+    """Return which pairs to weigh: one for each robot, as LEDs of one body stand in step with each other.
+
+    That two robots mirror each other is one coincidence, however many LEDs they carry; that a robot's LEDs
+    mirror each other is none.
+    """
+    kept: list[int] = []
+    for k, (i, j) in enumerate(zip(parents.tolist(), images.tolist(), strict=True)):
+        if not (_of_one_robot(flares, i, j) or any(_of_one_robot(flares, i, parents[one]) for one in kept)):
+            kept.append(k)
+    return kept
+
+
+def _of_one_robot(flares: Flares, i: int, j: int) -> bool:
+    """Tell whether two flares may be LEDs of one robot: they stand within 25 cm.
+
+    How far apart they are along the line of sight is known no better than by their fluxes.
+    """
+    apart_m = flares.place_m[i] - flares.place_m[j]
+    along_m = abs(float(apart_m @ flares.axes[i, 2]))
+    across_m = math.sqrt(max(float(apart_m @ apart_m) - along_m**2, 0.0))
+    unsure_m = 2.0 * math.hypot(*flares.moved_m[i].tolist(), *flares.moved_m[j].tolist())
+    return across_m < _ONE_ROBOT_M and along_m < _ONE_ROBOT_M + unsure_m
 
 
 def _log_parameter_prior(parameter: float, sigma: float, kind: int) -> float:
