@@ -105,19 +105,22 @@ def causes_plot(by_estimator: Mapping[str, Sequence[DetectionCauses]]) -> str:
             for colour, (cause, words) in enumerate(_CAUSE_WORDS.items()):
                 _, part_m = _band(range_m, np.array([one.part_m(cause) for one in causes]))
                 if (part_m > _LEAST_SHARE * whole_m).any():
-                    axes.plot(x, part_m, "o-", color=f"C{colour}", markersize=2.5, linewidth=0.9, label=words)
+                    style = {"color": _CAUSE_COLOURS[colour], "markersize": 2.5, "linewidth": 0.9}
+                    axes.plot(x, part_m, "o-", label=words, **style)
             axes.set_yscale("log")
             axes.set_ylim(bottom=_LEAST_SHARE * float(whole_m.min()))
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _metres_tick(value)))
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _metres_tick(value).lstrip("+")))
             axes.yaxis.set_minor_formatter(NullFormatter())
             axes.set_xlabel("range, m")
             axes.set_title(short(name), fontsize=9)
-            axes.legend(fontsize=7)
         panels[0].set_ylabel("σ of the range")
+        shown_lines = {line.get_label(): line for axes in panels for line in axes.get_lines()}
+        figure.legend(shown_lines.values(), shown_lines, loc="outside right upper", fontsize=8)
         return _svg(figure)
 
 
 _LEAST_SHARE = 0.01
+_CAUSE_COLOURS = mpl.colormaps["Paired"].colors  # type: ignore[attr-defined]
 _CAUSE_WORDS = {
     "own_light_m": "shot noise of its own light", "background_m": "shot noise of the background",
     "prnu_m": "unlike pixels", "read_noise_m": "read noise", "dsnu_m": "offsets", "rounding_m": "rounding",
