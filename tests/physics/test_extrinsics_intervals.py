@@ -26,7 +26,7 @@ from nir_render.scene.documents.camera import Camera
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.flare_spread import source_beam
 from perception import RawFrame, detect, flare_limit
-from perception.extrinsics.calibrate import Extrinsics, calibrate_extrinsics
+from perception.extrinsics.calibrate import Extrinsics, FrameSet, calibrate_extrinsics
 from perception.types import Calibration
 from tests.calibration_frames import camera_of
 from tests.paths import SCENES
@@ -135,7 +135,8 @@ def _said(seed: int) -> dict[str, Calibration]:
 
 
 def _learned(seed: int) -> Extrinsics:
-    said, sets = _said(seed), []
+    said = _said(seed)
+    sets: list[FrameSet] = []
     devices: list[Camera] = [camera_of(0.0, f"{name} {seed}") for name in NAMES]
     for heading in range(HEADINGS):
         frames = []

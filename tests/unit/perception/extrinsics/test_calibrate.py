@@ -1,5 +1,6 @@
 """Poses of cameras from shared flares: drawn detections whose truth is known."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -55,10 +56,12 @@ def _sets(
     robots: int = 6,
     ranges_m: tuple[float, float] = (0.6, 6.0),
 ) -> list[FrameSet]:
-    draw, sets = random(seed, 152), []
+    draw = random(seed, 152)
+    sets: list[FrameSet] = []
+    near, far = math.log(ranges_m[0]), math.log(ranges_m[1])
     for index in range(count):
         turn = draw.uniform(0.0, 2.0 * np.pi, robots)
-        range_m = np.exp(draw.uniform(*np.log(ranges_m), robots))
+        range_m = np.exp(draw.uniform(near, far, robots))
         places = np.stack(
             [range_m * np.cos(turn), range_m * np.sin(turn), draw.uniform(0.0, 0.5, robots)], axis=1
         )
@@ -147,7 +150,8 @@ def test_one_that_rests_counts_little_more_than_once() -> None:
     true = rig(prnu=0.1, source_radius_m=0.001)
     said = _said(true, 4)
     frames, found = zip(*_sets(true, said, 4), strict=True)
-    draw, again = random(4, 153), []
+    draw = random(4, 153)
+    again: list[FrameSet] = []
     for number, one in enumerate(frames):
         again += [(one, found[number])]
         for turn in range(1, 4):
