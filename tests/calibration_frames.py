@@ -220,7 +220,8 @@ def range_constant_bound(dsnu_e: float, calibration: Calibration) -> float:
     """Least relative σ of K without glare, from every other place: place and background of each are unknown too.
 
     So is the point spread's width, but for what the whole rail tells of it, and the flat frames tell
-    of pixels what their noise allows. K holds on the axis, so errors of the response at the places are errors of it.
+    of pixels what their noise allows: of a place's pixels, response and all. K holds for the mean pixel on
+    the axis, which flat frames tell as well as unlike pixels, rows and columns allow.
     """
     camera = camera_of(0.0, "any")
     read_e2 = camera.sensor.read_noise_e**2 + 1.0 / (12.0 * camera.sensor.system_gain_dn_per_e**2)
@@ -229,7 +230,6 @@ def range_constant_bound(dsnu_e: float, calibration: Calibration) -> float:
     unknown_prnu = 1.0 / np.hypot(1.0 / camera.sensor.prnu.pixel, 1.0 / flat_noise)
     total = np.zeros((2, 2))
     total[1, 1] = point_spread_bounds(0.0, dsnu_e)["sigma_px"] ** -2
-    of_place, angle_rad = [], []
     for place in range(0, len(RANGES_M), 2):
         at = _window(place, 0.0)
         image = REPEATS * rail_e(0.0, place)[0][at]
@@ -248,18 +248,24 @@ def range_constant_bound(dsnu_e: float, calibration: Calibration) -> float:
             information[2:, 2:], information[2:, :2]
         )
         total += known
-        of_place.append(float(known[0, 0]))
-        row, column = np.unravel_index(int(rail_e(0.0, place)[0].argmax()), tuple(_SIZE.values()))
-        angle_rad.append(math.hypot(column - calibration.cx_px, row - calibration.cy_px) / calibration.fx_px)
-    share = np.array(of_place) / sum(of_place)
-    of_response = float(share @ response_bound(0.0, np.arctan(angle_rad), calibration, dsnu_e))
-    return math.hypot(math.sqrt(float(np.linalg.inv(total)[0, 0])), of_response)
+    of_axis, covariance, _ = _response_fit(0.0, np.zeros(1), calibration, dsnu_e)
+    axis2 = float(of_axis[0] @ covariance @ of_axis[0])  # R(0) is 1
+    return math.sqrt(float(np.linalg.inv(total)[0, 0]) + axis2)
 
 
 def response_bound(glare_share: float, angle_rad: Array, calibration: Calibration, dsnu_e: float) -> Array:
-    """Least σ of the response relative to the axis: a cubic spline in θ² of nine parts, and a tilt.
+    """Least σ of the response relative to the axis."""
+    wanted, covariance, at = _response_fit(glare_share, angle_rad, calibration, dsnu_e)
+    slope = wanted[:-1] - at[:, None] * wanted[-1]  # R(0) is 1
+    return np.asarray(np.sqrt(np.einsum("ik,kl,il->i", slope, covariance, slope)))
 
-    The covariance of the frame's sum is D + Z G Zᵀ: pixels by themselves, and rows and columns of one
+
+def _response_fit(
+    glare_share: float, angle_rad: Array, calibration: Calibration, dsnu_e: float
+) -> tuple[Array, Array, Array]:
+    """The splines at angles and, last, on the axis; their least covariance; the response at the angles.
+
+    A cubic spline in θ² of nine parts, and a tilt. The covariance of the frame's sum is D + Z G Zᵀ: pixels by themselves, and rows and columns of one
     response each; it is inverted by Woodbury's identity.
     """
     sensor, rows, columns = camera_of(glare_share, "any").sensor, *_SIZE.values()
@@ -291,5 +297,4 @@ def response_bound(glare_share: float, angle_rad: Array, calibration: Calibratio
         np.append((angle_rad / theta.max()) ** 2, 0.0).clip(0, 1), knots, 3
     ).toarray()
     at = np.interp(angle_rad, calibration.response_angle_rad, calibration.response_relative)
-    slope = wanted[:-1] - at[:, None] * wanted[-1]  # R(0) is 1
-    return np.asarray(np.sqrt(np.einsum("ik,kl,il->i", slope, inverse[:-2, :-2], slope)))
+    return wanted, inverse[:-2, :-2], at

@@ -117,6 +117,10 @@ def perceive(
     tracker: OwnTracker = None,
     decoder: OwnDecoder = None,
     calibration: CalibrationFile = None,
+    causes: Annotated[
+        bool,
+        typer.Option("--causes", help="Also write what each range's σ is made of: causes.NAME.jsonl."),
+    ] = False,
     time_limit_s: TimeLimit = 60.0,
     as_json: Json = False,
 ) -> None:
@@ -130,7 +134,7 @@ def perceive(
     own = OwnParts.of(tracker, decoder)
     with progress_bar("perceive") as progress:
         perceived = perceive_run(
-            folder, estimators=chosen, progress=progress, own=own, calibration=calibration
+            folder, estimators=chosen, progress=progress, own=own, calibration=calibration, causes=causes
         )
     if as_json:
         told: dict[str, Any] = {"failed": dict(perceived.failures)} if perceived.failures else {}
@@ -153,30 +157,34 @@ def evaluate(folder: FolderArgument, as_json: Json = False) -> None:
 
 
 def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
-    """Learn a camera from frames of darkness, of an even surface, at known ranges; judge it on others."""
+    """Learn cameras from frames of darkness, an even surface, known ranges, and shared flares."""
     from nir_render.command.console import note, print_error, print_json
     from nir_render.command.progress import progress_bar
-    from nir_render.command.tables import calibration_tables, print_table
+    from nir_render.command.tables import calibration_tables, extrinsics_table, print_table
     from nir_render.run.calibrate import FITTED_FILE, calibrate_run
 
     with progress_bar("calibrate") as progress:
-        cameras = calibrate_run(folder, progress)
-    holds = not any(camera.faults for camera in cameras.values())
+        told = calibrate_run(folder, progress)
+    holds = not told.faults
     if as_json:
-        records = {name: camera.record() for name, camera in cameras.items()}
-        print_json({"format": 1, "folder": str(folder), "holds": holds, "cameras": records})
+        cameras = {name: camera.record() for name, camera in told.cameras.items()}
+        rigs = {name: rig.record() for name, rig in told.rigs.items()}
+        print_json(
+            {"format": 1, "folder": str(folder), "holds": holds, "cameras": cameras, "extrinsics": rigs}
+        )
     else:
-        for name, camera in cameras.items():
+        for name, camera in told.cameras.items():
             for table in calibration_tables(name, camera):
                 print_table(table)
             for sentence in camera.kept:
                 note(f"{name}: {sentence}")
+        for rig in told.rigs.values():
+            print_table(extrinsics_table(rig))
         if holds:
             typer.echo(f"{folder / FITTED_FILE}: written")
     if not holds:
-        for name, camera in cameras.items():
-            for fault in camera.faults:
-                print_error(f"{name}: {fault}", label="check failed")
+        for fault in told.faults:
+            print_error(fault, label="check failed")
         note(f"{folder / FITTED_FILE}: not written")
         raise typer.Exit(1)
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -12,6 +13,7 @@ from nir_render.evaluate.metrics import Evaluation, Score
 from nir_render.evaluate.tracks import FEW_SETS
 from nir_render.run.calibrate import CameraCalibration
 from perception.calibration.result import IDEAL_MAE, HeldOut, RailCalibration
+from perception.extrinsics.calibrate import Extrinsics
 
 _MOST_ROWS = 24
 
@@ -120,6 +122,31 @@ def calibration_tables(name: str, camera: CameraCalibration) -> list[Table]:
     if camera.result.rail is not None:
         tables.append(_rail_table(name, camera, camera.result.rail))
     return tables
+
+
+def extrinsics_table(rig: Extrinsics) -> Table:
+    """Return a table of how cameras stand to the reference: by how much otherwise than was said."""
+    title = f"{rig.reference} fixed: {rig.flares} flares shared, reduced χ² {rig.reduced_chi2:.2f}"
+    table = Table(title=title, title_justify="left")
+    for heading in ("", "flares", "turned by, mrad (x, y, z of the body)", "shifted by, mm"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for pose in rig.poses:
+        sigma = 1e3 * np.sqrt(np.diagonal(pose.covariance))
+        turned, shifted = (
+            "  ".join(map(_plain_with_sigma, 1e3 * values, sigmas))
+            for values, sigmas in ((pose.turned_rad, sigma[:3]), (pose.shifted_m, sigma[3:]))
+        )
+        table.add_row(
+            pose.camera,
+            str(pose.flares),
+            turned if pose.has_rotation else "not told: as it was",
+            shifted if pose.has_position else "not told: as it was",
+        )
+    table.caption = (
+        f"{rig.refused} more do not agree with these.\n" if rig.refused else ""
+    ) + "How all of them stand to the body, no flare tells."
+    table.caption_justify = "left"
+    return table
 
 
 def _rail_table(name: str, camera: CameraCalibration, result: RailCalibration) -> Table:

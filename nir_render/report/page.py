@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,11 @@ from nir_render.report.pictures import (
     close_ups,
     whole_pictures,
 )
-from nir_render.report.plots import bearing_plot, pull_plot, range_error_plot
+from nir_render.report.plots import bearing_plot, causes_plot, pull_plot, range_error_plot
 from nir_render.report.time.section import Said, time_section
 from nir_render.report.verdicts import RULES, verdicts_of
 from nir_render.report.wording import counted, degrees, metres, share
+from perception.causes import DetectionCauses
 from perception.types import Calibration, FrameKey, RawFrame
 
 _WORST = 8
@@ -41,6 +43,7 @@ def report_html(
     said: Said | None = None,
     film: str = "",
     look: str = "",
+    causes: Mapping[str, Sequence[DetectionCauses]] = MappingProxyType({}),
 ) -> str:
     """Write the page.
 
@@ -66,6 +69,8 @@ def report_html(
         Name of the film beside the page, if there is one.
     look
         Name of the picture of the scene from outside beside the page, likewise.
+    causes
+        What the σ of ranges is made of, by estimator, where that was asked for.
 
     Returns
     -------
@@ -95,6 +100,9 @@ def report_html(
         film=film,
         look=look,
         plots=_plots(by_estimator),
+        causes=Drawing(causes_plot(causes), "σ of ranges by cause, against range")
+        if any(causes.values())
+        else None,
         cameras=_cameras(keys, result),
         more_cameras=counted(len(cameras) - MOST_CAMERAS, "more camera")
         if len(cameras) > MOST_CAMERAS

@@ -1,6 +1,6 @@
 """The plots of a report, as SVG: errors against true range, with the limit drawn in."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -12,6 +12,7 @@ from nir_render.evaluate.estimator_errors import EstimatorErrors, Values, limit_
 from nir_render.report.drawing import legend, rounded_up, sheet, short, svg_of, symmetric_log
 from nir_render.report.style import BAD, FAINT, LIMIT, MATPLOTLIB, look
 from nir_render.report.wording import metres
+from perception.causes import DetectionCauses
 
 _RASTER_BEYOND = 1500
 """More points than these become a bitmap within the SVG: it bounds the size of the page."""
@@ -89,6 +90,44 @@ def bearing_plot(by_estimator: Mapping[str, EstimatorErrors]) -> str:
         axes.set_xlabel("true range, m")
         legend(axes)
         return _svg(figure)
+
+
+def causes_plot(by_estimator: Mapping[str, Sequence[DetectionCauses]]) -> str:
+    """Draw the σ that ranges claim against range, and what each cause brings to it: root mean squares."""
+    shown = {name: causes for name, causes in by_estimator.items() if causes}
+    with mpl.rc_context(MATPLOTLIB):
+        figure = sheet(4.2)
+        panels = np.atleast_1d(figure.subplots(1, len(shown), sharey=True))
+        for axes, (name, causes) in zip(panels, shown.items(), strict=True):
+            range_m = np.array([one.range_m for one in causes])
+            x, whole_m = _band(range_m, np.array([one.range_sigma_m for one in causes]))
+            axes.plot(x, whole_m, color=LIMIT, linewidth=2.2, label="all")
+            for colour, (cause, words) in enumerate(_CAUSE_WORDS.items()):
+                _, part_m = _band(range_m, np.array([one.part_m(cause) for one in causes]))
+                if (part_m > _LEAST_SHARE * whole_m).any():
+                    style = {"color": _CAUSE_COLOURS[colour], "markersize": 2.5, "linewidth": 0.9}
+                    axes.plot(x, part_m, "o-", label=words, **style)
+            axes.set_yscale("log")
+            axes.set_ylim(bottom=_LEAST_SHARE * float(whole_m.min()))
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _metres_tick(value).lstrip("+")))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+            axes.set_xlabel("range, m")
+            axes.set_title(short(name), fontsize=9)
+        panels[0].set_ylabel("σ of the range")
+        shown_lines = {line.get_label(): line for axes in panels for line in axes.get_lines()}
+        figure.legend(shown_lines.values(), shown_lines, loc="outside right upper", fontsize=8)
+        return _svg(figure)
+
+
+_LEAST_SHARE = 0.01
+_CAUSE_COLOURS = mpl.colormaps["Paired"].colors  # type: ignore[attr-defined]
+_CAUSE_WORDS = {
+    "own_light_m": "shot noise of its own light", "background_m": "shot noise of the background",
+    "prnu_m": "unlike pixels", "read_noise_m": "read noise", "dsnu_m": "offsets", "rounding_m": "rounding",
+    "range_constant_m": "K, the LED's flux", "source_radius_m": "source's radius",
+    "point_spread_m": "point spread", "fog_m": "fog", "other_m": "neighbours, misfit",
+    "response_m": "filter and vignetting (beside)",
+}  # fmt: skip
 
 
 def _band(range_m: Values, limit: Values) -> tuple[Values, Values]:

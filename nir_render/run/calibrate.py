@@ -25,16 +25,22 @@ from perception import (
     Recording,
     calibrate_camera,
     calibration_document,
+    detect_frames,
     encode_ranges,
+    frame_sets,
     read_ranges,
     read_recording,
 )
+from perception.calibration.camera import as_calibrated
 from perception.calibration.result import IDEAL_MAE, HeldOut, faults
+from perception.extrinsics.calibrate import Extrinsics, FrameSet, calibrate_extrinsics
 from perception.files.offsets import encode_offsets
 from perception.files.ranges import RANGES_FILE
+from perception.rig.frame_sets import robot_of
 
 FITTED_FILE = "calibration.fitted.json"
 _OFFSETS = "calibration.fitted.{}.offsets.png"
+_NO_RAIL = ("dark", "flat", "shared")
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,12 +150,27 @@ class CameraCalibration:
         }
 
 
-def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibration]:
-    """Calibrate the cameras of a folder from frames of darkness, of an even surface, at known ranges.
+@dataclass(frozen=True, eq=False)
+class RunCalibration:
+    """What a folder's frames told: of cameras by themselves, and, by robot, of how its cameras stand."""
 
-    What a frame is of says its `kind`. Known ranges stand in `ranges.csv`; where a rendered run has none, it
-    is written from the truth. Where nothing speaks against the result, `calibration.fitted.json` is written:
-    the calibration with what was learned. Otherwise there is none, also none of an earlier call.
+    cameras: Mapping[str, CameraCalibration]
+    rigs: Mapping[str, Extrinsics]
+
+    @property
+    def faults(self) -> list[str]:
+        """What speaks against it, a sentence each that names what it is of."""
+        of = {**self.cameras, **self.rigs}
+        return [f"{name}: {fault}" for name, one in of.items() for fault in one.faults]
+
+
+def calibrate_run(folder: Path, progress: Progress) -> RunCalibration:
+    """Calibrate the cameras of a folder, each by itself, then how they stand to each other.
+
+    What a frame is of says its `kind`: darkness, an even surface, a source at a known range, sources that two
+    cameras share. Known ranges stand in `ranges.csv`; where a rendered run has none, it is written from the
+    truth. Where nothing speaks against the result, `calibration.fitted.json` is written: the calibration with
+    what was learned. Otherwise there is none, also none of an earlier call.
 
     Raises
     ------
@@ -160,9 +181,10 @@ def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibrati
     for old in (folder / FITTED_FILE, *folder.glob(_OFFSETS.format("*"))):
         old.unlink(missing_ok=True)
     try:
-        recording = _as_taken(read_recording(folder))
+        recording = read_recording(folder)
+        taken = _as_taken(recording)
         truth = _truth(recording)
-        frames = _frames(recording, truth)
+        frames = _frames(taken, truth)
         done = {}
         for camera, of_camera in frames.items():
             result = calibrate_camera(of_camera, recording.calibrations[camera], progress)
@@ -170,16 +192,47 @@ def calibrate_run(folder: Path, progress: Progress) -> dict[str, CameraCalibrati
             done[camera] = CameraCalibration(
                 recording.calibrations[camera], result, speaks, _true_constant(folder, camera, truth)
             )
+        learned = {name: camera.result.calibration for name, camera in done.items()}
+        known = {**recording.calibrations, **learned}
+        rigs = _rigs(taken, recording.calibrations, known, progress)
     except InputError:
         raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
         raise InputError(str(error)) from None
-    if not any(camera.faults for camera in done.values()):
-        learned = {name: _with_offsets(folder, camera.result.calibration) for name, camera in done.items()}
-        fitted = {**recording.calibrations, **learned}
-        run_folder.write_json(folder / FITTED_FILE, calibration_document(fitted.values()))
+    told = RunCalibration(done, rigs)
+    if not told.faults:
+        for rig in rigs.values():
+            known |= {pose.camera: rig.calibrations[pose.camera] for pose in rig.poses}
+        known |= {name: _with_offsets(folder, known[name]) for name, one in done.items() if one.result.dark}
+        run_folder.write_json(folder / FITTED_FILE, calibration_document(known.values()))
     note_seconds(folder, "calibrate", started)
-    return done
+    return told
+
+
+def _rigs(
+    taken: Recording,
+    before: Mapping[str, Calibration],
+    known: Mapping[str, Calibration],
+    progress: Progress,
+) -> dict[str, Extrinsics]:
+    """Return how the cameras of each robot stand that has frames of shared sources."""
+    shared = [record for record in taken.records if record.kind == "shared"]
+    sets: dict[str, list[FrameSet]] = {}
+    done = 0
+    for group in frame_sets(shared):
+        frames = [
+            as_calibrated(taken.frame(record), before[record.camera], known[record.camera])
+            for record in group
+        ]
+        of_robot = sets.setdefault(robot_of(group[0].camera), [])
+        of_robot.append((group, detect_frames(frames, known)))
+        progress(done := done + len(group), len(shared))
+    return {
+        robot: calibrate_extrinsics(
+            own, {name: one for name, one in known.items() if robot_of(name) == robot}
+        )
+        for robot, own in sets.items()
+    }
 
 
 def _as_taken(recording: Recording) -> Recording:
@@ -192,8 +245,7 @@ def _as_taken(recording: Recording) -> Recording:
 
 def _with_offsets(folder: Path, calibration: Calibration) -> Calibration:
     """Write the pixels' offsets beside the calibration, which then names them."""
-    if calibration.offset_dn is None:
-        return calibration
+    assert calibration.offset_dn is not None
     name = _OFFSETS.format(calibration.camera)
     run_folder.write_file(folder / name, encode_offsets(calibration.offset_dn))
     return replace(calibration, offset_file=name)
@@ -208,7 +260,7 @@ def _frames(recording: Recording, truth: list[SourceTruth]) -> dict[str, Calibra
     folder = recording.folder
     kinds = {(record.camera, record.index): record.kind for record in recording.records}
     records = {(record.camera, record.index): record for record in recording.records}
-    has_others = any(kind in ("dark", "flat") for kind in kinds.values())
+    has_others = any(kind in _NO_RAIL for kind in kinds.values())
     has_rail = any(kind == "rail" for kind in kinds.values())
     path = folder / RANGES_FILE
     if not path.is_file() and truth:
@@ -225,7 +277,7 @@ def _frames(recording: Recording, truth: list[SourceTruth]) -> dict[str, Calibra
             raise InputError(
                 f"{path}: knows the range of frame {index} of {camera!r}, which is not in frames.jsonl"
             )
-        if kinds[camera, index] in ("dark", "flat"):
+        if kinds[camera, index] in _NO_RAIL:
             raise InputError(
                 f"{path}: knows the range of frame {index} of {camera!r}, which frames.jsonl calls "
                 f"{kinds[camera, index]}; correct its `kind`, or take its line out"

@@ -31,6 +31,7 @@ from perception import (
     read_odometry,
     read_recording,
 )
+from perception.causes import DetectionCauses, detection_causes
 from perception.command_estimator import LIMIT_S, is_command
 from perception.messages.own import DecoderError
 from perception.rig.overlap import finest, overlap_warnings
@@ -122,10 +123,12 @@ def perceive_run(
     progress: Progress,
     own: OwnParts = OwnParts(),  # noqa: B008
     calibration: Path | None = None,
+    causes: bool = False,
 ) -> Perceived:
     """Run estimators over the frames of a folder; write the detections of each that reads them all.
 
-    Dark and flat frames are passed over. `calibration` is a file in place of the folder's own.
+    Dark and flat frames are passed over. `calibration` is a file in place of the folder's own. With `causes`
+    what the σ of each range is made of is written beside the detections, else there is none of it.
 
     One's own that fails on a frame is left out from there on, and the others go on. Of it nothing is written;
     detections of an earlier call stay. `own` are a tracker and a decoder of one's own, for all of them.
@@ -156,6 +159,10 @@ def perceive_run(
         listed = [detection for key in keys for detection in of_frames.get(key, [])]
         run_folder.write_lines(folder / f"detections.{name}.jsonl", map(detection_record, listed))
         follower.write(folder)
+        (folder / f"causes.{name}.jsonl").unlink(missing_ok=True)
+        if causes:
+            lines = (one.record() for one in _causes(recording, of_frames))
+            run_folder.write_lines(folder / f"causes.{name}.jsonl", lines)
         counts[name] = len(listed)
     for name, text in failures.items():
         if (folder / f"detections.{name}.jsonl").is_file():
@@ -163,6 +170,13 @@ def perceive_run(
     if counts:
         note_seconds(folder, "perceive", started)
     return Perceived(counts, failures, tuple(_overlap_warnings(recording, found)))
+
+
+def _causes(recording: Recording, found: Found) -> Iterator[DetectionCauses]:
+    for record in recording.records:
+        hits = found.get((record.camera, record.index), [])
+        known = recording.calibrations[record.camera]
+        yield from detection_causes(hits, known, record.gain, record.black_level_dn)
 
 
 def _overlap_warnings(recording: Recording, found: Mapping[str, tuple[Found, Follower]]) -> Iterator[str]:

@@ -17,6 +17,7 @@ from perception import (
     read_frame,
     read_frame_records,
 )
+from perception.files.detections import parse_causes
 from perception.types import FrameKey
 
 
@@ -53,6 +54,7 @@ def report_run(folder: Path, result: Evaluation) -> Path:
             ),
             film=run_folder.FILM if film is not None else "",
             look=run_folder.LOOK if (folder / run_folder.LOOK).is_file() else "",
+            causes=run_folder.lines_of(folder, "causes", names, parse_causes),
         )
     except RecordingError as error:
         raise InputError(str(error)) from None

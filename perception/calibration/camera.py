@@ -69,16 +69,14 @@ def calibrate_camera(
             "dark, flat or rail, and write the ranges of rail frames into ranges.csv"
         )
     dark = flat = spread = rail = None
-    known = replace(calibration, offset_dn=None, offset_file="")
+    known = calibration
     if frames.dark:
-        dark = calibrate_dark(map(frames.load, frames.dark), known)
+        plain = replace(calibration, offset_dn=None, offset_file="")
+        dark = calibrate_dark(map(frames.load, frames.dark), plain)
         known = dark.calibration
-    moved_dn = known.black_level_dn - calibration.black_level_dn
 
     def load(index: int) -> RawFrame:
-        frame = frames.load(index)
-        frame = replace(frame, black_level_dn=frame.black_level_dn + moved_dn)
-        return without_offsets(frame, known)
+        return as_calibrated(frames.load(index), calibration, known)
 
     if frames.ranges_m:
         spread = calibrate_point_spread(frames.ranges_m, load, known, progress)
@@ -93,11 +91,17 @@ def calibrate_camera(
             frame = load(index)
             return frame if flat is None else without_response(frame, known, flat.pixel_response)
 
-        of_angle = None if flat is None else flat.response_sigma
-        rail = calibrate_rail(frames.ranges_m, load_even, even, progress, of_angle)
+        axis_sigma = 0.0 if flat is None else flat.axis_sigma
+        rail = calibrate_rail(frames.ranges_m, load_even, even, progress, axis_sigma)
         rail = replace(rail, calibration=replace(rail.calibration, prnu=known.prnu))
         known = rail.calibration
     return CalibratedCamera(known, dark, flat, spread, rail)
+
+
+def as_calibrated(frame: RawFrame, before: Calibration, now: Calibration) -> RawFrame:
+    """Return a frame as taken, as a later calibration has it: its black level moved, known offsets off."""
+    moved_dn = now.black_level_dn - before.black_level_dn
+    return without_offsets(replace(frame, black_level_dn=frame.black_level_dn + moved_dn), now)
 
 
 def _glare(known: Calibration, spread: PointSpreadCalibration | None) -> Glare | None:

@@ -39,6 +39,8 @@ class FlatCalibration:
         As it was, but for the response, and PRNU, with their σ.
     angle_rad, response, response_sigma
         The response relative to the axis, and its σ at each angle, shape (n,); held beyond the corner.
+    axis_sigma
+        Relative σ of the response on the axis, over that of the mean pixel.
     prnu, prnu_sigma
         Spread of the pixels' responses, of rows and columns too, and its σ.
     pixel_response, unknown_prnu
@@ -54,6 +56,7 @@ class FlatCalibration:
     angle_rad: Array
     response: Array
     response_sigma: Array
+    axis_sigma: float
     prnu: float
     prnu_sigma: float
     pixel_response: Array
@@ -150,6 +153,7 @@ def calibrate_flat(
         angle_rad=table_rad,
         response=response,
         response_sigma=sigma,
+        axis_sigma=fit.axis_sigma,
         prnu=prnu,
         prnu_sigma=prnu_sigma,
         pixel_response=pixel_response,

@@ -70,6 +70,12 @@ class RadialFit:
         slope = (basis[:-1] - self.relative(angle_rad)[:, None] * basis[-1]) / on_axis
         return np.asarray(np.sqrt(np.maximum(((slope @ self.covariance) * slope).sum(axis=1), 0.0)))
 
+    @property
+    def axis_sigma(self) -> float:
+        """Relative σ of f on the axis: by it the mean of those pixels passes for another than that of all."""
+        basis = _basis(np.zeros(1), self.last_rad)[0]
+        return math.sqrt(float(basis @ self.covariance @ basis)) / float(basis @ self.coefficients)
+
     def pixel_response(self) -> tuple[Array, float]:
         """Return 1 + ρ + κ + ε of each pixel as far as the frame tells, and the spread of what it does not.
 

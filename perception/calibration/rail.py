@@ -19,7 +19,6 @@ from perception.calibration.range_constant import (
 from perception.calibration.result import CONVERGED_CHANGE, HeldOut, RailCalibration
 from perception.estimators import detect
 from perception.files.fields import RecordingError
-from perception.model.bearing import angle_from_axis_rad, direction_camera
 from perception.model.fisher import fixed_influence, flare_limit, range_causes
 from perception.model.flare import PixelBox
 from perception.model.ranging import effective_exposure_s
@@ -91,7 +90,7 @@ def calibrate_rail(
     load: Callable[[int], RawFrame],
     calibration: Calibration,
     progress: Progress = lambda _done, _total: None,
-    response_sigma: NDArray[np.float64] | None = None,
+    axis_sigma: float = 0.0,
 ) -> RailCalibration:
     """Fit the range constants of one camera, and judge them on ranges held out.
 
@@ -113,9 +112,10 @@ def calibrate_rail(
         Of the camera. Its range constant is only a first guess.
     progress
         Told how far each pass is.
-    response_sigma
-        σ of the calibration's `response_relative`, where it is known angle by angle: errors of it are much
-        the same for all places of a rail, and K, which holds on the axis, has them.
+    axis_sigma
+        Relative σ of the response on the axis where flat frames gave it, and what is known of each pixel is
+        divided out: what response and pixels make of a place together is then known, and K, which holds for
+        the mean pixel on the axis, has this error at all places alike.
 
     Returns
     -------
@@ -140,9 +140,7 @@ def calibrate_rail(
     to_fit = [index for place in fitted for index in place]
     to_judge = [index for place in held_out for index in place]
     converged = _iterate_fit(find, to_fit, calibration)
-    shared_share = math.hypot(
-        _pixels_share(converged.measured), _response_share(converged.measured, response_sigma)
-    )
+    shared_share = math.hypot(_pixels_share(converged.measured), axis_sigma)
     paper = _fit_paper(find(to_fit, calibration, "paper"))
     known = _with_constants(calibration, converged, shared_share, paper)
     robust = find(to_judge, known, "robust")
@@ -255,17 +253,6 @@ def _fit_range_constant(measured: _Measured, sightings: int) -> tuple[RangeConst
             f"{sightings} frames to fit, and {error}. Look at the frames: is one source in view, alone, not "
             "clipped? Is the first guess of range_constant_dn_m2_per_s within a factor of 2?"
         ) from error
-
-
-def _response_share(measured: _Measured, response_sigma: NDArray[np.float64] | None) -> float:
-    """Return the relative σ of K that comes of the response at the places relative to that on the axis."""
-    if response_sigma is None:
-        return 0.0
-    known = measured.calibration
-    places_px = np.array([(s.detection.u_px, s.detection.v_px) for s in measured.sightings if s.detection])
-    angle_rad = angle_from_axis_rad(direction_camera(places_px, known))
-    relative = response_sigma / known.response_relative
-    return float(measured.share @ np.interp(angle_rad, known.response_angle_rad, relative))
 
 
 def _pixels_share(measured: _Measured) -> float:

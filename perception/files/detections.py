@@ -1,10 +1,14 @@
-"""Detections as lines of `detections.NAME.jsonl`: the fields of `Detection`; NaN stands as null."""
+"""Detections as lines of `detections.NAME.jsonl`: the fields of `Detection`; NaN stands as null.
+
+And why their ranges are no surer, as lines of `causes.NAME.jsonl`.
+"""
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from perception.causes import CAUSES, DetectionCauses
 from perception.files.entries import MOST_INDEX, MOST_PX, MOST_TIME_S, Entry, read_record
 from perception.files.fields import Place
 from perception.types import Detection
@@ -92,3 +96,27 @@ def _null_for_nan(name: str, value: float) -> float | None:
     if math.isinf(value):
         raise ValueError(f"{name} of a detection is infinite, which JSON cannot hold; use NaN")
     return None if math.isnan(value) else value
+
+
+CAUSES_ENTRIES = (
+    Entry("camera", "text", "the camera, as in `frames.jsonl`"),
+    Entry("index", "whole", "the frame, as there", 0, MOST_INDEX),
+    Entry("detection", "whole", "number of the detection among its frame's, from 0", 0, MOST_INDEX),
+    Entry("range_m", "number", "as detected", 0.0, _MOST_M, above=True),
+    Entry("range_sigma_m", "number", "as detected", 0.0, _MOST_M),
+    *(Entry(name, "number", "its part", 0.0, _MOST_M) for name in (*CAUSES, "response_m")),
+)
+"""The fields of a line of `causes.NAME.jsonl`: what the σ of a detection's range is made of."""
+
+
+def parse_causes(record: Mapping[str, Any], file: str = "", line: int | None = None) -> DetectionCauses:
+    """Read one object of `causes.NAME.jsonl`.
+
+    Raises
+    ------
+    RecordingError
+        All that is missing, of the wrong type or out of bounds.
+    """
+    values = read_record(record, CAUSES_ENTRIES, Place(file, line))
+    causes_m = {name: values.pop(name) for name in CAUSES}
+    return DetectionCauses(causes_m=causes_m, **values)

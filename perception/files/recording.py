@@ -20,7 +20,7 @@ from perception.types import Calibration, FrameKey, RawFrame
 FRAMES_FILE = "frames.jsonl"
 CALIBRATION_FILE = "calibration.json"
 SCENE_KIND = "scene"
-FRAME_KINDS = (SCENE_KIND, "dark", "flat", "rail")
+FRAME_KINDS = (SCENE_KIND, "dark", "flat", "rail", "shared")
 
 FRAME_ENTRIES = (
     Entry("camera", "text", "name of the camera, `robot.camera`; calibration.json has the same"),
@@ -36,8 +36,8 @@ FRAME_ENTRIES = (
     Entry("file", "text", "the picture, from the recording's folder, with forward slashes; once"),
     Entry(
         "kind", "choice",
-        "what it shows: a scene, nothing (cap on), an even surface, one source at a known range; `perceive` "
-        "passes over `dark` and `flat`",
+        "what it shows: a scene, nothing (cap on), an even surface, one source at a known range, sources "
+        "that two cameras share; `perceive` passes over `dark` and `flat`",
         choices=FRAME_KINDS, default=SCENE_KIND,
     ),
 )  # fmt: skip

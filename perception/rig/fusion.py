@@ -101,10 +101,11 @@ def fused(sightings: Sightings, groups: Sequence[Group]) -> list[Joined]:
     only where nothing does. Where ranges do not agree with where the rays meet, the most precise sighting
     alone says where it seems to be.
     """
-    return [_fused(sightings, group) for group in groups]
+    alone = _alone(sightings.rays)
+    return [_fused(sightings, group, alone) for group in groups]
 
 
-def _fused(sightings: Sightings, group: Group) -> Joined:
+def _fused(sightings: Sightings, group: Group, alone: Sequence["_Place"]) -> Joined:
     rays, members = sightings.rays, group.members
     used = [k for k in members if sightings.claimed[k]] or list(members)
     best = Group(tuple(used)).best(rays.noise)
@@ -113,7 +114,7 @@ def _fused(sightings: Sightings, group: Group) -> Joined:
         by_camera.setdefault(sightings.keys[k][0], k)
     if len(by_camera) == 1 or not group.ranges_agree:
         used = [best]
-        place = _alone(rays, best)
+        place = alone[best]
         time_s = float(rays.time_s[best])
     else:
         used = list(by_camera.values())
@@ -138,11 +139,10 @@ def _fused(sightings: Sightings, group: Group) -> Joined:
         ghost="yes" if flagged else "no",
         ghost_probability=float(flagged),
     )
-    seems_m = float(rays.range_m[best])
-    at_origin_m = rays.origin_m[best] + seems_m * rays.axes[best, 2] - place.origin_m
+    at_origin_m = rays.origin_m[best] + rays.range_m[best] * rays.axes[best, 2] - place.origin_m
     return Joined(
         measurement=measurement,
-        seems_m=float(np.linalg.norm(at_origin_m)),
+        seems_m=math.hypot(*at_origin_m.tolist()),
         noise=float(rays.noise[best]),
         common=float(rays.common[best]),
         moved_m=place.moved_m,
@@ -162,23 +162,23 @@ class _Place:
     noise_m2: Array
 
 
-def _alone(rays: Rays, index: int) -> _Place:
-    range_m, common = float(rays.range_m[index]), float(rays.common[index])
-    covariance, noise = np.zeros((3, 3)), np.zeros((3, 3))
-    covariance[:2, :2] = noise[:2, :2] = rays.angular_rad2[index]
-    noise[2, 2] = rays.noise[index] ** 2
-    covariance[2, 2] = range_m**2 * (rays.noise[index] ** 2 + common**2)
-    if math.isnan(range_m):
-        covariance[2, :] = covariance[:, 2] = math.nan
-    axes = rays.axes[index]
-    return _Place(
-        origin_m=rays.origin_m[index],
-        bearing=axes[2],
-        range_m=range_m,
-        covariance=covariance,
-        moved_m=common * range_m * axes[2],
-        noise_m2=range_m**2 * axes.T @ noise @ axes,
-    )
+def _alone(rays: Rays) -> list[_Place]:
+    """Return what each sighting says by itself."""
+    covariance = np.zeros((len(rays.range_m), 3, 3))
+    covariance[:, :2, :2] = rays.angular_rad2
+    noise = covariance.copy()
+    noise[:, 2, 2] = rays.noise**2
+    covariance[:, 2, 2] = rays.range_m**2 * (rays.noise**2 + rays.common**2)
+    unknown = np.isnan(rays.range_m)
+    covariance[unknown, 2, :] = covariance[unknown, :, 2] = math.nan
+    bearing = rays.axes[:, 2]
+    moved_m = (rays.common * rays.range_m)[:, None] * bearing
+    noise_m2 = rays.range_m[:, None, None] ** 2 * (np.swapaxes(rays.axes, 1, 2) @ noise @ rays.axes)
+    ranges_m = rays.range_m.tolist()
+    return [
+        _Place(*one)
+        for one in zip(rays.origin_m, bearing, ranges_m, covariance, moved_m, noise_m2, strict=True)
+    ]
 
 
 def _together(rays: Rays, rows: NDArray[np.int64], time_s: float) -> _Place:

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.rig.fusion import Joined
+from perception.rig.mirror_flares import Flares
 from perception.rig.mirror_model import (
     CONSTANT,
+    GATE_CHI2,
     PANE,
     SURFACE,
-    Flares,
     best_seeds,
+    fit_matched,
     fit_plane,
     matched,
     seeds_of_kind,
@@ -44,16 +46,18 @@ FORMATION_SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.04)
 YES, POSSIBLE = 0.98, 0.005
 """Probabilities of a ghost from which a measurement is called one, or possibly one."""
 
-LEAST_PLANE_DISTANCE_M, MOST_PLANE_DISTANCE_M = 0.05, 20.0
+MOST_PLANE_DISTANCE_M = 20.0
 LOSS_PRIOR, LOSS_SIGMA = math.log(0.15), 1.2
 """−½ ln R of a mirror of constant reflectance is log-normal: 0.15 is R = 0.74, 0.05 and 0.5 lie in 1 σ."""
 
 INDEX_PRIOR, INDEX_SIGMA = 1.5, 0.08
 
-_GATE_CHI2 = 25.0
 _MOST_FLARES = 40
 _MOST_SEEDS, _MOST_TRIED = 4000, 12
 _CLEAR = 10.0
+_LOG_NEVER = math.log(1e-4)
+"""Odds below are of no mirror, whatever else would explain what is seen."""
+
 _LOG_YES = math.log(YES / (1.0 - YES))
 _UNCLAIMED_RAD = 1e-3
 _MOST_PAIRS_OF_PAIRS = 40_000
@@ -64,17 +68,18 @@ _HEIGHT_SIGMA_M = 0.02
 _SAME_HEIGHT = 0.8
 _LOG_RANGE_SPAN = math.log(100.0)
 _OWN_SIGMA_M = 2e-3
+_ONE_ROBOT_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A plane, its kind and covariance, whom each image shows, and ln of its odds against none."""
+    """A plane and its kind, whom each image shows, its covariance, and ln of its odds against none."""
 
     plane: Array
     kind: int
-    covariance: Array
     parents: Indices
     images: Indices
+    covariance: Array
     log_odds: float
 
 
@@ -128,7 +133,7 @@ def told_ghosts(
         robots = np.concatenate([robots, np.arange(searched, len(usable))])
         for one in found:
             _, shown, _ = matched(
-                flares, robots, np.arange(searched, len(usable)), one.plane, one.kind, _GATE_CHI2
+                flares, robots, np.arange(searched, len(usable)), one.plane, one.kind, GATE_CHI2
             )
             probability[[usable[j] for j in shown]] = YES
     lone = _lone_probability(len(usable), len(own_sources_body_m), bool(found))
@@ -236,9 +241,7 @@ def _seeds(flares: Flares, parents: Indices, images: Indices) -> list[tuple[int,
     near_m = np.linalg.norm(flares.place_m[parents] - flares.origin_m[images], axis=1)
     dim = flares.seems_m[images] > _DIM_RATIO * near_m
     parents, images = parents[dim], images[dim]
-    for kind in (SURFACE, PANE):
-        of_kind = [seeds_of_kind(flares, parents, images, kind, index) for index in _SEED_INDICES]
-        seeds.append((kind, np.concatenate(of_kind)))
+    seeds += [(kind, seeds_of_kind(flares, parents, images, kind, _SEED_INDICES)) for kind in (SURFACE, PANE)]
     return [(kind, planes) for kind, planes in seeds if len(planes)]
 
 
@@ -255,36 +258,58 @@ def _fitted(
     """Fit a plane to the pairs that it explains, and weigh it; None where it explains too few."""
     plane = start.copy()
     is_known = bool(precision[0, 0] > 0.0)
-    parents, shown, _ = matched(flares, robots, images, plane, kind, 0.0)
-    result = None
-    for _ in range(4):
-        if len(parents) < (1 if is_known else 2):
-            return None
-        chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane, kind, prior, precision)
-        before_m = float((plane[3] - flares.origin_m[shown] @ plane[:3]).min())
-        if not (np.diagonal(covariance) > 0.0).all() or not before_m > LEAST_PLANE_DISTANCE_M:
-            return None
-        result = parents, shown, chi2, log_peak, covariance
-        again, whom, _ = matched(flares, robots, images, plane, kind, _GATE_CHI2)
-        if set(zip(again, whom, strict=True)) == set(zip(parents, shown, strict=True)):
-            break
-        parents, shown = again, whom
-    else:
+    parents, shown, chi2, log_peak, covariance = fit_matched(
+        flares, robots, images, plane, kind, prior, precision
+    )
+    if not len(parents):
         return None
-    parents, shown, chi2, log_peak, covariance = result
+    of_all = parents, shown, covariance
+    robot = _one_of_each(flares, parents, shown)
+    if len(robot) < len(parents):
+        parents, shown = parents[robot], shown[robot]
+        chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane.copy(), kind, prior, precision)
+        if len(parents) < (1 if is_known else 2) or not (np.diagonal(covariance) > 0.0).all():
+            return None
     log_gain = log_peak - 0.5 * chi2 - float(log_chance[shown].sum())
     log_gain += _log_seen(flares, robots, parents, plane, kind, len(log_chance))
     log_volume = 0.5 * (np.linalg.slogdet(2.0 * math.pi * covariance)[1])
     if is_known:
         log_prior = 0.5 * (np.linalg.slogdet(precision / (2.0 * math.pi))[1])
-        return _Found(plane, kind, covariance, parents, shown, log_gain + log_volume + log_prior)
+        return _Found(plane, kind, *of_all, log_gain + log_volume + log_prior)
     log_prior = -math.log(4.0 * math.pi) - math.log(MOST_PLANE_DISTANCE_M)
     log_odds = math.log(MIRROR_PROBABILITY / len(KINDS)) + log_gain + log_volume + log_prior
     log_odds += _log_parameter_prior(plane[4], math.sqrt(covariance[3, 3]), kind)
+    if log_odds < _LOG_NEVER:
+        return _Found(plane, kind, *of_all, log_odds)
     by_symmetry = _log_symmetry(flares, parents, shown, plane, log_gain + 0.5 * chi2 - log_peak, log_prior)
     # Against there being neither a mirror nor a formation.
     against = math.log1p(math.exp(min(by_symmetry, 700.0)))
-    return _Found(plane, kind, covariance, parents, shown, log_odds - against)
+    return _Found(plane, kind, *of_all, log_odds - against)
+
+
+def _one_of_each(flares: Flares, parents: Indices, images: Indices) -> list[int]:
+    """Return which pairs to weigh: one for each robot, as LEDs of one body stand in step with each other.
+
+    That two robots mirror each other is one coincidence, however many LEDs they carry; that a robot's LEDs
+    mirror each other is none.
+    """
+    kept: list[int] = []
+    for k, (i, j) in enumerate(zip(parents.tolist(), images.tolist(), strict=True)):
+        if not (_of_one_robot(flares, i, j) or any(_of_one_robot(flares, i, parents[one]) for one in kept)):
+            kept.append(k)
+    return kept
+
+
+def _of_one_robot(flares: Flares, i: int, j: int) -> bool:
+    """Tell whether two flares may be LEDs of one robot: they stand within 25 cm.
+
+    How far apart they are along the line of sight is known no better than by their fluxes.
+    """
+    apart_m = flares.place_m[i] - flares.place_m[j]
+    along_m = abs(float(apart_m @ flares.axes[i, 2]))
+    across_m = math.sqrt(max(float(apart_m @ apart_m) - along_m**2, 0.0))
+    unsure_m = 2.0 * math.hypot(*flares.moved_m[i].tolist(), *flares.moved_m[j].tolist())
+    return across_m < _ONE_ROBOT_M and along_m < _ONE_ROBOT_M + unsure_m
 
 
 def _log_parameter_prior(parameter: float, sigma: float, kind: int) -> float:
@@ -331,11 +356,13 @@ def _log_seen(
     What share of robots a mirror shows depends on how large it is: any share is as probable beforehand.
     """
     farthest_m = float(flares.seems_m[:count].max())
-    others = np.setdiff1d(robots, parents)
-    beyond_m = plane[3] - flares.place_m[others] @ plane[:3]
-    image_m = flares.place_m[others] + 2.0 * beyond_m[:, None] * plane[:3]
-    seems_m = np.linalg.norm(image_m, axis=1) * math.exp(plane[4] if kind == CONSTANT else 1.3)
-    unseen = int(((beyond_m > 0.0) & (seems_m < farthest_m)).sum())
+    # Whoever has an image lies before the plane.
+    beyond_m = plane[3] - flares.place_m[robots] @ plane[:3]
+    image_m = flares.place_m[robots] + 2.0 * beyond_m[:, None] * plane[:3]
+    seems_m = np.sqrt((image_m**2).sum(axis=1)) * math.exp(plane[4] if kind == CONSTANT else 1.3)
+    shown = (beyond_m > 0.0) & (seems_m < farthest_m)
+    seen = set(parents.tolist())
+    unseen = sum(robot not in seen for robot in robots[shown].tolist())
     return _log_share(len(parents), unseen)
 
 

@@ -6,12 +6,12 @@ flux alone it seems as far as |p' − o| / √R.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.rig.mirror_flares import Flares
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -19,47 +19,12 @@ Indices = NDArray[np.int64]
 CONSTANT, SURFACE, PANE = 0, 1, 2
 """Kinds of reflectance: a constant, of one side of a dielectric, of both sides of a sheet of it."""
 
-NEAREST_MIRROR_M = 0.05
-SAME_PLANE = 0.02
-SEED_GATE_CHI2 = 200.0
+NEAREST_MIRROR_M, SAME_PLANE = 0.05, 0.02
+GATE_CHI2, SEED_GATE_CHI2 = 25.0, 200.0
 SEED_LOG_RANGE, SEED_RAD = 0.3, 0.1
 SEED_COSINE2 = 1.0 - 2.0 * SEED_RAD**2
-FIT_STEPS = 8
-STEP = 1e-4
-SETTLED2 = 1e-4
-
-
-class Flares(NamedTuple):
-    """Flares of known range, n of them, and behind them the observer's own sources.
-
-    Attributes
-    ----------
-    origin_m, place_m
-        Where bearings count from, and where flares are, in body axes, shape (m, 3).
-    seems_m
-        How far they seem by flux, shape (m,): mirror images are nearer.
-    axes
-        Left, up and along each bearing, as rows, shape (m, 3, 3).
-    angular_rad2
-        Covariance of the bearing, shape (m, 2, 2).
-    noise
-        Standard deviation of the logarithm of the range, by noise, shape (m,).
-    noise_m2
-        Covariance of the place by noise, shape (m, 3, 3).
-    common, moved_m
-        Standard deviation of the logarithm of the range by what all images of a source share, shape (m,), and
-        by how much that moves the place, shape (m, 3).
-    """
-
-    origin_m: Array
-    place_m: Array
-    seems_m: Array
-    axes: Array
-    angular_rad2: Array
-    noise: Array
-    noise_m2: Array
-    common: Array
-    moved_m: Array
+FIT_STEPS, HOPELESS_CHI2, MOST_MATCHES = 8, 25.0, 4
+STEP, SETTLED2 = 1e-4, 1e-4
 
 
 @compiled
@@ -122,9 +87,8 @@ def pair_covariance(
         place_m[k] -= STEP
         for m in range(3):
             slope[m, k] = (moved[m] - off[m]) / STEP
-    shared = np.empty(3)  # the parent's flux is also the image's
+    shared = np.zeros(3)  # the parent's flux is also the image's
     for m in range(3):
-        shared[m] = 0.0
         for k in range(3):
             shared[m] += slope[m, k] * flares.moved_m[parent, k]
     shared[2] += flares.common[image]
@@ -170,9 +134,7 @@ def fit_plane(
     flares, parents, images
         Whom each image shows, indices of shape (pairs,).
     plane
-        n, c and the parameter to start from; the fitted ones afterwards.
-    kind
-        Of reflectance.
+        n, c and the parameter, of a `kind` of reflectance, to start from; the fitted ones afterwards.
     prior, precision
         What is known beforehand: a plane, shape (5,), and the precision of its two angles (left and up), of
         c and of the parameter, shape (4, 4); 0 where nothing is.
@@ -231,7 +193,8 @@ def fit_plane(
             if not information[k, k] > 0.0:
                 return chi2, log_peak, np.full((4, 4), np.nan)
         invert(information)
-        if settled or step == FIT_STEPS - 1:
+        # What its own pairs contradict after three steps is not worth polishing.
+        if settled or step == FIT_STEPS - 1 or (step > 2 and chi2 > HOPELESS_CHI2 * len(parents)):
             break
         length, settled = 0.0, True
         for k in range(4):
@@ -254,13 +217,16 @@ def fit_plane(
 
 
 @compiled
-def seeds_of_kind(flares: Flares, parents: Indices, images: Indices, kind: int, parameter: float) -> Array:
-    """Return the plane of each pair for a reflectance that is known, shape (seeds, 5)."""
-    found = np.empty((len(parents), 5))
+def seeds_of_kind(
+    flares: Flares, parents: Indices, images: Indices, kind: int, parameters: tuple[float, ...]
+) -> Array:
+    """Return the plane of each pair for each reflectance of some, shape (seeds, 5)."""
+    found = np.empty((len(parents) * len(parameters), 5))
     count = 0
     normal = np.empty(3)
-    for pair in range(len(parents)):
-        i, j = parents[pair], images[pair]
+    for number in range(len(found)):
+        parameter = parameters[number // len(parents)]
+        i, j = parents[number % len(parents)], images[number % len(parents)]
         cosine, c, s, near = 0.8, 0.0, 0.0, 0.0
         for _ in range(5):
             s = math.exp(log_root_reflectance(kind, parameter, cosine))
@@ -298,8 +264,12 @@ def matched(
     -------
     Pairs of parents and images, same shape, and how well they agree in all, the less the better.
     """
-    misfit = np.full((len(parents), len(images)), np.inf)
-    off, covariance = np.empty(3), np.empty((3, 3))
+    most = min(len(parents), len(images))
+    who, whom = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
+    # Those that lie within the gate are few: each with its row and column, and how badly it agrees.
+    found, misfit = 0, np.empty(len(parents) * len(images))
+    rows, columns = np.empty(len(misfit), dtype=np.int64), np.empty(len(misfit), dtype=np.int64)
+    off, covariance, shown_m = np.empty(3), np.empty((3, 3)), np.empty(3)
     for row in range(len(parents)):
         i = parents[row]
         before_m = plane[3]
@@ -307,51 +277,86 @@ def matched(
             before_m -= plane[k] * flares.place_m[i, k]
         if before_m <= 0.0:
             continue
+        for k in range(3):
+            shown_m[k] = flares.place_m[i, k] + 2.0 * before_m * plane[k]
         for column in range(len(images)):
             j = images[column]
-            if i == j:
-                continue
             # Most images are far from where they would have to be: that is seen without a root or an angle.
             along, length2 = 0.0, 0.0
             for k in range(3):
-                out_m = flares.place_m[i, k] + 2.0 * before_m * plane[k] - flares.origin_m[j, k]
+                out_m = shown_m[k] - flares.origin_m[j, k]
                 along += flares.axes[j, 2, k] * out_m
                 length2 += out_m**2
-            if along <= 0.0 or along**2 < SEED_COSINE2 * length2:
+            if i == j or along <= 0.0 or along**2 < SEED_COSINE2 * length2:
                 continue
             residual(flares, j, plane, kind, flares.place_m[i], off)
             if abs(off[0]) > SEED_RAD or abs(off[1]) > SEED_RAD or abs(off[2]) > SEED_LOG_RANGE:
                 continue
             if gate_chi2 == 0.0:
-                misfit[row, column] = (off[0] ** 2 + off[1] ** 2) / SEED_RAD**2 + (
-                    off[2] / SEED_LOG_RANGE
-                ) ** 2
-                continue
-            pair_covariance(flares, i, j, plane, kind, off, covariance)
-            invert(covariance)
-            chi2 = 0.0
-            for a in range(3):
-                for b in range(3):
-                    chi2 += off[a] * covariance[a, b] * off[b]
-            if chi2 < gate_chi2:
-                misfit[row, column] = chi2
+                chi2 = (off[0] ** 2 + off[1] ** 2) / SEED_RAD**2 + (off[2] / SEED_LOG_RANGE) ** 2
+            else:
+                pair_covariance(flares, i, j, plane, kind, off, covariance)
+                invert(covariance)
+                chi2 = 0.0
+                for a in range(3):
+                    for b in range(3):
+                        chi2 += off[a] * covariance[a, b] * off[b]
+            if gate_chi2 == 0.0 or chi2 < gate_chi2:
+                misfit[found], rows[found], columns[found] = chi2, row, column
+                found += 1
     count, total = 0, 0.0
-    most = min(len(parents), len(images))
-    who, whom = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
     while count < most:
-        best, at = np.inf, (0, 0)
-        for row in range(len(parents)):
-            for column in range(len(images)):
-                if misfit[row, column] < best:
-                    best, at = misfit[row, column], (row, column)
-        if not best < np.inf:
+        best, at = np.inf, -1
+        for one in range(found):
+            if misfit[one] < best:
+                best, at = misfit[one], one
+        if at < 0:
             break
-        who[count], whom[count] = parents[at[0]], images[at[1]]
-        misfit[at[0], :] = np.inf
-        misfit[:, at[1]] = np.inf
+        who[count], whom[count] = parents[rows[at]], images[columns[at]]
+        row, column = rows[at], columns[at]
+        for one in range(found):
+            if rows[one] == row or columns[one] == column:
+                misfit[one] = np.inf
         total += best
         count += 1
     return who[:count], whom[:count], total
+
+
+@compiled
+def fit_matched(
+    flares: Flares, robots: Indices, images: Indices, plane: Array, kind: int, prior: Array, precision: Array
+) -> tuple[Indices, Indices, float, float, Array]:
+    """Fit a plane in place to the pairs that it explains, at first by the coarse gate, until they settle.
+
+    Returns the pairs, none if fewer than two (one of a known plane) or none make a plane; and as `fit_plane`.
+    """
+    least = 1 if precision[0, 0] > 0.0 else 2
+    parents, shown, _ = matched(flares, robots, images, plane, kind, 0.0)
+    none = parents[:0]
+    chi2, log_peak, covariance = 0.0, 0.0, np.empty((4, 4))
+    for _ in range(MOST_MATCHES):
+        if len(parents) < least:
+            break
+        chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane, kind, prior, precision)
+        holds = np.diag(covariance).min() > 0.0
+        for j in shown:
+            before_m = plane[3]
+            for k in range(3):
+                before_m -= plane[k] * flares.origin_m[j, k]
+            holds &= before_m > NEAREST_MIRROR_M
+        if not holds:
+            break
+        again, whom, _ = matched(flares, robots, images, plane, kind, GATE_CHI2)
+        same = len(again) == len(parents)
+        for one in range(len(again)):
+            known = False
+            for other in range(len(parents)):
+                known |= again[one] == parents[other] and whom[one] == shown[other]
+            same &= known
+        if same:
+            return parents, shown, chi2, log_peak, covariance
+        parents, shown = again, whom
+    return none, none, chi2, log_peak, covariance
 
 
 @compiled
@@ -363,10 +368,12 @@ def best_seeds(
     A seed has the noise of one or two pairs, and that of a dielectric a guessed index, so gates are wide.
     """
     count, misfit = np.empty(len(seeds), dtype=np.int64), np.empty(len(seeds))
+    mark = np.empty(len(seeds), dtype=np.int64)
     for seed in range(len(seeds)):
         gate_chi2 = SEED_GATE_CHI2 if kind == CONSTANT else 0.0
-        who, _, misfit[seed] = matched(flares, parents, images, seeds[seed], kind, gate_chi2)
+        who, whom, misfit[seed] = matched(flares, parents, images, seeds[seed], kind, gate_chi2)
         count[seed] = len(who)
+        mark[seed] = ((who + 1) * (whom + 31) ** 4).sum()  # of which pairs, in whatever order
     taken = np.zeros(len(seeds), dtype=np.bool_)
     chosen = np.empty(min(most, len(seeds)), dtype=np.int64)
     ranks = 0
@@ -383,10 +390,11 @@ def best_seeds(
             break
         chosen[ranks] = best
         ranks += 1
-        # Planes close by would be the same one again.
+        # Planes close by would be the same one again, and those of the same pairs are fitted to it.
         for seed in range(len(seeds)):
             apart = abs(seeds[seed, 3] - seeds[best, 3])
             for k in range(3):
                 apart += abs(seeds[seed, k] - seeds[best, k])
-            taken[seed] |= apart < SAME_PLANE
+            same_pairs = count[seed] == count[best] and mark[seed] == mark[best]
+            taken[seed] |= apart < SAME_PLANE or same_pairs
     return seeds[chosen[:ranks]], count[chosen[:ranks]]

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.rig.mirror_model import NEAREST_MIRROR_M, Flares
+from perception.rig.mirror_flares import Flares
+from perception.rig.mirror_model import NEAREST_MIRROR_M
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -28,6 +29,12 @@ def seeds_of_constant(flares: Flares, parents: Indices, images: Indices, stride:
     count = 0
     one, other, bend = np.empty(3), np.empty(3), np.empty((3, 3))
     total = len(parents)
+    seems_m, apart_m = np.empty((total, 3)), np.empty((total, 3))
+    for a in range(total):
+        i, j = parents[a], images[a]
+        for x in range(3):
+            seems_m[a, x] = flares.seems_m[j] * flares.axes[j, 2, x]
+            apart_m[a, x] = flares.origin_m[j, x] - flares.place_m[i, x]
     for number in range(0, total * (total - 1) // 2, stride):
         # The numbered pair of pairs, a < b.
         b = int((1.0 + math.sqrt(1.0 + 8.0 * number)) / 2.0)
@@ -39,12 +46,8 @@ def seeds_of_constant(flares: Flares, parents: Indices, images: Indices, stride:
             continue
         for x in range(3):
             y, z = (x + 1) % 3, (x + 2) % 3
-            a_y, a_z = flares.seems_m[j] * flares.axes[j, 2, y], flares.seems_m[j] * flares.axes[j, 2, z]
-            b_y = flares.origin_m[j, y] - flares.place_m[i, y]
-            b_z = flares.origin_m[j, z] - flares.place_m[i, z]
-            c_y, c_z = flares.seems_m[m] * flares.axes[m, 2, y], flares.seems_m[m] * flares.axes[m, 2, z]
-            d_y = flares.origin_m[m, y] - flares.place_m[k, y]
-            d_z = flares.origin_m[m, z] - flares.place_m[k, z]
+            a_y, a_z, b_y, b_z = seems_m[a, y], seems_m[a, z], apart_m[a, y], apart_m[a, z]
+            c_y, c_z, d_y, d_z = seems_m[b, y], seems_m[b, z], apart_m[b, y], apart_m[b, z]
             bend[2, x] = a_y * c_z - a_z * c_y
             bend[1, x] = a_y * d_z - a_z * d_y + b_y * c_z - b_z * c_y
             bend[0, x] = b_y * d_z - b_z * d_y

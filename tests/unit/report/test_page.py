@@ -11,6 +11,7 @@ import pytest
 from nir_render.evaluate.metrics import evaluate
 from nir_render.report.page import report_html
 from nir_render.truth.sources import SourceTruth
+from perception.causes import CAUSES, DetectionCauses
 from perception.types import Detection, FrameKey
 from tests.unit.report.cases import Page, calibration, detection, frame, truth
 
@@ -22,11 +23,13 @@ def _page(
     rows: Sequence[SourceTruth],
     detections: dict[str, list[Detection]],
     manifest: dict[str, Any] | None = None,
+    causes: Sequence[DetectionCauses] = (),
 ) -> tuple[Page, str]:
     cameras = {camera: calibration(camera) for camera, _ in keys}
     html = report_html(
         keys=keys, result=evaluate(keys, rows, cameras, detections), load=lambda key: frame(*key),
         calibrations=cameras, manifest=manifest or {}, folder_name="folder", files=["truth.jsonl", "a b<.json"],
+        causes={"robust": causes},
     )  # fmt: skip
     return Page(html), html
 
@@ -71,6 +74,15 @@ def test_the_page_carries_all_it_shows_and_loads_nothing() -> None:
     assert "script" not in page.tags
     assert "http" not in re.sub(r'"data:[^"]*"', "", html)
     assert "url(" not in html
+
+
+def test_causes_are_drawn_where_they_were_asked_for() -> None:
+    parts = dict.fromkeys(CAUSES, 0.0) | {"own_light_m": 0.03, "read_noise_m": 0.04}
+    of_one = [DetectionCauses("r1.front", 0, k, 2.0 + k, 0.05, parts, 0.0) for k in range(3)]
+    for causes, plots in (([], 3), (of_one, 4)):
+        page, _ = _page(ONE, [truth()], {"robust": [detection()]}, causes=causes)
+        assert ("What the σ of a range is made of" in page.text) == bool(causes)
+        assert sum(address.startswith("data:") for address in page.addresses) == 2 + plots
 
 
 def test_whatever_comes_from_the_user_is_text() -> None:

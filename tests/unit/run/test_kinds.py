@@ -137,7 +137,7 @@ def test_what_does_not_fit_together_is_named(recording: Path, ranges: str, said:
 def test_dark_frames_alone_are_enough_and_the_rest_stays(recording: Path) -> None:
     for index in (3, 4):
         _relabel(recording, index, "scene")
-    done = calibrate_run(recording, lambda *_: None)["r1.front"]
+    done = calibrate_run(recording, lambda *_: None).cameras["r1.front"]
     assert [sentence.split(":")[1].split("(")[0] for sentence in done.kept] == [
         " no frame is of kind flat ",
         " no frame is of kind rail ",
@@ -147,5 +147,5 @@ def test_dark_frames_alone_are_enough_and_the_rest_stays(recording: Path) -> Non
     assert fitted["range_constant_dn_m2_per_s"]["value"] == CAMERA.range_constant_dn_m2_per_s
     assert (recording / fitted["offset_file"]).is_file()
     _relabel(recording, 0, "darkness")
-    with pytest.raises(InputError, match="Known are scene, dark, flat, rail"):
+    with pytest.raises(InputError, match="Known are scene, dark, flat, rail, shared"):
         calibrate_run(recording, lambda *_: None)

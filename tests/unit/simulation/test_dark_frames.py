@@ -19,10 +19,10 @@ SCENE = SCENES / "calibration.yaml"
 
 
 def test_frames_are_counted_off_in_order() -> None:
-    plan = CalibrationFrames(dark=2, flat=1, rail=3)
-    assert [plan.kind_of(index) for index in range(8)] == ["dark"] * 2 + ["flat"] + ["rail"] * 3 + [
-        "scene"
-    ] * 2
+    plan = CalibrationFrames(dark=2, flat=1, rail=3, shared=1)
+    counted = ["dark"] * 2 + ["flat"] + ["rail"] * 3 + ["shared"] + ["scene"] * 2
+    assert [plan.kind_of(index) for index in range(9)] == counted
+    assert plan.count == 7
     assert CalibrationFrames().kind_of(0) == "scene"
     with pytest.raises(InputError, match="320 frames for it are more than the 100 that are taken"):
         nr.load_scene(SCENE, {"clock.frames": 100, "clock.calibration.rail": 288})

@@ -20,10 +20,11 @@ JITTER_SIGMAS = 3.0
 
 
 class CalibrationFrames(Document):
-    """How many of the first frames are for calibration: `dark`, then `flat`, then `rail`.
+    """How many of the first frames are for calibration: `dark`, then `flat`, then `rail`, then `shared`.
 
-    Dark ones are taken with the cap on: no light comes in, and automatic exposure waits. What flat and rail
-    frames show is the scene's business: an even surface that fills the field, one source at known ranges.
+    Dark ones are taken with the cap on: no light comes in, and automatic exposure waits. What the others
+    show is the scene's business: an even surface that fills the field, one source at known ranges, sources
+    that two cameras share.
     """
 
     example: ClassVar[str] = "{dark: 16, flat: 16, rail: 320}"
@@ -31,10 +32,17 @@ class CalibrationFrames(Document):
     dark: Annotated[int, Field(ge=0)] = 0
     flat: Annotated[int, Field(ge=0)] = 0
     rail: Annotated[int, Field(ge=0)] = 0
+    shared: Annotated[int, Field(ge=0, exclude_if=lambda count: count == 0)] = 0
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.dark + self.flat + self.rail + self.shared
 
     def kind_of(self, index: int) -> str:
         """Return the kind of a frame, as `frames.jsonl` has it."""
-        for kind, count in (("dark", self.dark), ("flat", self.flat), ("rail", self.rail)):
+        for kind in ("dark", "flat", "rail", "shared"):
+            count = getattr(self, kind)
             if index < count:
                 return kind
             index -= count
@@ -54,8 +62,7 @@ class Clock(Document):
 
     @model_validator(mode="after")
     def _frames_for_calibration(self) -> Self:
-        first = self.calibration
-        if (count := first.dark + first.flat + first.rail) > self.frames:
+        if (count := self.calibration.count) > self.frames:
             raise ValueError(
                 f"calibration: {count} frames for it are more than the {self.frames} that are taken; raise "
                 "frames, or take fewer of them"

@@ -211,6 +211,56 @@ def test_a_formation_is_no_mirror(spread_m: float) -> None:
     assert robots.count("yes") <= 0.01 * len(robots)
 
 
+def _in_column(rng: np.random.Generator) -> list[Shown]:
+    """Five robots behind each other, 80 cm apart to 1 cm, each with two LEDs 12 cm apart across the column."""
+    turn, off = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-1.0, 1.0, 2)
+    ahead, left = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    robots = [off + 0.8 * i * ahead for i in range(5)]
+    robots = [place + 0.01 * rng.normal(size=2) for place in robots if np.linalg.norm(place) > 0.45]
+    lights = [place + side * 0.06 * left for place in robots for side in (1.0, -1.0)]
+    return [(np.array([*place, OWN_M[2]]), 1.0, False) for place in lights]
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.05])
+def test_several_leds_in_column_are_no_mirror(spread: float) -> None:
+    """LEDs of one body stand in step: two robots that mirror another two are two coincidences, not four."""
+    rng = random(1517, int(100 * spread))
+    robots: list[str] = []
+    for _ in range(60):
+        shown = _in_column(rng)
+        told = _measure(shown, rng, own_source=True, common=spread, errors=rng.normal(size=len(shown)))
+        robots += [one.ghost for one in told.measurements]
+    assert len(robots) > 500
+    assert robots.count("yes") == 0
+
+
+@pytest.mark.verify
+def test_several_leds_in_column_are_called_images_less_than_once_in_a_thousand() -> None:
+    """No case in more than 3 000: the 95 % upper bound is 0.1 %."""
+    rng = random(1518)
+    _, robots = _calls((_in_column(rng) for _ in range(340)), rng, own_source=True)
+    assert len(robots) >= 3000
+    assert robots.count("yes") == 0
+
+
+def test_images_of_robots_with_several_leds_are_told() -> None:
+    rng = random(1519)
+
+    def scenes() -> Iterator[list[Shown]]:
+        for _ in range(30):
+            wall = _wall(rng)
+            lights = []
+            for place in _room(rng, 3, wall):
+                turn = rng.uniform(0.0, 2.0 * np.pi)
+                across = 0.06 * np.array([np.cos(turn), np.sin(turn), 0.0])
+                lights += [place + across, place - across]
+            yield [(p, 1.0, False) for p in lights] + _images([*lights, OWN_M], wall, _metal)
+
+    images, robots = _calls(scenes(), rng, own_source=True)
+    assert images.count("yes") >= 0.99 * len(images)
+    assert robots.count("yes") == 0
+
+
 def test_a_lone_pair_may_be_a_robot_and_its_image() -> None:
     """Two flares have a mirror plane, whoever they are."""
     rng = random(1517)
