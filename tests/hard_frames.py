@@ -250,11 +250,13 @@ def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[st
     }
 
 
-def bad_pixels(stuck: int, hot: int, frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
+def bad_pixels(
+    stuck: int, hot: int, frames: int = 4, estimator: str = "robust", first: int = 0
+) -> dict[str, Any]:
     """Pixels stuck at full scale and hot ones of 500 to 30 000 e⁻, and nothing else."""
     camera = replace(POINT, bit_depth=12, saturation_dn=4095)
     alarms = 0
-    for index in range(frames):
+    for index in range(first, first + frames):
         generator = random(7, index)
         mean_e = np.full((camera.height_px, camera.width_px), BACKGROUND_E)
         places = generator.choice(mean_e.size, stuck + hot, replace=False)
@@ -262,7 +264,10 @@ def bad_pixels(stuck: int, hot: int, frames: int = 4, estimator: str = "robust")
         mean_e.flat[places[stuck:]] = 10.0 ** generator.uniform(2.7, 4.5, hot)
         frame = expose(mean_e, camera, random(8, index), EXPOSURE_S)
         alarms += len(perception.detect(frame, camera, estimator))
-    return {"frames": frames, "false_alarms_per_frame": alarms / frames, "pixels_per_frame": stuck + hot}
+    return {
+        "frames": frames, "false_alarms": alarms, "false_alarms_per_frame": alarms / frames,
+        "pixels_per_frame": stuck + hot,
+    }  # fmt: skip
 
 
 def textured(
