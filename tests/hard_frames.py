@@ -174,16 +174,16 @@ def pairs(apart_px: float, ratio: float = 1.0, frames: int = 4, estimator: str =
     }
 
 
-def lone(frames: int = 6, estimator: str = "robust") -> dict[str, Any]:
-    """Flares alone: how often one is told as two."""
-    scored = []
+def lone(frames: int = 6, estimator: str = "robust", kernel: float = 1.0) -> dict[str, Any]:
+    """Flares alone, through a point spread so many times as wide as calibrated: how often one is told as two."""
+    scored, imaging = [], replace(POINT, psf_sigma_px=kernel * POINT.psf_sigma_px)
     for index in range(frames):
         places = random(3, index).random((CELLS * CELLS, 3))
         flares = [
             Flare(u + du, v + dv, 10.0 ** (3.0 + 2.0 * share))
             for (u, v), (du, dv, share) in zip(cell_centres(), places, strict=True)
         ]
-        frame = frame_of(flares, POINT, BACKGROUND_E, 4, index)
+        frame = frame_of(flares, imaging, BACKGROUND_E, 4, index)
         scored.append(score(flares, perception.detect(frame, POINT, estimator), 1.0))
     return _counts(scored)
 
@@ -223,9 +223,13 @@ def lone_of(flux_e: float, frames: int = 4, estimator: str = "robust") -> dict[s
     }
 
 
-def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
-    """Points whose peak is so many times full scale."""
-    camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=1e-6)
+def clipped(
+    times: float, frames: int = 2, estimator: str = "robust", kernel_sigma: float = 0.0
+) -> dict[str, Any]:
+    """Points whose peak is so many times full scale; in each frame the kernel is off by what its σ says."""
+    width_px = POINT.psf_sigma_px
+    sigma = {"psf_sigma_px": kernel_sigma * width_px} if kernel_sigma else {}
+    camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=1e-6, sigma=sigma)
     full_e = (4095 - camera.black_level_dn) / camera.system_gain_dn_per_e
     flux_e = times * full_e / math.erf(0.5 / (math.sqrt(2.0) * camera.psf_sigma_px)) ** 2
     scored = []
@@ -234,7 +238,9 @@ def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[st
         flares = [
             Flare(u + du, v + dv, flux_e) for (u, v), (du, dv) in zip(cell_centres(), places, strict=True)
         ]
-        frame = frame_of(flares, camera, BACKGROUND_E, 6, index, round(times))
+        off = random(20, index).normal() * kernel_sigma
+        imaging = replace(camera, psf_sigma_px=(1.0 + off) * width_px)
+        frame = frame_of(flares, imaging, BACKGROUND_E, 6, index, round(times))
         scored.append(score(flares, perception.detect(frame, camera, estimator), 1.0))
     hits = [(flare, hit) for each in scored for flare, hit in zip(each.flares, each.hits, strict=True) if hit]
     claimed = [(flare, hit) for flare, hit in hits if math.isfinite(hit.range_sigma_m)]
@@ -371,8 +377,11 @@ ROWS: dict[str, Callable[..., dict[str, Any]]] = {
     "pair 1:5 at 4 px": lambda **more: pairs(4.0, 5.0, **more),
     "pair 1:20 at 3 px": lambda **more: pairs(3.0, 20.0, **more),
     "lone": lone,
+    "lone, kernel 3 % wider": lambda **more: lone(kernel=1.03, **more),
+    "lone, kernel 3 % narrower": lambda **more: lone(kernel=0.97, **more),
     **{f"lone of {flux:g} e": lambda flux=flux, **more: lone_of(flux, **more) for flux in (1e3, 4e3, 1.6e4)},
     **{f"clipped {times} times": lambda times=times, **more: clipped(times, **more) for times in (3, 10, 20, 50)},
+    "clipped 50 times, kernel known to 3 %": lambda **more: clipped(50, kernel_sigma=0.03, **more),
     "60 stuck pixels": lambda **more: bad_pixels(60, 0, **more),
     "120 hot pixels": lambda **more: bad_pixels(0, 120, **more),
     **{f"texture of {px} px": lambda px=px, **more: textured(px, **more) for px in (4, 6, 15, 30)},
