@@ -43,6 +43,8 @@ POINT = replace(
 
 BACKGROUND_E = 2.7
 BRIGHT_E = 1.3e4
+HALOGEN_E_PER_S_LUX = 93.9
+"""Electrons a second, pixel and lux of the preset camera before walls that halogen lights."""
 
 
 @dataclass(frozen=True)
@@ -356,6 +358,41 @@ def empty(kind: str, frames: int = 4, estimator: str = "robust", first: int = 0)
     return {"frames": frames, "false_alarms": alarms, "false_alarms_per_frame": alarms / frames}
 
 
+def lit(lux: float, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
+    """Sources 1 to 10 m away in a room lit by halogen lamps alone, the worst there is for so many lux.
+
+    Their light is told by `nir-render explain` of scenes/workshop.yaml, its lamps replaced by halogens.
+    """
+    background_e = HALOGEN_E_PER_S_LUX * lux * EXPOSURE_S
+    scored = []
+    for index in range(frames):
+        places = random(21, index).random((CELLS * CELLS, 3))
+        flares = [
+            Flare(u + du, v + dv, FLUX_PER_S_AT_1_M * EXPOSURE_S / (1.0 + 9.0 * share) ** 2)
+            for (u, v), (du, dv, share) in zip(cell_centres(), places, strict=True)
+        ]
+        frame = frame_of(flares, POINT, background_e, 22, index, round(lux))
+        scored.append(score(flares, perception.detect(frame, POINT, estimator), 1.0))
+    return {**_counts(scored), "background_e": round(background_e, 1)}
+
+
+def faint(snr: float, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
+    """Points on even ground of 2.7, 30 and 300 e⁻ whose brightest pixel stands out by so many sigmas of its noise."""
+    scored = []
+    for index in range(frames):
+        background_e = (2.7, 30.0, 300.0)[index % 3]
+        noise_e2 = background_e + 21.3
+        peak_e = 0.5 * (snr**2 + math.sqrt(snr**4 + 4.0 * snr**2 * noise_e2))  # of peak / √(peak + noise²)
+        flux_e = peak_e / math.erf(0.5 / (math.sqrt(2.0) * POINT.psf_sigma_px)) ** 2
+        places = random(23, index).random((CELLS * CELLS, 2)) - 0.5
+        flares = [
+            Flare(u + du, v + dv, flux_e) for (u, v), (du, dv) in zip(cell_centres(), places, strict=True)
+        ]
+        frame = frame_of(flares, POINT, background_e, 24, index)
+        scored.append(score(flares, perception.detect(frame, POINT, estimator), 1.0))
+    return _counts(scored)
+
+
 def crowd(number: int, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
     """Many flares of 2·10³ to 2·10⁵ e⁻ anywhere in a frame of 1280 × 960, and how long each frame takes."""
     camera = replace(POINT, width_px=1280, height_px=960, cx_px=639.5, cy_px=479.5)
@@ -382,6 +419,8 @@ ROWS: dict[str, Callable[..., dict[str, Any]]] = {
     **{f"lone of {flux:g} e": lambda flux=flux, **more: lone_of(flux, **more) for flux in (1e3, 4e3, 1.6e4)},
     **{f"clipped {times} times": lambda times=times, **more: clipped(times, **more) for times in (3, 10, 20, 50)},
     "clipped 50 times, kernel known to 3 %": lambda **more: clipped(50, kernel_sigma=0.03, **more),
+    "peak of 8 sigma": lambda **more: faint(8.0, **more),
+    **{f"lit by {lux} lux": lambda lux=lux, **more: lit(lux, **more) for lux in (300, 500, 800)},
     "60 stuck pixels": lambda **more: bad_pixels(60, 0, **more),
     "120 hot pixels": lambda **more: bad_pixels(0, 120, **more),
     **{f"texture of {px} px": lambda px=px, **more: textured(px, **more) for px in (4, 6, 15, 30)},
