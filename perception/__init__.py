@@ -83,6 +83,7 @@ from perception.track.tracker import Tracker
 from perception.types import (
     Calibration,
     Detection,
+    Detections,
     Measurement,
     Message,
     MirrorPlane,
@@ -103,6 +104,7 @@ __all__ = [
     "CommandProcess",
     "DarkCalibration",
     "Detection",
+    "Detections",
     "Estimator",
     "EstimatorError",
     "FlareLimit",

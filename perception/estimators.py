@@ -18,7 +18,7 @@ from typing import Any
 from perception.own_code import error_line, kind_of, load_function
 from perception.paper import detect_paper
 from perception.robust.detect import detect_robust
-from perception.types import Calibration, Detection, RawFrame
+from perception.types import Calibration, Detection, Detections, RawFrame
 
 Estimator = Callable[[RawFrame, Calibration], Iterable[Detection]]
 """Anything that turns a frame and its calibration into detections."""
@@ -27,8 +27,12 @@ ESTIMATORS: dict[str, Estimator] = {"paper": detect_paper, "robust": detect_robu
 
 
 def detect(
-    frame: RawFrame, calibration: Calibration, estimator: str | Estimator = "robust"
-) -> list[Detection]:
+    frame: RawFrame,
+    calibration: Calibration,
+    estimator: str | Estimator = "robust",
+    *,
+    limit_s: float = math.inf,
+) -> Detections:
     """Find the flares of one frame.
 
     Parameters
@@ -39,15 +43,20 @@ def detect(
         Its camera's calibration.
     estimator
         "paper" (the paper's method to the letter), "robust", or a function of frame and calibration.
+    limit_s
+        After so much time "robust" begins with no further flare: the brightest are measured, and the result
+        says that it is `truncated`. Which ones these are then depends on the machine.
 
     Returns
     -------
-    The detections, in the order in which the estimator gives them.
+    The detections, in the order in which the estimator gives them. Where "robust" finds none, their `reason`
+    says why.
 
     Raises
     ------
     ValueError
-        If the estimator's name is not known, or frame and calibration do not belong together.
+        If the estimator's name is not known, frame and calibration do not belong together, or time is
+        limited for another estimator than "robust", or to no positive number.
 
     Examples
     --------
@@ -78,14 +87,21 @@ def detect(
                 f"unknown estimator {estimator!r}: known are {', '.join(ESTIMATORS)}, or pass a function"
             )
         estimator = ESTIMATORS[estimator]
-    return list(estimator(frame, calibration))
+    if limit_s != math.inf:
+        if estimator is not detect_robust:
+            raise ValueError("limit_s: only the estimator 'robust' knows a limit of time")
+        if not limit_s > 0.0:
+            raise ValueError(f"limit_s is {limit_s!r}: wanted a time above 0 s")
+        return detect_robust(frame, calibration, limit_s)
+    found = estimator(frame, calibration)
+    return found if isinstance(found, Detections) else Detections(found)
 
 
 def detect_frames(
     frames: Sequence[RawFrame],
     calibrations: Mapping[str, Calibration],
     estimator: str | Estimator = "robust",
-) -> list[list[Detection]]:
+) -> list[Detections]:
     """Find the flares of several frames, such as those of a robot's cameras, side by side on all cores.
 
     Parameters
@@ -112,7 +128,7 @@ def detect_frames(
             f"no calibration for {', '.join(unknown)}; there are some for {', '.join(calibrations) or 'none'}"
         )
 
-    def found(frame: RawFrame) -> list[Detection]:
+    def found(frame: RawFrame) -> Detections:
         return detect(frame, calibrations[frame.camera], estimator)
 
     if len(frames) < 2:

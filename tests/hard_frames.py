@@ -43,6 +43,8 @@ POINT = replace(
 
 BACKGROUND_E = 2.7
 BRIGHT_E = 1.3e4
+HALOGEN_E_PER_S_LUX = 93.9
+"""Electrons a second, pixel and lux of the preset camera before walls that halogen lights."""
 
 
 @dataclass(frozen=True)
@@ -174,16 +176,16 @@ def pairs(apart_px: float, ratio: float = 1.0, frames: int = 4, estimator: str =
     }
 
 
-def lone(frames: int = 6, estimator: str = "robust") -> dict[str, Any]:
-    """Flares alone: how often one is told as two."""
-    scored = []
+def lone(frames: int = 6, estimator: str = "robust", kernel: float = 1.0) -> dict[str, Any]:
+    """Flares alone, through a point spread so many times as wide as calibrated: how often one is told as two."""
+    scored, imaging = [], replace(POINT, psf_sigma_px=kernel * POINT.psf_sigma_px)
     for index in range(frames):
         places = random(3, index).random((CELLS * CELLS, 3))
         flares = [
             Flare(u + du, v + dv, 10.0 ** (3.0 + 2.0 * share))
             for (u, v), (du, dv, share) in zip(cell_centres(), places, strict=True)
         ]
-        frame = frame_of(flares, POINT, BACKGROUND_E, 4, index)
+        frame = frame_of(flares, imaging, BACKGROUND_E, 4, index)
         scored.append(score(flares, perception.detect(frame, POINT, estimator), 1.0))
     return _counts(scored)
 
@@ -223,9 +225,13 @@ def lone_of(flux_e: float, frames: int = 4, estimator: str = "robust") -> dict[s
     }
 
 
-def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
-    """Points whose peak is so many times full scale."""
-    camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=1e-6)
+def clipped(
+    times: float, frames: int = 2, estimator: str = "robust", kernel_sigma: float = 0.0
+) -> dict[str, Any]:
+    """Points whose peak is so many times full scale; in each frame the kernel is off by what its σ says."""
+    width_px = POINT.psf_sigma_px
+    sigma = {"psf_sigma_px": kernel_sigma * width_px} if kernel_sigma else {}
+    camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=1e-6, sigma=sigma)
     full_e = (4095 - camera.black_level_dn) / camera.system_gain_dn_per_e
     flux_e = times * full_e / math.erf(0.5 / (math.sqrt(2.0) * camera.psf_sigma_px)) ** 2
     scored = []
@@ -234,7 +240,9 @@ def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[st
         flares = [
             Flare(u + du, v + dv, flux_e) for (u, v), (du, dv) in zip(cell_centres(), places, strict=True)
         ]
-        frame = frame_of(flares, camera, BACKGROUND_E, 6, index, round(times))
+        off = random(20, index).normal() * kernel_sigma
+        imaging = replace(camera, psf_sigma_px=(1.0 + off) * width_px)
+        frame = frame_of(flares, imaging, BACKGROUND_E, 6, index, round(times))
         scored.append(score(flares, perception.detect(frame, camera, estimator), 1.0))
     hits = [(flare, hit) for each in scored for flare, hit in zip(each.flares, each.hits, strict=True) if hit]
     claimed = [(flare, hit) for flare, hit in hits if math.isfinite(hit.range_sigma_m)]
@@ -250,11 +258,13 @@ def clipped(times: float, frames: int = 2, estimator: str = "robust") -> dict[st
     }
 
 
-def bad_pixels(stuck: int, hot: int, frames: int = 4, estimator: str = "robust") -> dict[str, Any]:
+def bad_pixels(
+    stuck: int, hot: int, frames: int = 4, estimator: str = "robust", first: int = 0
+) -> dict[str, Any]:
     """Pixels stuck at full scale and hot ones of 500 to 30 000 e⁻, and nothing else."""
     camera = replace(POINT, bit_depth=12, saturation_dn=4095)
     alarms = 0
-    for index in range(frames):
+    for index in range(first, first + frames):
         generator = random(7, index)
         mean_e = np.full((camera.height_px, camera.width_px), BACKGROUND_E)
         places = generator.choice(mean_e.size, stuck + hot, replace=False)
@@ -262,7 +272,10 @@ def bad_pixels(stuck: int, hot: int, frames: int = 4, estimator: str = "robust")
         mean_e.flat[places[stuck:]] = 10.0 ** generator.uniform(2.7, 4.5, hot)
         frame = expose(mean_e, camera, random(8, index), EXPOSURE_S)
         alarms += len(perception.detect(frame, camera, estimator))
-    return {"frames": frames, "false_alarms_per_frame": alarms / frames, "pixels_per_frame": stuck + hot}
+    return {
+        "frames": frames, "false_alarms": alarms, "false_alarms_per_frame": alarms / frames,
+        "pixels_per_frame": stuck + hot,
+    }  # fmt: skip
 
 
 def textured(
@@ -345,6 +358,41 @@ def empty(kind: str, frames: int = 4, estimator: str = "robust", first: int = 0)
     return {"frames": frames, "false_alarms": alarms, "false_alarms_per_frame": alarms / frames}
 
 
+def lit(lux: float, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
+    """Sources 1 to 10 m away in a room lit by halogen lamps alone, the worst there is for so many lux.
+
+    Their light is told by `nir-render explain` of scenes/workshop.yaml, its lamps replaced by halogens.
+    """
+    background_e = HALOGEN_E_PER_S_LUX * lux * EXPOSURE_S
+    scored = []
+    for index in range(frames):
+        places = random(21, index).random((CELLS * CELLS, 3))
+        flares = [
+            Flare(u + du, v + dv, FLUX_PER_S_AT_1_M * EXPOSURE_S / (1.0 + 9.0 * share) ** 2)
+            for (u, v), (du, dv, share) in zip(cell_centres(), places, strict=True)
+        ]
+        frame = frame_of(flares, POINT, background_e, 22, index, round(lux))
+        scored.append(score(flares, perception.detect(frame, POINT, estimator), 1.0))
+    return {**_counts(scored), "background_e": round(background_e, 1)}
+
+
+def faint(snr: float, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
+    """Points on even ground of 2.7, 30 and 300 e⁻ whose brightest pixel stands out by so many sigmas of its noise."""
+    scored = []
+    for index in range(frames):
+        background_e = (2.7, 30.0, 300.0)[index % 3]
+        noise_e2 = background_e + 21.3
+        peak_e = 0.5 * (snr**2 + math.sqrt(snr**4 + 4.0 * snr**2 * noise_e2))  # of peak / √(peak + noise²)
+        flux_e = peak_e / math.erf(0.5 / (math.sqrt(2.0) * POINT.psf_sigma_px)) ** 2
+        places = random(23, index).random((CELLS * CELLS, 2)) - 0.5
+        flares = [
+            Flare(u + du, v + dv, flux_e) for (u, v), (du, dv) in zip(cell_centres(), places, strict=True)
+        ]
+        frame = frame_of(flares, POINT, background_e, 24, index)
+        scored.append(score(flares, perception.detect(frame, POINT, estimator), 1.0))
+    return _counts(scored)
+
+
 def crowd(number: int, frames: int = 2, estimator: str = "robust") -> dict[str, Any]:
     """Many flares of 2·10³ to 2·10⁵ e⁻ anywhere in a frame of 1280 × 960, and how long each frame takes."""
     camera = replace(POINT, width_px=1280, height_px=960, cx_px=639.5, cy_px=479.5)
@@ -366,8 +414,13 @@ ROWS: dict[str, Callable[..., dict[str, Any]]] = {
     "pair 1:5 at 4 px": lambda **more: pairs(4.0, 5.0, **more),
     "pair 1:20 at 3 px": lambda **more: pairs(3.0, 20.0, **more),
     "lone": lone,
+    "lone, kernel 3 % wider": lambda **more: lone(kernel=1.03, **more),
+    "lone, kernel 3 % narrower": lambda **more: lone(kernel=0.97, **more),
     **{f"lone of {flux:g} e": lambda flux=flux, **more: lone_of(flux, **more) for flux in (1e3, 4e3, 1.6e4)},
     **{f"clipped {times} times": lambda times=times, **more: clipped(times, **more) for times in (3, 10, 20, 50)},
+    "clipped 50 times, kernel known to 3 %": lambda **more: clipped(50, kernel_sigma=0.03, **more),
+    "peak of 8 sigma": lambda **more: faint(8.0, **more),
+    **{f"lit by {lux} lux": lambda lux=lux, **more: lit(lux, **more) for lux in (300, 500, 800)},
     "60 stuck pixels": lambda **more: bad_pixels(60, 0, **more),
     "120 hot pixels": lambda **more: bad_pixels(0, 120, **more),
     **{f"texture of {px} px": lambda px=px, **more: textured(px, **more) for px in (4, 6, 15, 30)},

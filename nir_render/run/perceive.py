@@ -1,9 +1,10 @@
 """The stage `perceive`: the frames of any folder become detections, tracks, messages, by some estimators."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from perception import (
     Calibration,
     CommandEstimator,
     Detection,
+    Detections,
     Estimator,
     EstimatorError,
     OwnSetEstimator,
@@ -48,7 +50,8 @@ Found = dict[FrameKey, list[Detection]]
 class Perceived:
     """How many detections each estimator made, and what went wrong with those that failed, by name.
 
-    `warnings` say where what was found contradicts the calibration.
+    `warnings` say where what was found contradicts the calibration, why nothing was found at all, and where
+    more was seen than was measured.
     """
 
     detections: Mapping[str, int]
@@ -148,7 +151,7 @@ def perceive_run(
                 f"{folder / run_folder.FRAMES}: names dark and flat frames only; they are for 'nir-render "
                 "calibrate', and show no source to perceive"
             )
-        found, failures = _read_all(recording, estimators, progress, own)
+        found, failures, notes = _read_all(recording, estimators, progress, own)
     except InputError:
         raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
@@ -169,7 +172,8 @@ def perceive_run(
             failures[name] = f"{text}\ndetections.{name}.jsonl is of an earlier call, and stays as it was"
     if counts:
         note_seconds(folder, "perceive", started)
-    return Perceived(counts, failures, tuple(_overlap_warnings(recording, found)))
+    said = [text for name, total in counts.items() for text in notes[name].warnings(name, total)]
+    return Perceived(counts, failures, (*_overlap_warnings(recording, found), *said))
 
 
 def _causes(recording: Recording, found: Found) -> Iterator[DetectionCauses]:
@@ -197,8 +201,8 @@ def _read_all(
     estimators: Mapping[str, RunEstimator],
     progress: Progress,
     own: OwnParts,
-) -> tuple[dict[str, tuple[Found, Follower]], dict[str, str]]:
-    """Return what each estimator found and followed that came to the end, and what went wrong with others."""
+) -> tuple[dict[str, tuple[Found, Follower]], dict[str, str], dict[str, "_Notes"]]:
+    """Return what each estimator found and followed to the end, what went wrong with others, and notes."""
     records, calibrations = recording.records, recording.calibrations
     odometry = read_odometry(recording.folder)
     found: dict[str, tuple[Found, Follower]] = {}
@@ -239,7 +243,31 @@ def _read_all(
             attempt(name, readers[name].finish)
         for name, (_, follower) in list(found.items()):
             attempt(name, follower.finish)
-    return found, failures
+    return found, failures, {name: reader.notes for name, reader in readers.items()}
+
+
+@dataclass
+class _Notes:
+    """What an estimator says of frames as a whole: why they hold nothing, and how many hold too much."""
+
+    reasons: Counter[str] = field(default_factory=Counter)
+    truncated: int = 0
+
+    def take(self, found: Detections) -> Detections:
+        """Note what is said of a frame, and return its detections."""
+        self.reasons.update([found.reason] if found.reason else [])
+        self.truncated += found.truncated
+        return found
+
+    def warnings(self, name: str, total: int) -> Iterator[str]:
+        """Yield what is to be told, of an estimator that made so many detections in all."""
+        if total == 0 and self.reasons:
+            of = sum(self.reasons.values())
+            said = "; ".join(f"{reason} ({count})" for reason, count in self.reasons.most_common(3))
+            yield f"{name} found nothing in {of} frame{'s'[: of != 1]}: {said}"
+        if self.truncated:
+            frames = "one frame" if self.truncated == 1 else f"{self.truncated} frames"
+            yield f"{name} saw more in {frames} than it measures: the brightest alone are reported"
 
 
 @dataclass(frozen=True)
@@ -248,6 +276,7 @@ class _Reader:
 
     read: Callable[[Sequence[RawFrame], Sequence[Path]], list[Detection]]
     finish: Callable[[], None] = lambda: None
+    notes: _Notes = field(default_factory=_Notes)
 
     @staticmethod
     def of(estimator: RunEstimator, calibrations: Mapping[str, Calibration], stack: ExitStack) -> "_Reader":
@@ -264,12 +293,14 @@ class _Reader:
             )
         if isinstance(estimator, OwnSetEstimator):
             return _Reader(lambda frames, _: estimator(frames, calibrations))
+        notes = _Notes()
         return _Reader(
             lambda frames, _: [
                 detection
                 for frame in frames
-                for detection in detect(frame, calibrations[frame.camera], estimator)
-            ]
+                for detection in notes.take(detect(frame, calibrations[frame.camera], estimator))
+            ],
+            notes=notes,
         )
 
 

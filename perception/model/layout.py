@@ -1,6 +1,7 @@
 """What a window of a frame is handed to compiled loops as, and where each of its unknowns stands."""
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -26,22 +27,22 @@ class Layout:
     has_width: bool
     structure: int
 
-    @property
+    @cached_property
     def per_source(self) -> int:
         """Unknowns of each source."""
         return 4 if self.has_slack else 3
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Index of w."""
         return self.sources * self.per_source
 
-    @property
+    @cached_property
     def background(self) -> int:
         """Index of B."""
         return self.width + self.has_width
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of unknowns."""
         return self.background + 1 + self.structure
@@ -50,7 +51,7 @@ class Layout:
         """Return the sources' part of unknowns, a view of shape (sources, unknowns of each)."""
         return values[: self.width].reshape(self.sources, self.per_source)
 
-    @property
+    @cached_property
     def most_step(self) -> Array:
         """How far each unknown may move in one step of a fit that trusts its slopes, shape (unknowns,)."""
         most = np.full(self.size, np.inf)
@@ -71,6 +72,9 @@ class Layout:
         return precision
 
 
+_layout = lru_cache(maxsize=256)(Layout)  # every window asks for one, and most for the same
+
+
 class Known(NamedTuple):
     """What is known of a camera; which unknowns a window has follows from it.
 
@@ -86,7 +90,7 @@ class Known(NamedTuple):
 
     def layout(self, sources: int, structure: int) -> Layout:
         """Return where the unknowns of so many sources and amplitudes stand."""
-        return Layout(sources, self.tie_spread > 0.0, self.width_spread > 0.0, structure)
+        return _layout(sources, self.tie_spread > 0.0, self.width_spread > 0.0, structure)
 
 
 class Sources(NamedTuple):

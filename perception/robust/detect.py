@@ -1,6 +1,7 @@
 """The robust detector: flares found against the noise of one frame, and measured by maximum likelihood."""
 
 import math
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -10,12 +11,13 @@ from perception.model.bearing import bearing_body
 from perception.model.fog import loosened, may_be_in_fog, ranged_in_fog, size_alone
 from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
-from perception.robust.clusters import brightest, candidates, clusters, is_extended
+from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
+from perception.robust.reason import reason_of_none
 from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.prepare import PreparedFrame, prepare
-from perception.types import Calibration, Detection, RawFrame
+from perception.types import Calibration, Detection, Detections, RawFrame
 
 CONTRAST_SIGMAS = 6.03
 """As for detection against the coarse background: Gaussian noise passes 8e-10 of the time."""
@@ -23,11 +25,12 @@ CONTRAST_SIGMAS = 6.03
 MOST_FLARES = 1000
 """The robust detector measures no more blobs of a frame than this, the brightest: it bounds the time."""
 
+_AT_ONCE = 8  # clusters between two looks at the clock
 _RING_PX = 4
 _FEWEST_RING_PIXELS = 8
 
 
-def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
+def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = math.inf) -> Detections:
     """Flares found against the local background and measured by maximum likelihood.
 
     Counts become electrons; a background on a coarse mesh is subtracted; the rest is matched to the image of
@@ -40,11 +43,14 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
         A raw frame.
     calibration
         Its camera's calibration.
+    limit_s
+        After so much time no further flares are begun with; the brightest come first.
 
     Returns
     -------
     Detections
-        From top to bottom. `area_px` and `mean_dn` are those of the pixels above the detection limit.
+        From top to bottom; `truncated` where time or the number of blobs ended the search, and with the
+        `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above the detection limit.
         `saturated`: a pixel is clipped, which counts as censored. Where that does not determine the range
         `range_sigma_m` is NaN; of a disc too large to be fitted the flux is a lower bound, too, and the range
         an upper one. Flares that overlap are fitted together (`deblend`), and their sigmas know of it; behind
@@ -59,6 +65,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     ValueError
         If frame and calibration do not belong together (`sensor.check_frame`).
     """
+    started = time.perf_counter()
     check_frame(frame, calibration)
     in_fog = may_be_in_fog(calibration)
     prepared = prepare(frame, loosened(calibration) if in_fog else calibration)
@@ -69,18 +76,38 @@ def detect_robust(frame: RawFrame, calibration: Calibration) -> list[Detection]:
     ]
     blobs = _above_surroundings(blobs, prepared)
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
-    measured = measure(clusters(brightest(flares, MOST_FLARES), prepared), prepared)
+    groups = clusters(brightest(flares, MOST_FLARES), prepared)
+    measured, late = _measured(groups, prepared, started + limit_s)
+    truncated = late or len(flares) > MOST_FLARES
     measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
     reported = [(blob, found) for blob, found in measured if found.stands_out]
     if not reported:
-        return []
+        return Detections(reason=reason_of_none(prepared, len(blobs), late=late), truncated=truncated)
     if in_fog:
         reported = list(_in_fog(reported, frame, calibration))
     bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
-    return [
-        _detection(blob, found, (x, y, z), frame, calibration)
-        for (blob, found), (x, y, z) in zip(reported, bearings, strict=True)
-    ]
+    return Detections(
+        (
+            _detection(blob, found, (x, y, z), frame, calibration)
+            for (blob, found), (x, y, z) in zip(reported, bearings, strict=True)
+        ),
+        truncated=truncated,
+    )
+
+
+def _measured(
+    found: Sequence[Cluster], prepared: PreparedFrame, until_s: float
+) -> tuple[list[tuple[Blob, MeasuredFlare]], bool]:
+    """Measure clusters, the brightest first where time is limited; tell whether it was up before all."""
+    if until_s == math.inf:
+        return measure(found, prepared), False
+    by_flux = sorted(found, key=lambda each: -max(each.members[k].flux_e for k in each.wanted))
+    measured: list[tuple[Blob, MeasuredFlare]] = []
+    for first in range(0, len(by_flux), _AT_ONCE):
+        if time.perf_counter() >= until_s:
+            return measured, True
+        measured += measure(by_flux[first : first + _AT_ONCE], prepared)
+    return measured, False
 
 
 def _in_fog(

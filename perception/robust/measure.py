@@ -64,14 +64,17 @@ class MeasuredFlare:
 
     @property
     def stands_out(self) -> bool:
-        """Whether its flux exceeds the background right beside it by 4 σ (a clipped one always does).
+        """Whether its flux exceeds the background right beside it by 4 σ.
 
+        A clipped one always does, but for one that does not look like a source and whose flux is unknown.
         What only the coarse background made look bright, such as the border of a shadow, does not. On
         texture, which need not be as normal as the fit takes it to be, it must exceed 8 σ; on edges, which
         never are, where something is left beside it, and where it does not look like a source, 10 σ.
         """
         least = 10.0 if self.misfit or self.on_edges else 8.0 if self.on_texture else 4.0
-        return self.saturated or (self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e)
+        if self.saturated:
+            return not (self.misfit and self.flux_sigma_e > self.flux_e)
+        return self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e
 
 
 def measure(
@@ -302,18 +305,17 @@ def _measurement(
         clips &= ~prepared.bad[blob.box.slices]
     saturated = bool(clips.any())
     bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
-    unknown = math.nan
     return MeasuredFlare(
         u_px=u_px,
         v_px=v_px,
-        u_sigma_px=unknown if bound_only else float(solution.u_sigma_px[index]) * widening,
-        v_sigma_px=unknown if bound_only else float(solution.v_sigma_px[index]) * widening,
+        u_sigma_px=math.nan if bound_only else float(solution.u_sigma_px[index]) * widening,
+        v_sigma_px=math.nan if bound_only else float(solution.v_sigma_px[index]) * widening,
         flux_e=flux_e,
         flux_sigma_e=flux_sigma_e,
         background_e=solution.background_e,
         range_m=range_m,
-        range_sigma_m=unknown if bound_only else range_m * log_sigma,
-        range_sigma_common_m=unknown if bound_only else range_m * float(solution.log_range_common[index]),
+        range_sigma_m=math.nan if bound_only else range_m * log_sigma,
+        range_sigma_common_m=math.nan if bound_only else range_m * float(solution.log_range_common[index]),
         saturated=saturated,
         misfit=misfit,
         on_texture=solution.window.structure_e > 0.0,
@@ -322,10 +324,9 @@ def _measurement(
 
 
 def _by_apertures(cluster: Cluster, prepared: PreparedFrame) -> list[tuple[Blob, MeasuredFlare]]:
-    members = [cluster.members[k] for k in cluster.wanted]
     return [
         (member.blob, _from_aperture(member, cluster, prepared))
-        for member in members
+        for member in (cluster.members[k] for k in cluster.wanted)
         if not (member.is_too_large and is_no_large_disc(member, prepared))
     ]
 
@@ -359,18 +360,17 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         aperture.background * gain,
     )
     u_sigma_px, v_sigma_px = _centroid_sigmas(member, aperture.flux, prepared)
-    unknown = math.nan
     return MeasuredFlare(
         u_px=member.u_px,
         v_px=member.v_px,
-        u_sigma_px=unknown if member.is_clipped else u_sigma_px,
-        v_sigma_px=unknown if member.is_clipped else v_sigma_px,
+        u_sigma_px=math.nan if member.is_clipped else u_sigma_px,
+        v_sigma_px=math.nan if member.is_clipped else v_sigma_px,
         flux_e=aperture.flux,
         flux_sigma_e=aperture.flux_sigma,
         background_e=aperture.background,
         range_m=ranged.range_m,
-        range_sigma_m=unknown if member.is_clipped else ranged.range_sigma_m,
-        range_sigma_common_m=unknown if member.is_clipped else 0.5 * ranged.range_m * camera.flux_spread,
+        range_sigma_m=math.nan if member.is_clipped else ranged.range_sigma_m,
+        range_sigma_common_m=math.nan if member.is_clipped else 0.5 * ranged.range_m * camera.flux_spread,
         saturated=member.is_clipped,
         misfit=not member.is_clipped and not member.is_beyond_fit,
     )

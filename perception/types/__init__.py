@@ -3,6 +3,7 @@
 from perception.types.inputs import Calibration, FrameKey, Odometry, RawFrame
 from perception.types.outputs import (
     Detection,
+    Detections,
     Ghost,
     Measurement,
     Message,
@@ -16,6 +17,7 @@ from perception.types.outputs import (
 __all__ = [
     "Calibration",
     "Detection",
+    "Detections",
     "FrameKey",
     "Ghost",
     "Measurement",

@@ -1,6 +1,7 @@
 """What perception says: detections, measurements of a rig, tracks, what they send."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -44,6 +45,22 @@ class Detection:
     range_sigma_common_m: float = math.nan
     range_by_size_m: float = math.nan
     range_by_size_sigma_m: float = math.nan
+
+
+class Detections(list[Detection]):
+    """The flares of one frame, and what is to be known of them as a whole.
+
+    Attributes
+    ----------
+    reason
+        Why it is empty, in words; "" where it is not, or where the estimator does not say.
+    truncated
+        Whether more was seen than was measured: time was up, or there were too many. The brightest are kept.
+    """
+
+    def __init__(self, found: Iterable[Detection] = (), *, reason: str = "", truncated: bool = False) -> None:
+        super().__init__(found)
+        self.reason, self.truncated = reason, truncated
 
 
 Ghost = Literal["no", "possible", "yes"]

@@ -37,6 +37,17 @@ def test_unknown_name() -> None:
         perception.detect(FRAME, CAMERA, "sound")
 
 
+def test_time_is_limited_for_robust_alone() -> None:
+    assert (
+        perception.detect(FRAME, CAMERA, limit_s=60.0)[0].range_m == detect_robust(FRAME, CAMERA)[0].range_m
+    )
+    with pytest.raises(ValueError, match="only the estimator 'robust'"):
+        perception.detect(FRAME, CAMERA, "paper", limit_s=1.0)
+    for limit_s in (0.0, math.nan):
+        with pytest.raises(ValueError, match="wanted a time above 0 s"):
+            perception.detect(FRAME, CAMERA, limit_s=limit_s)
+
+
 def test_inputs_are_left_as_they_were() -> None:
     before = FRAME.data_dn.copy()
     perception.detect(FRAME, CAMERA)

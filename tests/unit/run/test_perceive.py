@@ -6,6 +6,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from nir_render.errors import InputError
@@ -92,6 +93,22 @@ def test_estimators_of_sets_and_commands_run_beside_the_others(recording: Path) 
         recording / "detections.robust.jsonl"
     ).read_bytes()
     assert steps == [(2, 6), (4, 6), (6, 6)]
+
+
+def test_a_recording_without_flares_is_told_why(recording: Path) -> None:
+    """Six frames, two of them clipped all over; with one flare among them nothing is to be told."""
+    dark = encode_png16(np.full((100, 120), 64, dtype=np.uint16))
+    for file in recording.glob("*.png"):
+        file.write_bytes(
+            encode_png16(np.full((100, 120), 4095, dtype=np.uint16)) if "-2" in file.name else dark
+        )
+    chosen = chosen_estimators(["robust"])
+    (said,) = perceive_run(recording, estimators=chosen, progress=lambda *_: None).warnings
+    assert said.startswith("robust found nothing in 6 frames: all pixels read 64 counts")
+    assert "read out (4); 100 % of the pixels are clipped (at 4095 counts)" in said
+    assert said.endswith("saturation_dn (2)")
+    (recording / "r1.front-0.png").write_bytes(encode_png16(FRAME.data_dn))
+    assert perceive_run(recording, estimators=chosen, progress=lambda *_: None).warnings == ()
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,12 @@ def test_the_edge_of_a_lit_patch_is_no_chain_of_flares() -> None:
     assert sum(patches(frames=1, first=frame)["false_alarms"] for frame in told) == 0
 
 
+@pytest.mark.parametrize("frame", [3, 14])
+def test_a_clipped_lamp_without_a_flux_is_no_source(frame: int) -> None:
+    """An ellipse and a rectangle of some 25 px, clipped all over: their fits bound no flux (σ of 1e5 times it)."""
+    assert ROWS["lamps"](frames=1, first=frame)["reported"] == 0
+
+
 @pytest.mark.verify
 @pytest.mark.parametrize("row", EMPTY)
 def test_false_alarms_are_rarer_than_one_in_ten_frames(row: str) -> None:

@@ -1,12 +1,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from perception.model.fisher import flare_limit
 from perception.paper import detect_paper
+from perception.robust import detect
 from perception.robust.detect import detect_robust
 from perception.types import Calibration, Detection, RawFrame
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
@@ -198,6 +200,58 @@ def test_tiny_frames(side_px: int) -> None:
 def test_garbage_takes_bounded_time() -> None:
     data = random(63).integers(0, 4096, (160, 200)).astype(np.uint16)
     detect_robust(RawFrame(SMALL.camera, 0, 0.0, 1e-3, data, 64.0), SMALL)
+
+
+def _with(level_e: float, rectangle_e: float = 0.0) -> RawFrame:
+    mean = np.full((SMALL.height_px, SMALL.width_px), level_e)
+    mean[30:50, 30:60] += rectangle_e
+    return expose(mean, SMALL, random(70), 5e-4)
+
+
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [
+        (_with(1e6), "100 % of the pixels are clipped (at 4095 counts)"),
+        (frame_of(0), "all pixels read 0 counts"),
+        (replace(_with(2.0), black_level_dn=200.0), "less than the black level, 200"),
+        (_with(2.0), "nothing exceeds the noise"),
+        (_with(2.0, 400.0), "in 1 place, nothing looks like a source"),
+    ],
+)
+def test_a_frame_without_flares_says_why(frame: RawFrame, reason: str) -> None:
+    found = detect_robust(frame, SMALL)
+    assert found == []
+    assert reason in found.reason
+    assert not found.truncated
+
+
+def test_limited_time_measures_the_brightest_as_they_are() -> None:
+    """Of 40 flares, in clusters of one: with time enough the same to the bit, with none left not one."""
+    rows, columns = np.divmod(np.arange(40), 8)
+    sources = [
+        (14.3 + 24.0 * c, 16.4 + 32.0 * r, 4.0 + 0.1 * (8 * r + c))
+        for r, c in zip(rows, columns, strict=True)
+    ]
+    frame = take(sources, 1e-3, 71)
+    whole, ample, none = (detect_robust(frame, SMALL, limit_s) for limit_s in (math.inf, 60.0, 1e-9))
+    assert len(whole) == 40
+    assert ample == whole or [vars(hit) for hit in ample] == [vars(hit) for hit in whole]
+    assert (whole.truncated, ample.truncated, none.truncated) == (False, False, True)
+    assert (none, whole.reason) == ([], "")
+    assert "time was up" in none.reason
+
+
+def test_what_time_leaves_is_the_brightest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that stands at 0 for two looks: one batch of clusters, the nearest sources of all."""
+    sources = [
+        (14.3 + 24.0 * k, 16.4 + 32.0 * row, 4.0 + 0.3 * (8 * row + k)) for row in range(4) for k in range(8)
+    ]
+    frame, looks = take(sources[::-1], 1e-3, 72), iter([0.0, 0.0])
+    monkeypatch.setattr(detect, "time", SimpleNamespace(perf_counter=lambda: next(looks, 9.0)))
+    found = detect_robust(frame, SMALL, 1.0)
+    assert found.truncated
+    assert sorted(round(hit.u_px) for hit in found) == sorted(round(u) for u, _, _ in sources[:8])
+    assert {round(hit.v_px) for hit in found} == {16}
 
 
 def test_gain_of_the_frame() -> None:
