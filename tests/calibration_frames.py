@@ -297,4 +297,4 @@ def _response_fit(
         np.append((angle_rad / theta.max()) ** 2, 0.0).clip(0, 1), knots, 3
     ).toarray()
     at = np.interp(angle_rad, calibration.response_angle_rad, calibration.response_relative)
-    return wanted, inverse[:-2, :-2], at
+    return wanted, np.asarray(inverse[:-2, :-2], dtype=np.float64), np.asarray(at, dtype=np.float64)

@@ -160,8 +160,8 @@ class RunCalibration:
     @property
     def faults(self) -> list[str]:
         """What speaks against it, a sentence each that names what it is of."""
-        of = {**self.cameras, **self.rigs}
-        return [f"{name}: {fault}" for name, one in of.items() for fault in one.faults]
+        of_cameras = [f"{name}: {fault}" for name, one in self.cameras.items() for fault in one.faults]
+        return of_cameras + [f"{name}: {fault}" for name, one in self.rigs.items() for fault in one.faults]
 
 
 def calibrate_run(folder: Path, progress: Progress) -> RunCalibration:
