@@ -277,8 +277,8 @@ def default_depth(
     """Return the longest path where a scene does not say it: the thicker the fog, the longer.
 
     `low_m` and `high_m` are corners of the box that holds the bodies; with the robots it says how far light
-    goes in fog. That length in optical depths is how often fog turns it on the way; that of sun and sky, which
-    comes in everywhere, goes further.
+    goes in fog. That length in optical depths is how often fog turns it on the way; that of sun and sky,
+    which comes in everywhere, goes further.
     """
     if fog is None:
         return CLEAR_DEPTH
