@@ -111,8 +111,9 @@ def test_the_default_depth_leaves_out_less_than_half_a_percent(make: Loader) -> 
     del document["render"]["indirect"]["max_depth"]
     default = _measured(make(document))
     assert short.share > 0.005 + 2.0 * short.standard_error
-    assert default.max_depth > 24
-    assert default.share + 2.0 * default.standard_error < 0.005
+    assert default.max_depth > 48
+    assert default.share - 2.0 * default.standard_error < 0.005
+    assert default.share < 0.4 * short.share
 
 
 def test_shares_are_of_electrons() -> None:

@@ -49,7 +49,8 @@ _DEFAULT_SAMPLES = 16
 PILOT_SAMPLES = 16
 _PILOT_STEP = 4
 _PILOT_PIXELS = 1200
-_LEAST_FOG_DEPTH, _MOST_DEPTH, _DEPTH_PER_TURN = 12, 64, 3.0
+_MOST_DEPTH = 64
+_FOG_DEPTH, _OPEN_FOG_DEPTH = (12, 3.0), (24, 5.0)  # and for each optical depth; open under sun or sky
 _VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
 _NOTHING = 1e-28  # 1/(m² sr)²
 _MAPPED_FROM_BYTES = 2**30  # larger arrays lie in a file that the system may page out
@@ -311,14 +312,17 @@ def default_depth(
     """Return the longest path where a scene does not say it: the thicker the fog, the longer.
 
     `low_m` and `high_m` are corners of the box that holds the bodies; with the robots it says how far light
-    goes in fog. That length in optical depths is how often fog turns it on the way.
+    goes in fog. That length in optical depths is how often fog turns it on the way; that of sun and sky,
+    which comes in everywhere, goes further.
     """
     if fog is None:
         return CLEAR_DEPTH
     places_m = np.array([low_m, high_m, *(robot.pose.position_m for robot in snapshot.robots.values())])
     low_m, high_m = np.maximum(places_m.min(axis=0), fog.low_m), np.minimum(places_m.max(axis=0), fog.high_m)
     optical_depth = fog.extinction_per_m * float(np.linalg.norm(np.maximum(high_m - low_m, 0.0)))
-    return int(np.clip(_LEAST_FOG_DEPTH + _DEPTH_PER_TURN * optical_depth, _LEAST_FOG_DEPTH, _MOST_DEPTH))
+    open_air = snapshot.sun is not None or snapshot.skylight is not None
+    least, per_turn = _OPEN_FOG_DEPTH if open_air else _FOG_DEPTH
+    return int(min(least + per_turn * optical_depth, _MOST_DEPTH))
 
 
 def _sky_of(snapshot: Snapshot) -> CieSky | None:

@@ -24,8 +24,9 @@ from nir_render.transport.indirect.kernel.types import (
 )
 from nir_render.transport.world.emitters import SKY, SUN
 
-# Shares of directions that go into the halo of a light, from surfaces in fog and from fog itself.
-_FROM_SURFACE, _FROM_FOG = 0.25, 0.5
+# Shares of directions that go into the halo of a light, from surfaces in fog and from fog itself. Each turn
+# that misses the halo weighs by one over what is left: near 1 it must be for the sun, whose paths turn often.
+_FROM_SURFACE, _FROM_FOG, _FROM_FOG_TO_SUN = 0.25, 0.5, 0.15
 # So many times more often than light do paths turn in fog: what comes of it varies more than what comes from
 # surfaces.
 _TURNS = 3.0
@@ -91,7 +92,8 @@ def leave_in_fog(
     turned = number(draws.FLIGHT) < chance
 
     rough = surface & ~turned & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    share = dr.select(turned, _FROM_FOG, dr.select(rough, _FROM_SURFACE, 0.0))
+    from_fog = _share_from_fog(scene, state)
+    share = dr.select(turned, from_fog, dr.select(rough, _FROM_SURFACE, 0.0))
     in_halo = number(draws.HALO) < share
     place = dr.select(turned, scattering.place, sampled.place)
     light = number(draws.HALO_LIGHT)
@@ -102,7 +104,7 @@ def leave_in_fog(
     halo = halos.density(direction)
 
     phase = phase_function(fog, 0.5 * dr.squared_norm(direction - state.direction))
-    turned_weight = scattering.weight * phase / dr.lerp(phase, halo, _FROM_FOG)
+    turned_weight = scattering.weight * phase / dr.lerp(phase, halo, from_fog)
 
     value, density = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), in_halo & rough)
     density = dr.select(in_halo, density, sampled.density)
@@ -124,6 +126,16 @@ def leave_in_fog(
         smooth=smooth & ~turned,
         turned=turned,
     )
+
+
+def _share_from_fog(scene: DeviceScene, state: PathState) -> Float:
+    """Return the share of directions from fog that go into halos, by whether the path serves the sun."""
+    if scene.lights.sun < 0:
+        return mi.Float(_FROM_FOG)
+    if state.tier is None:
+        return mi.Float(_FROM_FOG_TO_SUN)
+    of_sun = dr.gather(mi.UInt32, scene.lights.tier, mi.UInt32(scene.lights.sun))
+    return dr.select(state.tier == of_sun, _FROM_FOG_TO_SUN, _FROM_FOG)
 
 
 class _Halos:
