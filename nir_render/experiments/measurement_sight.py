@@ -145,14 +145,16 @@ class MeasurementSight:
         pose = snapshot.camera(frame.camera).pose
         random = generator(self._seed, "measurements", frame.camera, frame.index)
         images, flares = [], []
-        for name, placed in snapshot.carried_sources.items():
-            # For all: who is out of view leaves those of the others as they are.
-            noise = random.standard_normal(3)
-            towards_m = pose.to_local(placed.pose.position_m)
-            (place_px,) = project(towards_m[None], known)
+        sources = snapshot.carried_sources
+        # For all: who is out of view leaves the noise of the others as it is.
+        noises = random.standard_normal((len(sources), 3))
+        towards_m = pose.to_local(np.array([placed.pose.position_m for placed in sources.values()]))
+        places_px, ranges_m = project(towards_m, known), np.linalg.norm(towards_m, axis=1)
+        for (name, placed), place_px, range_m, noise in zip(
+            sources.items(), places_px, ranges_m.tolist(), noises, strict=True
+        ):
             if name.startswith(f"{self._robot}.") or not _is_in_view(place_px, known):
                 continue
-            range_m = float(np.linalg.norm(towards_m))
             bound, lit_e = self._bound(frame, range_m, float(place_px[0]), float(place_px[1]))
             # A source that is brighter than its type seems so much nearer, and one that was lit for a part
             # of the exposure so much farther.
