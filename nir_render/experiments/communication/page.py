@@ -37,8 +37,8 @@ RULES = {
     "level": (
         "frames: every camera's frames are rendered, exposed and read by the whole stack, 30 a second. "
         "measurements: detections are drawn about the truth with the σ of their Cramér–Rao bound, and "
-        "where a source is dark its pixels are drawn, with read noise and no other light; from there on it is "
-        "the stack. truth: nothing is seen."
+        "where a source is dark its pixels are drawn, with read noise and no other light; from there on it "
+        "is the stack. truth: nothing is seen."
     ),
 }
 
@@ -90,8 +90,9 @@ _NONE = Command("", 0.0, 0.0, None, None, None)
 _WHY = (
     f"A packet takes {PACKET_S:g} s: 55 bits at 10 Hz. The base goes 0.1 m/s at most and gathers speed by "
     "0.2 m/s²: 0.2 m take 2.5 s, 0.6 m 6.5 s, 0.4 m 4.5 s, if a follower need only go straight. Where "
-    "sending begins at the paper's marks, an interval leaves less after its packet than the way takes: either "
-    "they do not begin with the sending, or its robots were faster than it says. Below: the best of all seeds of robots that know the truth, sending begun at the marks."
+    "sending begins at the paper's marks, an interval leaves less after its packet than the way takes: "
+    "either they do not begin with the sending, or its robots were faster than it says. Below: the best of "
+    "all seeds of robots that know the truth, sending begun at the marks."
 )
 
 
