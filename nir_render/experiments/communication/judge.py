@@ -37,8 +37,8 @@ class Command:
     reached_s
         From when on, after that, the worst pair is within 5 cm for 5 s; None where it never is.
     worst_m
-        The worst pair's |d − d₀| in the 5 s from 10 s after `read_s`; None where the next command was read
-        before their end, or the run was over.
+        The worst pair's |d − d₀| in the 5 s from 10 s after `read_s`; None where the next command may have
+        been read before their end, or the run was over.
     """
 
     command: str
@@ -125,7 +125,9 @@ def judged(
         for packet in commands
     }
     reads_s = [_read_s(packet, obeyed) for packet in commands]
-    later_s = [*(packet.start_s for packet in commands[1:]), float(times_s[-1])][: len(commands)]
+    # Nobody goes elsewhere before the next command can have been read.
+    later_s = [packet.end_s - _READ_EARLIEST_S for packet in commands[1:]]
+    later_s = [*later_s, float(times_s[-1])][: len(commands)]
     found = tuple(
         Command(
             packet.command, packet.start_s, packet.end_s, read_s,
