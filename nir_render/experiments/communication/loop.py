@@ -205,7 +205,7 @@ class Loop:
                 coded = encode(packet.word)
                 bits += int(known.sum())
                 wrong += int((decided[known] != coded[known]).sum())
-                dark, lit = _levels(signal, packet)
+                dark, lit = levels_in(signal, packet)
                 levels["dark"] += dark
                 levels["lit"] += lit
         return bits, wrong, {name: _moments(of_one) for name, of_one in levels.items()}
@@ -269,7 +269,7 @@ def _sight(scene: Scene, robot: str, plan: Communication, seed: int, sent: Seque
     return FrameSight(scene, robot, seed, plan.stack, plan.refresh_s, keep_signals=True)
 
 
-def _levels(signal: Signal, packet: SentTruth) -> tuple[list[float], list[float]]:
+def levels_in(signal: Signal, packet: SentTruth) -> tuple[list[float], list[float]]:
     """Return the levels of the samples that lie within dark bits of a packet, and within lit ones."""
     coded = encode(packet.word)
     bit_s = (packet.end_s - packet.start_s) / len(coded)

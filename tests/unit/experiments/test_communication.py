@@ -9,11 +9,15 @@ import pytest
 from nir_render import load_scene
 from nir_render.experiments import runs
 from nir_render.experiments.communication.judge import judged
-from nir_render.experiments.communication.loop import Communication, Loop
+from nir_render.experiments.communication.loop import Communication, Loop, levels_in
 from nir_render.experiments.communication.outcome import outcome_of, upper_limit
 from nir_render.experiments.communication.page import write_outcome
 from nir_render.experiments.controllers import Formation, Neighbour
+from nir_render.experiments.frame_sight import FrameSight
+from nir_render.experiments.measurement_sight import MeasurementSight
 from nir_render.experiments.outcome import ARENA
+from nir_render.experiments.world import Base, World
+from nir_render.simulation.sent import sent_packets
 from nir_render.truth.sent import SentTruth
 from perception import Message
 
@@ -134,3 +138,43 @@ def test_a_follower_reads_what_the_leader_sends_and_its_killed_run_ends_alike(
     number, mean, sigma = record["levels"]["dark"]
     assert number > 150
     assert abs(mean) < 4.0 * sigma / np.sqrt(number) + 1e-4
+
+
+@pytest.mark.verify
+@pytest.mark.mitsuba
+def test_a_blinking_source_is_as_bright_by_measurements_as_by_frames() -> None:
+    """At 1 m in the lit arena, 65 samples of a packet by either: σ of the dark ones and means.
+
+    42 dark samples know a σ to 11 %, and two such their ratio to 16 %. Walls and floor add some 10⁻⁴.
+    """
+    raw = load_scene(ARENA)
+    names = ["leader", "follower1", "follower2"]
+    scene = raw.with_(
+        {
+            "robots": {name: raw.raw["robots"][name] for name in names},
+            "observe": ["follower1"],
+            "robots.leader.rig.sources.top.drive": {"packets": {"sends": [{"at": "0.34 s", "word": 9}]}},
+        }
+    )
+    places = ([1.0, 0.0], [0.0, 0.0], [0.5, 0.9])
+    places_m = {name: np.array(place) for name, place in zip(names, places, strict=True)}
+    sights: dict[str, MeasurementSight | FrameSight] = {
+        "measurements": MeasurementSight(scene, "follower1", 1, keep_signals=True),
+        "frames": FrameSight(scene, "follower1", 1, "robust", 60.0, keep_signals=True),
+    }
+    found = {}
+    for level, sight in sights.items():
+        sight._cameras = ["follower1.front"]  # the one that the leader is in
+        world = World(scene, places_m, Base(), 1)
+        for _ in range(75):
+            seen = sight.look(world)
+            world.step({}, 1.0 / 30.0)
+        (track,) = [one.track for one in seen.tracks if one.position_body_m[0] > 0.8]
+        (signal,) = [one for one in sight.signals() if one.track == track]
+        found[level] = levels_in(signal, sent_packets(scene)[0])
+    (dark, lit), (rendered_dark, rendered_lit) = found["measurements"], found["frames"]
+    assert len(dark) == len(rendered_dark) > 35
+    assert len(lit) == len(rendered_lit) > 15
+    assert np.std(dark) / np.std(rendered_dark) == pytest.approx(1.0, abs=0.5)
+    assert np.mean(rendered_dark) == pytest.approx(np.mean(dark), abs=1e-3)
+    assert np.mean(rendered_lit) == pytest.approx(np.mean(lit), abs=0.05)
