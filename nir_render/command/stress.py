@@ -6,7 +6,7 @@ import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,6 +22,7 @@ from nir_render.command.options import (
 from nir_render.errors import InputError
 
 if TYPE_CHECKING:
+    from nir_render.scene.scene import Scene
     from nir_render.stress.campaign import Campaign
     from nir_render.stress.jobs import Job
     from nir_render.stress.sweep import Sweep
@@ -81,6 +82,7 @@ class Experiment(StrEnum):
     """The paper's experiments that there are."""
 
     FLOCKING = "flocking"
+    COMMUNICATION = "communication"
 
 
 class Law(StrEnum):
@@ -99,10 +101,10 @@ class Level(StrEnum):
 
 
 def experiment(
-    name: Annotated[Experiment, typer.Argument(metavar="NAME", help="Which: flocking.")],
+    name: Annotated[Experiment, typer.Argument(metavar="NAME", help="Which: flocking or communication.")],
     output: Output = None,
     law: Annotated[
-        Law, typer.Option("--law", help="How robots steer: robust, or as the paper says.")
+        Law, typer.Option("--law", help="Flocking: how robots steer, robust or as the paper says.")
     ] = Law.ROBUST,
     level: Annotated[
         Level,
@@ -115,7 +117,15 @@ def experiment(
         Law, typer.Option("--stack", help="With frames: the perception stack, robust or paper.")
     ] = Law.ROBUST,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="How many runs, by seeds from 0 on.")] = 20,
-    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="How long each lasts.")] = 120.0,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds", metavar="S", help="How long each lasts: flocking 120 s, communication 65 s."
+        ),
+    ] = None,
+    robots: Annotated[
+        int, typer.Option("--robots", min=3, max=7, help="Communication: how many, the leader among them.")
+    ] = 3,
     scene: Annotated[
         Path | None,
         typer.Option(
@@ -131,25 +141,59 @@ def experiment(
 ) -> None:
     """Run an experiment of the paper in closed loop: robots move by what they see."""
     from nir_render.command.console import print_json
+    from nir_render.experiments.outcome import ARENA
+
+    if seconds is not None and not (math.isfinite(seconds) and seconds >= 1.0):
+        raise InputError(f"--seconds {seconds:g}: wanted a second or more, such as 120")
+    folder = output if output is not None else Path("outputs") / name.value
+    world = read_scene(ARENA if scene is None else scene, settings, None)
+    if name is Experiment.FLOCKING:
+        said, page, record = _flocking(
+            world, law.value, level.value, stack.value, seconds, seeds, folder, workers
+        )
+    else:
+        said, page, record = _communication(
+            world, robots, level.value, stack.value, seconds, seeds, folder, workers
+        )
+    if as_json:
+        print_json({**record, "page": str(page)})
+        return
+    typer.echo(said)
+    typer.echo(f"open {page}")
+
+
+def _flocking(
+    world: "Scene", law: str, level: str, stack: str, seconds: float | None, seeds: int, folder: Path,
+    workers: int | None,
+) -> tuple[str, Path, dict[str, Any]]:  # fmt: skip
     from nir_render.command.progress import progress_bar
     from nir_render.experiments.flocking import Flocking
-    from nir_render.experiments.outcome import ARENA, outcome_of
+    from nir_render.experiments.outcome import outcome_of
     from nir_render.experiments.page import sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
 
-    if not (math.isfinite(seconds) and seconds >= 1.0):
-        raise InputError(f"--seconds {seconds:g}: wanted a second or more, such as 120")
-    plan = Flocking(law=law.value, level=level.value, stack=stack.value, lasts_s=seconds)
-    folder = output if output is not None else Path("outputs") / name.value
-    world = read_scene(ARENA if scene is None else scene, settings, None)
-    with progress_bar(name.value) as progress:
+    plan = Flocking(law=law, level=level, stack=stack, lasts_s=seconds or 120.0)
+    with progress_bar("flocking") as progress:
         outcome = outcome_of(world, plan, range(seeds), folder, workers or usual_workers(), progress)
-    page = write_outcome(outcome, folder)
-    if as_json:
-        print_json({**outcome.record(), "page": str(page)})
-        return
-    typer.echo(sentence(outcome))
-    typer.echo(f"open {page}")
+    return sentence(outcome), write_outcome(outcome, folder), outcome.record()
+
+
+def _communication(
+    world: "Scene", robots: int, level: str, stack: str, seconds: float | None, seeds: int, folder: Path,
+    workers: int | None,
+) -> tuple[str, Path, dict[str, Any]]:  # fmt: skip
+    from nir_render.command.progress import progress_bar
+    from nir_render.experiments.communication.loop import Communication
+    from nir_render.experiments.communication.outcome import outcome_of
+    from nir_render.experiments.communication.page import sentence, write_outcome
+    from nir_render.transport.backend.cores import usual_workers
+
+    if len(world.document.robots) < robots:
+        raise InputError(f"{world.path}: has {len(world.document.robots)} robots; --robots wants {robots}")
+    plan = Communication(robots=robots, level=level, stack=stack, lasts_s=seconds or 65.0)
+    with progress_bar("communication") as progress:
+        outcome = outcome_of(world, plan, range(seeds), folder, workers or usual_workers(), progress)
+    return sentence(outcome), write_outcome(outcome, folder), outcome.record()
 
 
 def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: bool) -> None:

@@ -285,13 +285,14 @@ def _bits(sent: Sequence[SentTruth], signals: Sequence[Signal], ways: _Ways) -> 
         source = (packet.robot, packet.source, None)
         for signal in signals:
             if ways.source_of(signal.track, packet.start_s, packet.end_s) == source:
-                decided, known = _decided(signal, packet)
+                decided, known = decided_bits(signal, packet)
                 bits += int(known.sum())
                 errors += int((decided[known] != coded[known]).sum())
     return bits, errors
 
 
-def _decided(signal: Signal, packet: SentTruth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def decided_bits(signal: Signal, packet: SentTruth) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return a packet's bits, each the mean of the levels within it against half, and which are known."""
     count = FRAME_BITS * REPEATS
     bit_s = (packet.end_s - packet.start_s) / count
     place = (signal.time_s - packet.start_s) / bit_s

@@ -1,4 +1,4 @@
-"""Flocking laws: from neighbours as they are seen to a velocity.
+"""Laws of flocking and formation: from neighbours as they are seen to a velocity.
 
 All of it happens in the plane, in the axes of the robot's body, which the base keeps in place. A neighbour's
 velocity is that over ground.
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.types import Track
+from perception.types import Message, Track
 
 Array = NDArray[np.float64]
 
@@ -104,6 +104,50 @@ def clipped(velocity: Array, most_m_per_s: float) -> Array:
     """Return a velocity of no more than so much speed, in the same direction."""
     speed = float(np.hypot(*velocity))
     return velocity if speed <= most_m_per_s else velocity * (most_m_per_s / speed)
+
+
+COMMANDED_M = {"disperse": 1.2, "aggregate": 0.6, "recover": _PAPERS_SPACING_M}
+"""The spacing that each command sets (the paper's Exp. 4)."""
+
+_ON_ITS_WAY_M_PER_S = 0.09  # a little below the base's 0.1 m/s: who stands a spacing from the leader keeps up
+
+
+class Formation:
+    """A controller that keeps a commanded spacing by `springs`: a command sets it, once.
+
+    The wished spacing goes from the old one to the new one at 0.09 m/s, and with it the reach of the springs,
+    1.3 times itself. A reach that stayed at 1.3 times the larger one would take in, at 0.6 m after 1.2 m, the
+    next but one at 1.04 m, and rest elsewhere.
+
+    Attributes
+    ----------
+    obeyed
+        When what was obeyed.
+    """
+
+    def __init__(self, spacing_m: float = _PAPERS_SPACING_M) -> None:
+        self.obeyed: list[tuple[float, str]] = []
+        self._old_m = self._new_m = spacing_m
+        self._since_s = -np.inf
+
+    def hear(self, messages: Sequence[Message], time_s: float) -> None:
+        """Take in what was said. What sets the spacing that is set already changes nothing."""
+        for message in messages:
+            new_m = COMMANDED_M.get(message.command)
+            if new_m is not None and new_m != self._new_m:
+                self._old_m, self._new_m, self._since_s = self.wished_m(time_s), new_m, time_s
+                self.obeyed.append((time_s, message.command))
+
+    def wished_m(self, time_s: float) -> float:
+        """Return the wished spacing, on its way from the old one to the new one."""
+        gone_m = _ON_ITS_WAY_M_PER_S * (time_s - self._since_s)
+        return self._new_m + float(np.sign(self._old_m - self._new_m)) * max(
+            abs(self._new_m - self._old_m) - gone_m, 0.0
+        )
+
+    def velocity(self, neighbours: Sequence[Neighbour], time_s: float, most_m_per_s: float) -> Array:
+        """Return the wished velocity over ground."""
+        return springs(neighbours, self.wished_m(time_s), most_m_per_s)
 
 
 LAWS: dict[str, Law] = {"paper": reynolds, "robust": springs}

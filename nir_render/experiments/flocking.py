@@ -1,8 +1,9 @@
 """The paper's flocking experiment: four robots follow a leader by what they see of it and of each other."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from nir_render.experiments.controllers import LAWS
 from nir_render.experiments.frame_sight import FrameSight
 from nir_render.experiments.measurement_sight import MeasurementSight
 from nir_render.experiments.sight import Sight, TrueSight
+from nir_render.experiments.spacing import Spacing, spacing
 from nir_render.experiments.world import Base, World
 from nir_render.randomness import generator
 from nir_render.scene.scene import Scene
@@ -53,6 +55,10 @@ class Flocking:
     refresh_s: float = 5.0
     base: Base = field(default_factory=Base)
 
+    def loop(self, scene: Scene, seed: int) -> "Loop":
+        """Return the beginning of a run."""
+        return Loop(scene, self, seed)
+
 
 @dataclass(frozen=True, eq=False)
 class Instant:
@@ -79,6 +85,11 @@ class Loop:
         """How many steps the whole run has."""
         return round(self.plan.lasts_s / self.plan.period_s)
 
+    @property
+    def done(self) -> int:
+        """How many of them are done."""
+        return len(self.instants)
+
     def step(self) -> Instant:
         """Look, decide, go; return how it was when robots looked."""
         plan, world = self.plan, self.world
@@ -94,11 +105,66 @@ class Loop:
         world.step(wanted, plan.period_s)
         return instant
 
+    def record(self) -> dict[str, Any]:
+        """Return a run as plain data: its spacing, all places over time, what held light was off by."""
+        names = list(self.world.movers)
+        places_m = np.array([[instant.places_m[name] for name in names] for instant in self.instants])
+        shares = [
+            share
+            for sight in self.sights.values()
+            if isinstance(sight, FrameSight)
+            for share in sight.held_shares
+        ]
+        return {
+            "format": 1,
+            "seed": self.seed,
+            "spacing": {
+                name: value if math.isfinite(value) else None  # no number is no JSON
+                for name, value in asdict(spacing_of(self.instants, self.plan)).items()
+            },
+            "robots": names,
+            "time_s": [round(instant.time_s, 9) for instant in self.instants],
+            "places_m": np.round(places_m, 6).tolist(),
+            "neighbours": [
+                [instant.neighbours.get(name, 0) for name in self.followers] for instant in self.instants
+            ],
+            "held_light_share": max(shares) if shares else None,
+        }
+
     def _leaders_velocity(self) -> Array:
         """Return the velocity that brings the leader to where its way has it after this step."""
         after_s = self.world.time_s + self.plan.period_s
         ahead_m = _along_way_m(self.plan.leader_m_per_s * after_s) - self.world.movers[self.leader].place_m
         return np.asarray(ahead_m / self.plan.period_s)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of one seed that is done: its spacing, where everybody was, and how well held light held."""
+
+    seed: int
+    spacing: Spacing
+    record: dict[str, Any]
+
+
+def run_of(record: dict[str, Any]) -> Run:
+    """Return a run from its record."""
+    said: dict[str, Any] = {
+        name: math.nan if value is None else value for name, value in record["spacing"].items()
+    }
+    return Run(record["seed"], Spacing(**said), record)
+
+
+def spacing_of(instants: Sequence[Instant], plan: Flocking) -> Spacing:
+    """Return how well a run kept its spacing."""
+    names = list(instants[0].places_m)
+    distances_m = {
+        (one, other): np.array([float(np.hypot(*(at.places_m[one] - at.places_m[other]))) for at in instants])
+        for number, one in enumerate(names)
+        for other in names[number + 1 :]
+    }
+    times_s = np.array([instant.time_s for instant in instants])
+    return spacing(times_s, distances_m, plan.spacing_m, plan.base.diameter_m)
 
 
 def _sight(scene: Scene, robot: str, plan: Flocking, seed: int) -> Sight:

@@ -14,7 +14,7 @@ from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import frame_of
 from nir_render.simulation.refresh import interpolation_error, rates_between
-from perception import Pipeline, RawFrame
+from perception import Pipeline, RawFrame, Signal
 
 _AHEAD_S = 1e-9
 
@@ -27,10 +27,13 @@ class FrameSight:
     `held_shares`: the mean square over the mean temporal variance of the frame.
     """
 
-    def __init__(self, scene: Scene, robot: str, seed: int, stack: str, refresh_s: float) -> None:
+    def __init__(
+        self, scene: Scene, robot: str, seed: int, stack: str, refresh_s: float, keep_signals: bool = False
+    ) -> None:
         self._robot, self._seed, self._refresh_s = robot, seed, refresh_s
         self._cameras = scene.document.cameras_of(robot)
-        self._pipeline = Pipeline.of(stack, {name: calibration(scene, name) for name in self._cameras})
+        known = {name: calibration(scene, name) for name in self._cameras}
+        self._pipeline = Pipeline.of(stack, known, keep_signals=keep_signals)
         self._held: dict[str, Rates] = {}
         self._held_in: Snapshot | None = None
         self._index = 0
@@ -46,7 +49,11 @@ class FrameSight:
         frames = [self._frame(snapshot, name) for name in self._cameras]
         self._index += 1
         heard = self._pipeline.push(frames, world.odometry(self._robot))
-        return Seen(neighbours_of(heard.tracks), heard.messages)
+        return Seen(neighbours_of(heard.tracks), heard.messages, heard.tracks)
+
+    def signals(self) -> tuple[Signal, ...]:
+        """Return how bright every track was so far, where that is kept."""
+        return self._pipeline.signals()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what can be rendered again to the same bits."""

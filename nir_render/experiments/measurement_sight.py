@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.timing.drive import drive_of, mean_level
 from nir_render.experiments.controllers import neighbours_of
 from nir_render.experiments.sight import Seen
 from nir_render.experiments.world import World
@@ -14,30 +16,68 @@ from nir_render.randomness import generator
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.calibration import calibration
-from perception import Calibration, Detection
+from perception import Calibration, Detection, Pipeline, RawFrame, Signal
 from perception.model.bearing import bearing_body
 from perception.model.fisher import FlareLimit, flare_limit
+from perception.model.flare import PixelBox, flare_image
 from perception.model.lens import project
-from perception.model.ranging import flux_at_one_metre_dn
-from perception.rig.measure_set import measure_set
-from perception.track.tracker import Tracker
+from perception.model.ranging import angular_radius_rad, flux_at_one_metre_dn
 
 Array = NDArray[np.float64]
 
 _RANGES_PER_E, _STEP_PX = 40.0, 60.0  # bounds are looked up at the next of such ranges and places
 _LEAST_SNR = 8.0  # from which `robust` finds 99.8 %
 _MERGED_PX = 2.0  # down to which it parts two of a like brightness
+_FAR_PX = 12.0  # from the rim of a flare, beyond which its light is less than read noise
 _RIM_PX = 3.0  # a centre nearer to the edge of a frame is not found
 
 
 @dataclass(frozen=True)
+class _Image:
+    """A source in view, found or not: its place, its range, and the electrons of it in this frame."""
+
+    u_px: float
+    v_px: float
+    range_m: float
+    flux_e: float
+
+
+class _Pixels:
+    """The pixels of a frame that nobody rendered: windows of it, drawn as photometry asks for them.
+
+    Flares as the calibration has them, shot noise of their light, read noise and rounding; no other light.
+    """
+
+    def __init__(self, known: Calibration, images: Sequence[_Image], random: np.random.Generator) -> None:
+        self._known, self._images, self._random = known, images, random
+
+    def __getitem__(self, window: tuple[slice, slice]) -> NDArray[np.uint16]:
+        known, (rows, columns) = self._known, window
+        box = PixelBox(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
+        mean_e = np.zeros((box.height, box.width))
+        for one in self._images:
+            radius = float(angular_radius_rad(np.array([one.range_m]), known.source_radius_m)[0])
+            reach_px = _FAR_PX + radius * known.fx_px
+            right, bottom = box.left + box.width, box.top + box.height
+            beside = box.left - reach_px < one.u_px < right + reach_px
+            if beside and box.top - reach_px < one.v_px < bottom + reach_px:
+                mean_e += one.flux_e * flare_image(one.u_px, one.v_px, radius, box, known).fraction
+        noise_e = math.hypot(known.read_noise_e, known.dsnu_e) * self._random.standard_normal(mean_e.shape)
+        electrons = self._random.poisson(np.maximum(mean_e, 0.0)) + noise_e
+        counts = np.rint(known.black_level_dn + known.system_gain_dn_per_e * electrons)
+        return np.clip(counts, 0.0, known.saturation_dn).astype(np.uint16)
+
+
+@dataclass(frozen=True)
 class _Exposed:
-    """What a frame that nobody rendered is to the fusion of cameras."""
+    """What a frame that nobody rendered is to the stack behind the detector."""
 
     camera: str
     index: int
     time_s: float
     exposure_s: float
+    black_level_dn: float
+    data_dn: _Pixels | None = None
     line_time_s: float = 0.0
     gain: float = 1.0
 
@@ -52,63 +92,87 @@ class _Flare:
     range_m: float
     range_sigma_m: float
     flux_e: float
+    flux_sigma_e: float
     merged: bool = False
 
 
 class MeasurementSight:
     """Measurements as the detector makes them, drawn about the truth with the σ of their Cramér–Rao bound.
 
-    From the detections on everything is the stack itself: fusion of the cameras, ghosts, the tracker. Left
-    out is what only frames have: light off walls and lamps, false alarms, bits, flares drawn out. Two within
-    2 px are one at their centre of light, and not ranged; below 8 σ of flux nothing is found.
+    From the detections on everything is the stack itself: fusion of the cameras, ghosts, the tracker,
+    brightness, the decoder. Left out is what only frames have: light off walls and lamps, false alarms,
+    flares drawn out. Two within 2 px are one at their centre of light, and not ranged; below 8 σ of flux
+    nothing is found. Where a source was not found its pixels are drawn: how dark it is the stack measures.
     """
 
-    def __init__(self, scene: Scene, robot: str, seed: int) -> None:
+    def __init__(self, scene: Scene, robot: str, seed: int, keep_signals: bool = False) -> None:
         self._robot, self._seed = robot, seed
         self._cameras = scene.document.cameras_of(robot)
         self._known = {name: calibration(scene, name) for name in self._cameras}
         self._exposure_s = {name: scene.camera(name)[1].exposure_s for name in self._cameras}
         self._bounds: dict[tuple[str, int, int, int], tuple[FlareLimit, float]] = {}
-        self._tracker = Tracker()
+        self._pipeline = Pipeline(self._known, keep_signals=keep_signals)
         self._index = 0
 
     def look(self, world: World) -> Seen:
-        """Draw the detections of a set, and follow them."""
+        """Draw the detections of a set, and take them in."""
         snapshot = world.snapshot()
-        frames = [
-            _Exposed(name, self._index, world.time_s - 0.5 * self._exposure_s[name], self._exposure_s[name])
-            for name in self._cameras
-        ]
-        found = [self._detections(frame, snapshot) for frame in frames]
+        frames, found = [], []
+        for name in self._cameras:
+            frame = self._exposed(name, self._index, world.time_s)
+            images, hits = self._images_and_detections(frame, snapshot)
+            random = generator(self._seed, "pixels", name, self._index)
+            frames.append(replace(frame, data_dn=_Pixels(self._known[name], images, random)))
+            found.append(hits)
         self._index += 1
-        seen = measure_set(frames, found, self._known)
-        odometry = world.odometry(self._robot)
-        return Seen(neighbours_of(self._tracker.update(world.time_s, seen.measurements, odometry)))
+        # They are no raw frames: of their pixels there are only the windows that photometry looks at.
+        heard = self._pipeline.follow(cast(list[RawFrame], frames), found, world.odometry(self._robot))
+        return Seen(neighbours_of(heard.tracks), heard.messages, heard.tracks)
 
-    def _detections(self, frame: _Exposed, snapshot: Snapshot) -> list[Detection]:
+    def signals(self) -> tuple[Signal, ...]:
+        """Return how bright every track was so far, where that is kept."""
+        return self._pipeline.signals()
+
+    def _exposed(self, camera: str, index: int, middle_s: float) -> _Exposed:
+        exposure_s = self._exposure_s[camera]
+        black_dn = self._known[camera].black_level_dn
+        return _Exposed(camera, index, middle_s - 0.5 * exposure_s, exposure_s, black_dn)
+
+    def _images_and_detections(
+        self, frame: _Exposed, snapshot: Snapshot
+    ) -> tuple[list[_Image], list[Detection]]:
         known = self._known[frame.camera]
         pose = snapshot.camera(frame.camera).pose
         random = generator(self._seed, "measurements", frame.camera, frame.index)
-        flares = []
-        for name, placed in snapshot.carried_sources.items():
-            noise = random.standard_normal(
-                3
-            )  # for all: who is out of view leaves those of the others as they are
-            towards_m = pose.to_local(placed.pose.position_m)
-            (place_px,) = project(towards_m[None], known)
+        images, flares = [], []
+        sources = snapshot.carried_sources
+        # For all: who is out of view leaves the noise of the others as it is.
+        noises = random.standard_normal((len(sources), 3))
+        towards_m = pose.to_local(np.array([placed.pose.position_m for placed in sources.values()]))
+        places_px, ranges_m = project(towards_m, known), np.linalg.norm(towards_m, axis=1)
+        for (name, placed), place_px, range_m, noise in zip(
+            sources.items(), places_px, ranges_m.tolist(), noises, strict=True
+        ):
             if name.startswith(f"{self._robot}.") or not _is_in_view(place_px, known):
                 continue
-            range_m = float(np.linalg.norm(towards_m))
-            bound, flux_e = self._bound(frame, range_m, float(place_px[0]), float(place_px[1]))
+            bound, lit_e = self._bound(frame, range_m, float(place_px[0]), float(place_px[1]))
+            # A source that is brighter than its type seems so much nearer, and one that was lit for a part
+            # of the exposure so much farther.
+            brighter = placed.source.sent_flux_w / placed.source.of_its_type.sent_flux_w
+            level = float(mean_level(drive_of(placed.source), frame.time_s, frame.exposure_s)) * brighter
+            flux_e = level * lit_e
+            images.append(_Image(float(place_px[0]), float(place_px[1]), range_m, flux_e))
             if flux_e < _LEAST_SNR * bound.flux_sigma_e:
                 continue
-            # A source that is brighter than its type seems so much nearer.
-            brighter = placed.source.sent_flux_w / placed.source.of_its_type.sent_flux_w
             sigma_px, share = (bound.u_sigma_px, bound.v_sigma_px), bound.range_sigma_m / range_m
-            seen_m = range_m * math.exp(share * noise[2]) / math.sqrt(brighter)
+            seen_m = range_m * math.exp(share * noise[2]) / math.sqrt(level)
             u_px, v_px = place_px + noise[:2] * sigma_px
-            flares.append(_Flare(float(u_px), float(v_px), sigma_px, seen_m, share * seen_m, flux_e))
-        return [_detection(frame, known, flare) for flare in _merged(flares)]
+            flux_sigma_e = bound.flux_sigma_e
+            seen_e = flux_e - flux_sigma_e * noise[2]  # who seems farther seems fainter
+            flares.append(
+                _Flare(float(u_px), float(v_px), sigma_px, seen_m, share * seen_m, seen_e, flux_sigma_e)
+            )
+        return images, [_detection(frame, known, flare) for flare in _merged(flares)]
 
     def _bound(self, frame: _Exposed, range_m: float, u_px: float, v_px: float) -> tuple[FlareLimit, float]:
         """Return the bound of a flare, and its electrons: those of the next range and place looked up."""
@@ -144,8 +208,9 @@ def _merged(flares: Sequence[_Flare]) -> list[_Flare]:
         places_px = np.array([(one.u_px, one.v_px) for one in group])
         u_px, v_px = (flux_e @ places_px / flux_e.sum()).tolist()
         wide_px = 0.5 * _MERGED_PX
-        one = _Flare(u_px, v_px, (wide_px, wide_px), math.nan, math.nan, float(flux_e.sum()), merged=True)
-        found.append(one)
+        sigma_e = math.hypot(*(one.flux_sigma_e for one in group))
+        wide = (wide_px, wide_px)
+        found.append(_Flare(u_px, v_px, wide, math.nan, math.nan, float(flux_e.sum()), sigma_e, merged=True))
     return found
 
 
@@ -169,5 +234,6 @@ def _detection(frame: _Exposed, known: Calibration, flare: _Flare) -> Detection:
         range_m=flare.range_m,
         range_sigma_m=flare.range_sigma_m,
         bearing_body=(float(bearing[0]), float(bearing[1]), float(bearing[2])),
+        flux_sigma_dn=flare.flux_sigma_e * known.system_gain_dn_per_e,
         range_sigma_common_m=0.0,
     )

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.experiments.flocking import Flocking
-from nir_render.experiments.runs import Progress, Run, run_seeds
+from nir_render.experiments.flocking import Flocking, Run, run_of
+from nir_render.experiments.runs import Progress, run_seeds
 from nir_render.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ def outcome_of(
     known = replace(plan, level="truth")
     by_truth = run_seeds(scene, known, seeds, folder / "truth", workers, lambda *_: None)
     runs = by_truth if plan == known else run_seeds(scene, plan, seeds, folder, workers, progress)
-    return Outcome(plan, scene.document.name, runs, by_truth)
+    return Outcome(plan, scene.document.name, [*map(run_of, runs)], [*map(run_of, by_truth)])
 
 
 def _errors_m(runs: Sequence[Run]) -> Array:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nir_render.experiments.flocking import Run
 from nir_render.experiments.outcome import Outcome
 from nir_render.experiments.plots import flock_plot
-from nir_render.experiments.runs import Run
 from nir_render.report.parts import Table, render_page
 from nir_render.report.wording import counted, metres, share
 from nir_render.run.folder import write_file, write_json

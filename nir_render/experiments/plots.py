@@ -3,8 +3,7 @@
 import matplotlib as mpl
 import numpy as np
 
-from nir_render.experiments.flocking import Flocking
-from nir_render.experiments.runs import Run
+from nir_render.experiments.flocking import Flocking, Run
 from nir_render.experiments.spacing import COUNTED_S, NEIGHBOURS
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.style import FAINT, INK, MATPLOTLIB

@@ -1,23 +1,17 @@
 """Runs of an experiment over seeds: side by side in processes, kept as they go, gone on with where killed."""
 
-import math
 import multiprocessing
 import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, ClassVar, Protocol
 
 from nir_render.errors import InputError
-from nir_render.experiments.flocking import Flocking, Instant, Loop
-from nir_render.experiments.frame_sight import FrameSight
-from nir_render.experiments.spacing import Spacing, spacing
 from nir_render.run.folder import locked, read_json, write_file, write_json
 from nir_render.run.manifest import versions
 from nir_render.run.render import run_digest
@@ -30,19 +24,37 @@ Progress = Callable[[int, int], None]
 _SAVED_STEPS = 50
 
 
-@dataclass(frozen=True)
-class Run:
-    """A run of one seed that is done: its spacing, where everybody was, and how well held light held."""
+class Loop(Protocol):
+    """A run in the making; it can be pickled between steps."""
 
-    seed: int
-    spacing: Spacing
-    record: dict[str, Any]
+    @property
+    def steps(self) -> int:
+        """How many steps the whole run has."""
+
+    @property
+    def done(self) -> int:
+        """How many of them are done."""
+
+    def step(self) -> Any:
+        """Do the next one."""
+
+    def record(self) -> dict[str, Any]:
+        """Return a run that is done as plain data."""
+
+
+class Plan(Protocol):
+    """What the runs of an experiment are: a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def loop(self, scene: Scene, seed: int) -> Loop:
+        """Return the beginning of a run."""
 
 
 def run_seeds(
-    scene: Scene, plan: Flocking, seeds: Sequence[int], folder: Path, workers: int, progress: Progress
-) -> list[Run]:
-    """Run an experiment for each seed, in `workers` processes; what is done in the folder is not done again.
+    scene: Scene, plan: Plan, seeds: Sequence[int], folder: Path, workers: int, progress: Progress
+) -> list[dict[str, Any]]:
+    """Return the record of each seed, run in `workers` processes; what is done is not done again.
 
     Raises
     ------
@@ -65,10 +77,10 @@ def run_seeds(
         ended = _ended(scene, plan, wanted, folder, min(workers, len(wanted)))
         for done in accumulate(1 for _ in ended):
             progress(len(seeds) - len(wanted) + done, len(seeds))
-    return [_read(folder, seed) for seed in seeds]
+    return [read_json(_file(folder, seed)) for seed in seeds]
 
 
-def _ended(scene: Scene, plan: Flocking, seeds: Sequence[int], folder: Path, workers: int) -> Iterator[int]:
+def _ended(scene: Scene, plan: Plan, seeds: Sequence[int], folder: Path, workers: int) -> Iterator[int]:
     """Yield seeds as their runs end; a single worker is this process."""
     if workers < 2:
         for seed in seeds:
@@ -86,62 +98,17 @@ def _ended(scene: Scene, plan: Flocking, seeds: Sequence[int], folder: Path, wor
             raise
 
 
-def run_seed(scene: Scene, plan: Flocking, seed: int, folder: Path) -> None:
+def run_seed(scene: Scene, plan: Plan, seed: int, folder: Path) -> None:
     """Run one seed to its end, from where an earlier process left it, and write its record."""
     state = folder / "runs" / f"{seed:04d}.state"
     # Written by `run_seed` itself, of the same plan, scene and code: the digest is checked before.
-    loop: Loop = pickle.loads(state.read_bytes()) if state.exists() else Loop(scene, plan, seed)  # noqa: S301
-    while len(loop.instants) < loop.steps:
+    loop: Loop = pickle.loads(state.read_bytes()) if state.exists() else plan.loop(scene, seed)  # noqa: S301
+    while loop.done < loop.steps:
         loop.step()
-        if len(loop.instants) % _SAVED_STEPS == 0:
+        if loop.done % _SAVED_STEPS == 0:
             write_file(state, pickle.dumps(loop))
-    write_json(_file(folder, seed), record_of(loop))
+    write_json(_file(folder, seed), loop.record())
     state.unlink(missing_ok=True)
-
-
-def record_of(loop: Loop) -> dict[str, Any]:
-    """Return a run as plain data: its spacing, the places of all over time, what held light was off by."""
-    names = list(loop.world.movers)
-    places_m = np.array([[instant.places_m[name] for name in names] for instant in loop.instants])
-    shares = [
-        share
-        for sight in loop.sights.values()
-        if isinstance(sight, FrameSight)
-        for share in sight.held_shares
-    ]
-    return {
-        "format": 1,
-        "seed": loop.seed,
-        "spacing": {
-            name: value if math.isfinite(value) else None  # no number is no JSON
-            for name, value in asdict(spacing_of(loop.instants, loop.plan)).items()
-        },
-        "robots": names,
-        "time_s": [round(instant.time_s, 9) for instant in loop.instants],
-        "places_m": np.round(places_m, 6).tolist(),
-        "neighbours": [[instant.neighbours.get(name, 0) for name in names[1:]] for instant in loop.instants],
-        "held_light_share": max(shares) if shares else None,
-    }
-
-
-def spacing_of(instants: Sequence[Instant], plan: Flocking) -> Spacing:
-    """Return how well a run kept its spacing."""
-    names = list(instants[0].places_m)
-    distances_m = {
-        (one, other): np.array([float(np.hypot(*(at.places_m[one] - at.places_m[other]))) for at in instants])
-        for number, one in enumerate(names)
-        for other in names[number + 1 :]
-    }
-    times_s = np.array([instant.time_s for instant in instants])
-    return spacing(times_s, distances_m, plan.spacing_m, plan.base.diameter_m)
-
-
-def _read(folder: Path, seed: int) -> Run:
-    record = read_json(_file(folder, seed))
-    said: dict[str, Any] = {
-        name: math.nan if value is None else value for name, value in record["spacing"].items()
-    }
-    return Run(seed, Spacing(**said), record)
 
 
 def _file(folder: Path, seed: int) -> Path:

@@ -54,6 +54,7 @@ class World:
         self.time_s = 0.0
         self.movers = {name: Mover(np.array(place_m, dtype=float)) for name, place_m in places_m.items()}
         self._scene, self._base = scene, base
+        self._snapshot: Snapshot | None = None  # all look at the same one
         self._reckoned = {
             name: DeadReckoning(name, scene.document.robots[name].rig.odometry or OdometryNoise(), seed)
             for name in places_m
@@ -66,8 +67,10 @@ class World:
 
         Flares are not drawn out: at 0.1 m/s and 1 m an exposure of 0.2 ms moves one by 0.01 px.
         """
-        poses = {name: _pose(mover) for name, mover in self.movers.items()}
-        return self._scene.at(0.0).moved(poses, self.time_s)
+        if self._snapshot is None:
+            poses = {name: _pose(mover) for name, mover in self.movers.items()}
+            self._snapshot = self._scene.at(0.0).moved(poses, self.time_s)
+        return self._snapshot
 
     def odometry(self, robot: str) -> list[Odometry]:
         """Return what a robot knows of its last seconds."""
@@ -84,6 +87,7 @@ class World:
             mover.velocity_m_per_s = mover.velocity_m_per_s + clipped(wanted - mover.velocity_m_per_s, most)
             mover.place_m = mover.place_m + lasts_s * mover.velocity_m_per_s
         self.time_s += lasts_s
+        self._snapshot = None
         self._note()
 
     def _note(self) -> None:

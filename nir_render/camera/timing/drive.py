@@ -104,7 +104,7 @@ def _of_packets(packets: Packets, start_s: Array, duration_s: Array) -> Array:
     opened = np.minimum(first, len(edge_s) - 1)
     lit_s = level[first] * (edge_s[opened] - start_s) + (sums_s[final] - sums_s[opened])
     lit_s += level[last] * (end_s - edge_s[final])
-    mean = np.divide(lit_s, duration_s, out=level[first], where=~within)
+    mean = np.divide(lit_s, duration_s, out=np.asarray(level[first]), where=~within)
     return np.asarray(np.clip(mean, 0.0, 1.0))
 
 

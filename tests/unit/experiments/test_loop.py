@@ -55,7 +55,7 @@ def test_measurements_scatter_by_their_bound() -> None:
     found = []
     for index in range(600):
         frame = dataclasses.replace(_frame(sight), index=index)
-        found += [hit for hit in sight._detections(frame, snapshot) if 1.5 < hit.range_m < 2.5]
+        found += [hit for hit in sight._images_and_detections(frame, snapshot)[1] if 1.5 < hit.range_m < 2.5]
     assert len(found) == 600
     range_m = float(np.hypot(2.0, 0.08))
     v_px = known.cy_px - known.fy_px * 0.08 / 2.0
@@ -76,9 +76,7 @@ def test_measurements_scatter_by_their_bound() -> None:
 
 
 def _frame(sight: MeasurementSight) -> Any:
-    from nir_render.experiments.measurement_sight import _Exposed
-
-    return _Exposed("follower1.front", 0, 0.0, sight._exposure_s["follower1.front"])
+    return sight._exposed("follower1.front", 0, 0.0)
 
 
 @pytest.mark.parametrize(("apart_m", "merged"), [(0.005, 1), (0.012, 0)])
@@ -92,7 +90,9 @@ def test_two_in_one_place_are_one_flare_without_a_range(apart_m: float, merged: 
     }
     world = World(scene, {**places_m, "follower3": np.array([-3.0, 0.0])}, Base(), seed=1)
     sight = MeasurementSight(scene, "follower1", seed=4)
-    hits = [hit for hit in sight._detections(_frame(sight), world.snapshot()) if hit.u_px > 630.0]
+    hits = [
+        hit for hit in sight._images_and_detections(_frame(sight), world.snapshot())[1] if hit.u_px > 630.0
+    ]
     assert sum(hit.merged for hit in hits) == merged
     assert all(np.isnan(hit.range_m) == hit.merged for hit in hits)
 
