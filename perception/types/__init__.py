@@ -1,12 +1,14 @@
 """The contract: what perception reads (`inputs`) and what it says (`outputs`)."""
 
-from perception.types.inputs import Calibration, FrameKey, Odometry, RawFrame
+from perception.types.inputs import Calibration, FrameKey, Layout, Odometry, RawFrame
 from perception.types.outputs import (
     Detection,
     Ghost,
     Measurement,
     Message,
     MirrorPlane,
+    PoseHypothesis,
+    RobotPose,
     SetMeasurements,
     Signal,
     Track,
@@ -18,11 +20,14 @@ __all__ = [
     "Detection",
     "FrameKey",
     "Ghost",
+    "Layout",
     "Measurement",
     "Message",
     "MirrorPlane",
     "Odometry",
+    "PoseHypothesis",
     "RawFrame",
+    "RobotPose",
     "SetMeasurements",
     "Signal",
     "Track",
