@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from perception.rig.frame_sets import Exposed
 from perception.rig.layout import LEAST_ODDS, PoseModel, Posterior, Sights
-from perception.rig.sightings import CAMERAS_MOST, CAMERAS_SHARE, LEAST_NOISE, UNCLAIMED_RANGE, sightings_of
 from perception.rig.rays import UNKNOWN_RANGE
+from perception.rig.sightings import CAMERAS_MOST, CAMERAS_SHARE, LEAST_NOISE, UNCLAIMED_RANGE, sightings_of
 from perception.types import Calibration, Detection, Layout, Measurement, PoseHypothesis, RobotPose
 
 Array = NDArray[np.float64]
@@ -273,8 +273,7 @@ def _ways(members: tuple[int, ...], sources: int, fits: Pairs) -> list[tuple[int
             (*way, source)
             for way in ways
             for source in range(sources)
-            if source not in way
-            and all((way[m], source) in fits[members[m], k] for m in range(n))
+            if source not in way and all((way[m], source) in fits[members[m], k] for m in range(n))
         ][:MOST_TRIED]
     return ways
 
@@ -291,9 +290,7 @@ def _alone(flare: _Flare, sights: Sights) -> float:
     return model.evidence_of_place() + math.log(PER_M3)
 
 
-def _told_apart(
-    candidates: Sequence[_Candidate], alone: Sequence[float]
-) -> list[tuple[_Candidate, float]]:
+def _told_apart(candidates: Sequence[_Candidate], alone: Sequence[float]) -> list[tuple[_Candidate, float]]:
     """Return the most probable way to part all flares into robots, each with its odds over all ways.
 
     Flares that no chain of candidates connects are parted by themselves.
