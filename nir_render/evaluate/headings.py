@@ -20,9 +20,9 @@ def heading_numbers(
 ) -> dict[str, Any]:
     """Return the `set_robots_…` and `set_heading_…` numbers of one estimator in `summary.json`.
 
-    A robot is who truth says that its flares are of; flares of several robots are a robot put together wrongly.
-    The heading's error is that of the best hypothesis, or of another that truth is nearer to if it has at least
-    half the odds of the best: layouts that are symmetric are so scored modulo their symmetry. `wrong` has none
+    A robot is who truth says that its flares are of; flares of several are a robot put together wrongly.
+    The heading's error is that of the best hypothesis, or of another that truth is nearer to if it has at
+    least half the odds of the best: symmetric layouts are so scored modulo their symmetry. `wrong` has none
     of these within 5 σ of truth, `unsaid` none at all.
 
     Parameters

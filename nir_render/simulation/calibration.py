@@ -111,9 +111,8 @@ def _layouts(snapshot: Snapshot, known: Calibration) -> tuple[Layout, ...]:
         flux = tuple(
             1.0 if math.isnan(constant) else range_constant(device, source) / constant for source in sources
         )
-        share_sigma = (
-            max(flare_spread(device, source).share_sigma for source in sources) if constant > 0.0 else 0.0
-        )
+        known_shares = [] if math.isnan(constant) else [flare_spread(device, source) for source in sources]
+        share_sigma = max((spread.share_sigma for spread in known_shares), default=0.0)
         places_m = tuple(source.position_m for source in sources)
         layouts.setdefault((places_m, flux), Layout(name, places_m, flux, flux_sigma_common=share_sigma))
     return tuple(layouts.values())

@@ -122,7 +122,7 @@ class PoseModel:
         return arm, np.stack([-arm[..., 1], arm[..., 0], np.zeros_like(arm[..., 0])], -1)
 
     def whitened(self, position_m: Array, heading_rad: Array) -> tuple[Array, Array]:
-        """Return residuals of unit variance, shape (b, 3 n), and their slopes, shape (b, 3 n, 4), at b poses."""
+        """Return residuals of unit variance, shape (b, 3 n), and slopes, shape (b, 3 n, 4), at b poses."""
         arm, swing = self._turned(heading_rad)
         from_m = position_m[:, None] + arm - self._sights.origin_m
         range_m = np.linalg.norm(from_m, axis=-1, keepdims=True)
@@ -167,7 +167,7 @@ class PoseModel:
         return place_m, (residual**2).sum(axis=1), np.swapaxes(slope, 1, 2) @ slope
 
     def _nodes(self, worth_chi2: float) -> tuple[Array, Array, Array, Array]:
-        """Return headings, increasing over a turn, that resolve the posterior; places, χ², informations there."""
+        """Return headings over a turn that resolve the posterior; places, χ², informations there."""
         heading = np.arange(COARSE) * (2.0 * math.pi / COARSE)
         found = (heading, *self._placed(heading))
         chi2 = found[2]

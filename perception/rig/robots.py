@@ -17,7 +17,7 @@ from perception.types import Calibration, Detection, Layout, Measurement, PoseHy
 Array = NDArray[np.float64]
 
 SEEN = 0.9
-"""How probable it is, beforehand, that a source of a robot in view is seen: it may be off, or behind its body."""
+"""How probable it is, beforehand, that a source of a robot is seen: it may be off, or behind its body."""
 
 PER_M3 = 0.1
 """How densely robots, and other sources, are taken to stand."""
@@ -229,7 +229,7 @@ def _fitting_pairs(flares: Sequence[_Flare], sights: Sights, layout: Layout) -> 
 
 def _cliques(count: int, fits: Pairs, most: int) -> list[tuple[int, ...]]:
     """Return groups of two to `most` flares of which every two may be of one robot."""
-    groups = [pair for pair in sorted(fits)]
+    groups = sorted(fits)
     found: list[tuple[int, ...]] = list(groups)
     for _ in range(most - 2):
         groups = [

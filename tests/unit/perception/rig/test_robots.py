@@ -3,9 +3,9 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from perception.rig.measure_set import measure_set
@@ -141,18 +141,46 @@ def against_bound(found: Figures) -> tuple[float, float, float]:
     return ratio, float(within.mean()) if within.size else math.nan, float(found.pulls2.mean()) / 4.0
 
 
-def of_pulls(found: Figures) -> dict[str, Any]:
-    """Return all figures, for who runs more poses than the tests do."""
-    ratio, coverage, nees = against_bound(found)
-    wrong = np.abs(found.error) > 6.0 * found.sigma
-    close = found.bound <= math.radians(10.0)
-    return {
-        "poses": len(found.error), "lost": found.lost, "bound above 10 deg": int((~close).sum()),
-        "rmse over bound": ratio, "pooled": math.sqrt(np.mean(found.error[close] ** 2) / np.mean(found.bound[close] ** 2)),
-        "coverage elsewhere": coverage, "coverage": float((np.abs(found.error) < 1.96 * found.sigma).mean()),
-        "nees": nees, "best is wrong": int((found.right < found.odds - 1e-9).sum()),
-        "expected": float((1.0 - found.odds).sum()), "unsaid": int((found.right <= 0.0).sum()),
-        "least odds of truth": float(found.right.min()), "beyond 6 sigma": int(wrong.sum()),
-        "rmse over sigma": math.sqrt(float(np.mean((found.error / found.sigma) ** 2))),
-        "worst ratio": np.sort(np.abs(found.error / found.bound))[-5:].tolist(),
-    }  # fmt: skip
+def test_two_leds_alike_tell_the_heading_modulo_half_a_turn() -> None:
+    found = figures(ALIKE, 80, math.pi)
+    ratio, _, nees = against_bound(found)
+    assert found.lost == 0
+    assert ratio < 1.25
+    assert nees == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / (4.0 * 80)))
+    assert (found.odds <= 0.5 + 1e-6).all()
+    assert (found.right > 0.0).all()
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("layout", [UNLIKE, THREE], ids=["unlike", "three"])
+def test_unlike_leds_or_three_tell_the_whole_heading(layout: Layout) -> None:
+    found = figures(layout, 500)
+    ratio, _, nees = against_bound(found)
+    assert found.lost == 0
+    assert ratio < 1.25
+    assert nees == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / (4.0 * 500)))
+    assert (found.right < 0.5).mean() <= 0.01
+    assert (found.right > 0.0).all()
+
+
+def test_two_robots_beside_each_other_are_told_apart_with_a_source_hidden() -> None:
+    """Four of five flares: each robot gets its own, the heading of both is among the hypotheses."""
+    pair = replace(ALIKE, kind="pair")
+    cameras = {name: replace(camera, layouts=(pair, THREE)) for name, camera in rig().items()}
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        near, far = rng.uniform(-np.pi, np.pi, 2)
+        poses = [np.array([1.5, 0.2, 0.0, near]), np.array([1.6, -0.3, 0.0, far])]
+        robots = told(cameras, sighted(cameras, [(pair, poses[0]), (THREE, poses[1])], rng, hidden=[(1, 2)]))
+        assert len(robots) == 2
+        for robot in robots:
+            own = min(poses, key=lambda pose: np.linalg.norm(pose[:3] - robot.hypotheses[0].position_body_m))
+            assert sum(each.odds for each in robot.hypotheses) == pytest.approx(1.0, abs=1e-4)
+            assert any(is_at(each, own[3]) for each in robot.hypotheses)
+
+
+def test_one_led_alone_is_no_robot() -> None:
+    cameras = {name: replace(camera, layouts=(ALIKE,)) for name, camera in rig().items()}
+    pose = np.array([2.0, 0.3, 0.0, 1.0])
+    hits = sighted(cameras, [(ALIKE, pose)], np.random.default_rng(1), hidden=[(0, 1)])
+    assert told(cameras, hits) == ()
