@@ -49,6 +49,8 @@ from perception.files.measurements import (
     mirror_record,
     parse_measurement,
     parse_mirror,
+    parse_robot,
+    robot_record,
 )
 from perception.files.pictures import Picture, encode_png16, read_picture
 from perception.files.ranges import encode_ranges, read_ranges
@@ -63,7 +65,6 @@ from perception.files.recording import (
     read_frames,
     read_recording,
 )
-from perception.files.robots import parse_robot, robot_record
 from perception.files.tracks import (
     message_record,
     odometry_record,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.rig.frame_sets import Exposed
-from perception.rig.layout import LEAST_ODDS, PoseModel, Posterior, Sights
+from perception.rig.pose.layout import LEAST_ODDS, PoseModel, Posterior, Sights
 from perception.rig.rays import UNKNOWN_RANGE
 from perception.rig.sightings import CAMERAS_MOST, CAMERAS_SHARE, LEAST_NOISE, UNCLAIMED_RANGE, sightings_of
 from perception.types import Calibration, Detection, Layout, Measurement, PoseHypothesis, RobotPose

@@ -41,7 +41,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.photometry": (),
     "perception.track": (),
     "perception.messages": (),
-    "perception.rig": (),
+    "perception.rig": ("pose",),
     "perception.calibration": (),
     "perception.command_estimator": (),
     "perception.estimators": (),
