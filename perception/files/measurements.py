@@ -2,8 +2,8 @@
 
 The fields of `Measurement` and `MirrorPlane`, NaN as null. A measurement says beside them where it is,
 `position_body_m`; a mirror says whose it is and when, `robot` and `time_s`.
-They stand in `mirrors.NAME.jsonl`; in `robots.NAME.jsonl` the fields of `RobotPose`, each hypothesis an object
-with those of `PoseHypothesis`.
+They stand in `mirrors.NAME.jsonl`; in `robots.NAME.jsonl` the fields of `RobotPose`, each hypothesis an
+object with those of `PoseHypothesis`.
 """
 
 import math
