@@ -62,6 +62,15 @@ class TrueWays:
         carried_m = np.einsum("nji,nj->ni", seen_then.rotation, world_m - seen_then.position_m)
         return np.where(np.isfinite(carried_m).all(axis=1, keepdims=True), carried_m, place_m)
 
+    def relative(self, observer: str, robot: str, time_s: float) -> tuple[Values, float] | None:
+        """Return a robot's origin (m) and heading (rad) in the observer's body axes; None where not known."""
+        seen_from, there = (self._ways([name], np.array([time_s])) for name in (observer, robot))
+        place_m = seen_from.rotation[0].T @ (there.position_m[0] - seen_from.position_m[0])
+        turn = seen_from.rotation[0].T @ there.rotation[0]
+        if not np.isfinite(turn).all():
+            return None
+        return place_m, math.atan2(turn[1, 0], turn[0, 0])
+
     def _ways(self, robots: Sequence[str], time_s: Values) -> "_Ways":
         """Return poses and velocities of robots at times, one each; NaN where none is known."""
         n = len(robots)

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from nir_render.errors import InputError
+from nir_render.evaluate.headings import heading_numbers
 from nir_render.evaluate.messages import MessageEvaluation, evaluate_messages, parse_told
 from nir_render.evaluate.metrics import Evaluation, evaluate
-from nir_render.evaluate.sets import evaluate_sets
+from nir_render.evaluate.sets import SetEvaluation, evaluate_sets
 from nir_render.evaluate.tracks import TrackEvaluation, evaluate_tracks, sets_in_time
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds, parse_lines
@@ -31,6 +32,7 @@ from perception import (
     parse_detection,
     parse_measurement,
     parse_mirror,
+    parse_robot,
     parse_signal,
     parse_track,
     read_frame,
@@ -149,11 +151,27 @@ def _with_sets(
                     f"detections.{name}.jsonl does not have; run 'nir-render perceive {folder}' again"
                 )
     around = evaluate_sets(sets, truth, recording.calibrations, measurements, detections, lamps, mirrors)
+    around = _with_headings(folder, around)
     summary = dict(result.summary)
     summary["estimators"] = {
         name: {**numbers, **around.summary.get(name, {})} for name, numbers in summary["estimators"].items()
     }
     return replace(result, summary=summary, around=around)
+
+
+def _with_headings(folder: Path, around: SetEvaluation) -> SetEvaluation:
+    """Add the scores of robots with several sources, where the folder has `robots.*.jsonl` and poses."""
+    robots = run_folder.lines_of(folder, "robots", list(around.summary), parse_robot)
+    if not robots or not (folder / run_folder.POSES).is_file():
+        return around
+    poses = parse_lines(folder / run_folder.POSES, parse_pose)
+    summary = {
+        name: {**numbers, **heading_numbers(robots[name], around.scores, name, poses)}
+        if name in robots
+        else numbers
+        for name, numbers in around.summary.items()
+    }
+    return replace(around, summary=summary)
 
 
 def _with_tracks(

@@ -20,6 +20,7 @@ from perception import (
     measurement_record,
     message_record,
     mirror_record,
+    robot_record,
     signal_record,
     track_record,
 )
@@ -90,7 +91,7 @@ class Follower:
         self._pipelines: dict[str, Pipeline] = {}
         self._latest_s: dict[str, float] = {}
         self._lines: dict[str, list[Line]] = {
-            kind: [] for kind in ("measurements", "mirrors", "fog", "tracks", "messages")
+            kind: [] for kind in ("measurements", "mirrors", "robots", "fog", "tracks", "messages")
         }
 
     def take(self, frames: Sequence[RawFrame], detections: Sequence[Sequence[Detection]]) -> None:
@@ -114,6 +115,7 @@ class Follower:
     def _note_set(self, robot: str, time_s: float, seen: SetMeasurements) -> None:
         self._lines["measurements"] += map(measurement_record, seen.measurements)
         self._lines["mirrors"] += [mirror_record(plane, robot, time_s) for plane in seen.planes]
+        self._lines["robots"] += map(robot_record, seen.robots)
         if math.isfinite(seen.extinction_per_m):
             told = {
                 "extinction_per_m": seen.extinction_per_m,

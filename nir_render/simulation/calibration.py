@@ -25,7 +25,7 @@ from nir_render.simulation.flare_spread import Progress, flare_spread, source_be
 from nir_render.spectra.nodes import BAND_M
 from perception.estimators import detect
 from perception.paper import regress_paper_range_constant
-from perception.types import Calibration, RawFrame
+from perception.types import Calibration, Layout, RawFrame
 
 FOG_SIGMA_PER_M = 0.05
 """What a robot knows of fog where there is some: not how thick it is. 0.05 /m is a visibility of 78 m."""
@@ -87,7 +87,35 @@ def _with_robot(known: Calibration, world: Scene | Snapshot) -> Calibration:
         sigma["hidden_background"] = math.sqrt(1.0 / 12.0)
         known = replace(known, hidden_background=0.5)
     own_sources_body_m = np.array(places, dtype=np.float64).reshape(-1, 3)
-    return replace(known, sigma=sigma, own_sources_body_m=own_sources_body_m)
+    return replace(
+        known,
+        sigma=sigma,
+        own_sources_body_m=own_sources_body_m,
+        layouts=_layouts(snapshot, known),
+    )
+
+
+def _layouts(snapshot: Snapshot, known: Calibration) -> tuple[Layout, ...]:
+    """Return where robots carry their sources that have several, one of each kind, named by its first robot.
+
+    Their flux is over that of the range constant, so far as this is known, and but for a unit's own offset.
+    """
+    own = known.camera.partition(".")[0]
+    layouts: dict[tuple[object, ...], Layout] = {}
+    for name, robot in snapshot.robots.items():
+        sources = [source.of_its_type for source in robot.rig.sources.values()]
+        if name == own or len(sources) < 2:
+            continue
+        device = snapshot.camera(known.camera).camera
+        constant = known.range_constant_dn_m2_per_s
+        flux = tuple(
+            1.0 if math.isnan(constant) else range_constant(device, source) / constant for source in sources
+        )
+        known_shares = [] if math.isnan(constant) else [flare_spread(device, source) for source in sources]
+        share_sigma = max((spread.share_sigma for spread in known_shares), default=0.0)
+        places_m = tuple(source.position_m for source in sources)
+        layouts.setdefault((places_m, flux), Layout(name, places_m, flux, flux_sigma_common=share_sigma))
+    return tuple(layouts.values())
 
 
 @lru_cache(maxsize=_KEPT)

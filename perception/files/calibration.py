@@ -4,11 +4,12 @@
 as `quaternion_body_camera_xyzw` and `position_body_m`. An entry whose standard deviation is known is written
 as {"value": v, "sigma": s}; that of the quaternion is an angle in radians. `lens_model` and `distortion` may
 be missing: the lens is then rectilinear; `dsnu_e`, `prnu`, `extinction_per_m` and
-`hidden_background` too: they are then 0; `own_sources_body_m` too.
+`hidden_background` too: they are then 0; `own_sources_body_m` and `layouts` too: they are then empty.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
@@ -16,13 +17,30 @@ import numpy as np
 
 from perception.files.entries import Entry, check_names, read_entries, read_entry
 from perception.files.fields import Faults, Place, RecordingError, check_format, get, shown
+from perception.files.readers import plain
 from perception.model.lens import COEFFICIENTS
-from perception.types import Calibration
+from perception.types import Calibration, Layout
 
 _QUATERNION = "quaternion_body_camera_xyzw"
 _MOST_DN = 65535.0
 _MOST_E = 1e6
 _MOST_CONSTANT = 1e30
+
+LAYOUT_ENTRIES = (
+    Entry("kind", "text", "the name of such robots"),
+    Entry("places_body_m", "places", "the sources' centres, in the robot's own body axes", -1e3, 1e3),
+    Entry(
+        "relative_flux", "list", "flux of each, over that which the range constant is of", 1e-6, 1e6
+    ),
+    Entry(
+        "flux_sigma_common", "number", "relative σ of these fluxes, of all sources of a robot together",
+        0.0, 10.0, null="as the range constant has it", default=math.nan,
+    ),
+    Entry(
+        "flux_sigma_own", "number", "relative σ of the flux of each source by itself", 0.0, 10.0, default=0.0
+    ),
+)  # fmt: skip
+"""The fields of a layout among `layouts`."""
 
 CALIBRATION_ENTRIES = (
     Entry("width_px", "whole", "columns of a frame", 1, 65535, sigma=True),
@@ -102,6 +120,10 @@ CALIBRATION_ENTRIES = (
         "own_sources_body_m", "places", "where the robot's own sources sit, in body axes", -1e6, 1e6,
         default=(), sigma=True,
     ),
+    Entry(
+        "layouts", "objects", "where robots of a kind carry their sources, if several; a robot's heading is "
+        "told by it", default=(), fields=LAYOUT_ENTRIES,
+    ),
 )  # fmt: skip
 """The fields of a camera in `calibration.json`."""
 
@@ -153,6 +175,8 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     record["lens_model"] = calibration.lens_model
     if calibration.offset_file:
         record["offset_file"] = calibration.offset_file
+    if calibration.layouts:
+        record["layouts"] = [_layout_record(layout) for layout in calibration.layouts]
     record["distortion"] = [float(number) for number in calibration.distortion]
     for field, sigma in calibration.sigma.items():
         name = _QUATERNION if field == "rotation_body_camera" else field
@@ -160,6 +184,10 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
             raise ValueError(f"sigma of {field!r}, which is no entry of a calibration")
         record[name] = {"value": record[name], "sigma": float(sigma)}
     return record
+
+
+def _layout_record(layout: Layout) -> dict[str, Any]:
+    return {name: plain(name, value) for name, value in asdict(layout).items()}
 
 
 def parse_calibration_document(
@@ -208,8 +236,8 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
     faults = Faults()
     with faults.kept():
         read_entry(name, _NAME, Place(place.file))
-    plain, sigma = _split_sigmas(record, place, faults)
-    values = read_entries(plain, _told_of(plain, record), place, faults)
+    values, sigma = _split_sigmas(record, place, faults)
+    values = read_entries(values, _told_of(values, record), place, faults)
     for problem in _contradictions(values, place):
         faults.problems += problem.problems
     faults.raise_any()
@@ -221,17 +249,23 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
         rotation_body_camera=Rotation.from_quat(quaternion).as_matrix(),
         sigma=sigma,
         distortion=tuple(values.pop("distortion", ())),
+        layouts=tuple(_layout(layout) for layout in values.pop("layouts", ())),
         **arrays,
         **values,
     )
 
 
-def _told_of(plain: Mapping[str, Any], record: Mapping[str, Any]) -> list[Entry]:
+def _layout(values: Mapping[str, Any]) -> Layout:
+    places = tuple((float(x), float(y), float(z)) for x, y, z in values["places_body_m"])
+    return Layout(**{**values, "places_body_m": places, "relative_flux": tuple(values["relative_flux"])})
+
+
+def _told_of(given: Mapping[str, Any], record: Mapping[str, Any]) -> list[Entry]:
     """Return the entries to read: all but those whose value is missing beside their σ."""
     return [
         entry
         for entry in CALIBRATION_ENTRIES
-        if entry.name in plain or not isinstance(record.get(entry.name), dict)
+        if entry.name in given or not isinstance(record.get(entry.name), dict)
     ]
 
 
@@ -268,6 +302,14 @@ def _contradictions(values: Mapping[str, Any], place: Place) -> Iterator[Recordi
                 f"is {values['saturation_dn']}, beyond full scale, {full_scale_dn} DN at "
                 f"{values['bit_depth']} bits", f"Write {full_scale_dn} or less", "saturation_dn",
             )  # fmt: skip
+    for number, layout in enumerate(values.get("layouts", ())):
+        inside = place.within(f"layouts[{number}]")
+        places, flux = layout["places_body_m"], layout["relative_flux"]
+        if not places:
+            yield inside.error("is empty", "Write a list of [x, y, z], in metres", "places_body_m")
+        elif len(flux) != len(places):
+            remedy = f"Write a list of {len(places)} numbers, one for each source"
+            yield inside.error(f"has {len(flux)} numbers", remedy, "relative_flux")
     black_dn, saturation_dn = values.get("black_level_dn", -math.inf), values.get("saturation_dn", math.inf)
     if black_dn >= saturation_dn:
         problem = f"is {black_dn:g}, not below saturation_dn = {saturation_dn}"

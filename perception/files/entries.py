@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from perception.files.fields import Faults, Place, check_format, get, shown
 
-Kind = Literal["text", "whole", "number", "flag", "list", "places", "bearing", "choice"]
+Kind = Literal["text", "whole", "number", "flag", "list", "places", "bearing", "choice", "objects"]
 
 REQUIRED: Any = object()
 """The default of what has none: the field must be there."""
@@ -48,6 +48,8 @@ class Entry:
         What a field that is missing counts as.
     sigma
         Whether it may stand as {"value": v, "sigma": s}.
+    fields
+        Of each of a list of `objects`.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Entry:
     null: str = ""
     default: Any = REQUIRED
     sigma: bool = False
+    fields: "tuple[Entry, ...]" = ()
 
     @property
     def required(self) -> bool:
@@ -151,6 +154,8 @@ def read_entry(value: Any, entry: Entry, place: Place) -> Any:
             return _places(value, entry, place)
         case "bearing":
             return _bearing(value, entry, place)
+        case "objects":
+            return _objects(value, entry, place)
         case _:
             return _number(value, entry, place, entry.name)
 
@@ -165,6 +170,8 @@ def wanted(entry: Entry) -> str:
         return " or ".join(f'"{choice}"' for choice in entry.choices)
     if entry.kind == "places":
         return "a list of [x, y, z]"
+    if entry.kind == "objects":
+        return "a list of objects with " + ", ".join(f"`{field.name}`" for field in entry.fields)
     if entry.kind in ("list", "bearing"):
         count = "numbers" if entry.size is None else f"{entry.size} numbers"
         return f"a list of {count}{_bounds(entry)}"
@@ -232,6 +239,21 @@ def _places(value: Any, entry: Entry, place: Place) -> list[list[float]]:
     for i, part in enumerate(value):
         with faults.kept():
             found.append(_list(part, replace(one, name=f"{entry.name}[{i}]"), place))
+    faults.raise_any()
+    return found
+
+
+def _objects(value: Any, entry: Entry, place: Place) -> list[dict[str, Any]]:
+    """Read a list of objects, none among them."""
+    if not isinstance(value, list) or len(value) > _MOST_LIST:
+        raise place.error(f"is {shown(value)}", f"Write {wanted(entry).replace('`', '')}", entry.name)
+    faults, found = Faults(), []
+    for i, part in enumerate(value):
+        inside = place.within(f"{entry.name}[{i}]")
+        with faults.kept():
+            if not isinstance(part, dict):
+                raise inside.error(f"is {shown(part)}", "Put a JSON object { } there")
+            found.append(read_entries(part, entry.fields, inside, faults))
     faults.raise_any()
     return found
 

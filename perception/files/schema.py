@@ -76,6 +76,8 @@ def _field(entry: Entry) -> dict[str, Any]:
     elif entry.kind == "places":
         place = {"type": "array", "items": {"type": "number", **_bounds(entry)}, "minItems": 3, "maxItems": 3}
         value = {"type": "array", "items": place}
+    elif entry.kind == "objects":
+        value = {"type": "array", "items": _object(entry.fields, marked=False)}
     else:
         value = {"type": _KINDS[entry.kind], **_bounds(entry)}
         value |= {"enum": list(entry.choices)} if entry.choices else {}

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.rig.fusion import Joined
-from perception.rig.mirror_flares import Flares
-from perception.rig.mirror_model import (
+from perception.rig.mirrors.flares import Flares
+from perception.rig.mirrors.model import (
     CONSTANT,
     GATE_CHI2,
     PANE,
@@ -27,8 +27,8 @@ from perception.rig.mirror_model import (
     matched,
     seeds_of_kind,
 )
-from perception.rig.mirror_planes import KINDS, mirror_plane, prior_of
-from perception.rig.mirror_seeds import seeds_of_constant
+from perception.rig.mirrors.planes import KINDS, mirror_plane, prior_of
+from perception.rig.mirrors.seeds import seeds_of_constant
 from perception.types import Ghost, Measurement, MirrorPlane, bearing_axes
 
 Array = NDArray[np.float64]

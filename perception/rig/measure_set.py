@@ -1,6 +1,7 @@
 """The one call from a set of frames to who stands where."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,8 +10,9 @@ from perception.rig.extinction import Extinction, corrected, estimated_extinctio
 from perception.rig.frame_sets import Exposed, robot_of
 from perception.rig.fusion import associated, fused
 from perception.rig.ghosts import told_ghosts
-from perception.rig.mirror_planes import check_planes
+from perception.rig.mirrors.planes import check_planes
 from perception.rig.moving import at_one_time
+from perception.rig.robots import told_robots
 from perception.rig.sightings import sightings_of
 from perception.types import (
     Calibration,
@@ -100,12 +102,13 @@ def measure_set(
             break
         detections = corrected(frames, as_found, calibrations, extinction)
         measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
-    return SetMeasurements(
+    seen = SetMeasurements(
         measurements,
         tuple(map(tuple, detections)),
         mirrors,
         *((extinction.per_m, extinction.sigma_per_m) if extinction is not None else ()),
     )
+    return replace(seen, robots=told_robots(frames, detections, calibrations, measurements))
 
 
 def _measured(

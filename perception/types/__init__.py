@@ -1,6 +1,6 @@
 """The contract: what perception reads (`inputs`) and what it says (`outputs`)."""
 
-from perception.types.inputs import Calibration, FrameKey, Odometry, RawFrame
+from perception.types.inputs import Calibration, FrameKey, Layout, Odometry, RawFrame
 from perception.types.outputs import (
     Detection,
     Detections,
@@ -8,6 +8,8 @@ from perception.types.outputs import (
     Measurement,
     Message,
     MirrorPlane,
+    PoseHypothesis,
+    RobotPose,
     SetMeasurements,
     Signal,
     Track,
@@ -20,11 +22,14 @@ __all__ = [
     "Detections",
     "FrameKey",
     "Ghost",
+    "Layout",
     "Measurement",
     "Message",
     "MirrorPlane",
     "Odometry",
+    "PoseHypothesis",
     "RawFrame",
+    "RobotPose",
     "SetMeasurements",
     "Signal",
     "Track",

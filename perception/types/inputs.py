@@ -4,6 +4,7 @@ Pixel coordinates follow OpenCV: (0, 0) is the centre of the top left pixel, u t
 Camera axes: x right, y down, z forward. Body axes: x forward, y left, z up.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -37,6 +38,30 @@ class RawFrame:
         from perception.picture import frame_png
 
         return frame_png(self.data_dn, self.black_level_dn)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the robots of one kind carry their sources.
+
+    Attributes
+    ----------
+    kind
+        Its name.
+    places_body_m
+        The sources' centres in the robot's own body axes.
+    relative_flux
+        Flux of each, over that which the range constant is of.
+    flux_sigma_common, flux_sigma_own
+        Relative σ of these fluxes: of all sources of a robot together, and of each by itself. NaN: they are
+        together as uncertain as the range constant.
+    """
+
+    kind: str
+    places_body_m: tuple[tuple[float, float, float], ...]
+    relative_flux: tuple[float, ...]
+    flux_sigma_common: float = math.nan
+    flux_sigma_own: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +116,8 @@ class Calibration:
         sphere in clear air, 0 where it sends back as much of the ambient light as it hides.
     own_sources_body_m
         Where the robot's own sources sit, in body axes, shape (n, 3): mirrors show them too.
+    layouts
+        Of robots that carry several sources, where these are known.
     sigma
         Standard deviation of entries, by field name; an entry that is missing is taken as exact.
     """
@@ -129,6 +156,7 @@ class Calibration:
     glare_radius_px: float = 10.0
     glare_exponent: float = 2.5
     own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
+    layouts: tuple[Layout, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,6 +162,57 @@ class MirrorPlane:
 
 
 @dataclass(frozen=True, eq=False)
+class PoseHypothesis:
+    """One way in which a robot may stand.
+
+    Attributes
+    ----------
+    odds
+        How probable it is, given that the flares are one robot of this kind; those of a robot sum to 1.
+    position_body_m
+        Of the robot's origin from the observer's, in the observer's body axes.
+    heading_rad
+        Angle from the observer's x axis to the robot's, about z, from −π to π.
+    covariance
+        Of position and heading, in m², m rad, rad², shape (4, 4).
+    sources
+        Which source of the layout each flare is, counted from 0.
+    """
+
+    odds: float
+    position_body_m: tuple[float, float, float]
+    heading_rad: float
+    covariance: NDArray[np.float64]
+    sources: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotPose:
+    """A robot whose layout of sources is known, as a set shows it: upright, at any height.
+
+    Attributes
+    ----------
+    robot, time_s
+        The observer's name, and the mean of its flares' times.
+    kind
+        Whose layout it has.
+    flares
+        Of which measurements it is made: the first detection of each.
+    group_odds
+        How probable it is that these flares, and no others, are one robot of this kind.
+    hypotheses
+        The most probable first.
+    """
+
+    robot: str
+    time_s: float
+    kind: str
+    flares: tuple[tuple[str, int, int], ...]
+    group_odds: float
+    hypotheses: tuple[PoseHypothesis, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class SetMeasurements:
     """What a rig measures in one set of frames.
 
@@ -176,6 +227,8 @@ class SetMeasurements:
     extinction_per_m, extinction_sigma_per_m
         Of the fog, with which ranges were corrected; NaN where it was not looked for, or the set did not
         tell it.
+    robots
+        Position and heading of robots with several sources, where the calibration knows their layout.
     """
 
     measurements: tuple[Measurement, ...]
@@ -183,6 +236,7 @@ class SetMeasurements:
     planes: tuple[MirrorPlane, ...] = ()
     extinction_per_m: float = math.nan
     extinction_sigma_per_m: float = math.nan
+    robots: tuple[RobotPose, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

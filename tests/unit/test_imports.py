@@ -44,7 +44,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.track": (),
     "perception.messages": (),
     "perception.extrinsics": (),
-    "perception.rig": (),
+    "perception.rig": ("pose", "mirrors"),
     "perception.calibration": (),
     "perception.command_estimator": (),
     "perception.estimators": (),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception import RecordingError, calibration_document, parse_calibration_document
+from perception import Layout, RecordingError, calibration_document, parse_calibration_document
 from tests.unit.perception.simulation import calibration
 
 ARRAYS = (
@@ -30,6 +30,7 @@ FULL = calibration(
     own_sources_body_m=np.array([[0.0, 1.0 / 3.0, 0.28], [0.1, 0.0, 0.0]]),
     dsnu_e=4.0 + 1.0 / 3.0,
     prnu=0.009,
+    layouts=(Layout("pair", ((0.06, 0.0, 1.0 / 3.0), (-0.06, 0.0, 0.28)), (1.0, 1.0 / 3.0), 0.1, 0.05),),
     lens_model="brown_conrady",
     distortion=(-0.1, 0.01, 1e-3, -1.0 / 3.0, 0.0),
 )
@@ -58,7 +59,14 @@ def test_a_file_without_a_lens_model_is_of_a_rectilinear_lens() -> None:
 
 def test_every_number_of_a_calibration_can_have_a_sigma() -> None:
     """What is written with a σ reads back with it, whichever entry it is of."""
-    names = {*FULL.__dataclass_fields__} - {"camera", "sigma", "lens_model", "offset_dn", "offset_file"}
+    names = {*FULL.__dataclass_fields__} - {
+        "camera",
+        "sigma",
+        "lens_model",
+        "offset_dn",
+        "offset_file",
+        "layouts",
+    }
     sigma = {name: 0.01 * number for number, name in enumerate(sorted(names), 1)}
     document = json.loads(json.dumps(calibration_document([replace(FULL, sigma=sigma)])))
     back = parse_calibration_document(document)["r1.front"]

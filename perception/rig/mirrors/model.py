@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.rig.mirror_flares import Flares
+from perception.rig.mirrors.flares import Flares
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.rig.mirror_flares import Flares
-from perception.rig.mirror_model import NEAREST_MIRROR_M
+from perception.rig.mirrors.flares import Flares
+from perception.rig.mirrors.model import NEAREST_MIRROR_M
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.rig.mirror_model import CONSTANT
+from perception.rig.mirrors.model import CONSTANT
 from perception.types import MirrorPlane
 
 Array = NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""How a robot with several sources stands: the model of its flares, and the posterior."""
