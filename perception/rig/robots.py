@@ -229,8 +229,9 @@ def _fitting_pairs(flares: Sequence[_Flare], sights: Sights, layout: Layout) -> 
 
 def _cliques(count: int, fits: Pairs, most: int) -> list[tuple[int, ...]]:
     """Return groups of two to `most` flares of which every two may be of one robot."""
-    groups = sorted(fits)
-    found: list[tuple[int, ...]] = list(groups)
+    groups: list[tuple[int, ...]] = list(fits)
+    groups.sort()
+    found = list(groups)
     for _ in range(most - 2):
         groups = [
             (*group, k)

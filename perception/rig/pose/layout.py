@@ -168,7 +168,7 @@ class PoseModel:
 
     def _nodes(self, worth_chi2: float) -> tuple[Array, Array, Array, Array]:
         """Return headings over a turn that resolve the posterior; places, χ², informations there."""
-        heading = np.arange(COARSE) * (2.0 * math.pi / COARSE)
+        heading: Array = np.arange(COARSE, dtype=np.float64) * (2.0 * math.pi / COARSE)
         found = (heading, *self._placed(heading))
         chi2 = found[2]
         low = np.flatnonzero((chi2 <= np.roll(chi2, 1)) & (chi2 < np.roll(chi2, -1)))
