@@ -71,8 +71,10 @@ def told_robots(
     measurements
         Made of the detections.
     """
+    if len(measurements) < 2:
+        return ()
     layouts = [each for each in calibrations[frames[0].camera].layouts if len(each.places_body_m) > 1]
-    if not layouts or len(measurements) < 2:
+    if not layouts:
         return ()
     sights, keys = sights_of(frames, detections, calibrations)
     row_of = {key: row for row, key in enumerate(keys)}

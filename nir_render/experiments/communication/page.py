@@ -224,11 +224,11 @@ def formation_plot(run: Run) -> Drawing:
             apart.axvspan(packet["start_s"], packet["end_s"], color=colour, alpha=0.3, linewidth=0.0)
             if commands:
                 apart.text(packet["start_s"], 0.06, packet["command"], fontsize=8, color=INK)
-        for one in run.judged.commands:
-            if one.read_s is not None:
-                wished_m = COMMANDED_M[one.command]
+        for heard in run.judged.commands:
+            if heard.read_s is not None:
+                wished_m = COMMANDED_M[heard.command]
                 apart.plot(
-                    [one.read_s, min(one.read_s + 15.0, times_s[-1])], [wished_m] * 2,
+                    [heard.read_s, min(heard.read_s + 15.0, times_s[-1])], [wished_m] * 2,
                     color=INK, linestyle="--", linewidth=0.9,
                 )  # fmt: skip
         apart.set_xlim(0.0, times_s[-1])

@@ -17,6 +17,7 @@ from nir_render.experiments.frame_sight import FrameSight
 from nir_render.experiments.measurement_sight import MeasurementSight
 from nir_render.experiments.outcome import ARENA
 from nir_render.experiments.world import Base, World
+from nir_render.run.folder import read_json
 from nir_render.simulation.sent import sent_packets
 from nir_render.truth.sent import SentTruth
 from perception import Message
@@ -131,7 +132,7 @@ def test_a_follower_reads_what_the_leader_sends_and_its_killed_run_ends_alike(
     runs.run_seed(scene, plan, 2, tmp_path / "killed")
     whole, killed = (tmp_path / folder / "runs" / "0002.json" for folder in ("whole", "killed"))
     assert whole.read_text() == killed.read_text()
-    record = runs.read_json(whole)
+    record = read_json(whole)
     assert (record["bits"], record["wrong_bits"]) == (2 * 55, 0)
     assert all([command for _, command in of_one] == ["disperse"] for of_one in record["obeyed"].values())
     number, mean, sigma = record["levels"]["dark"]

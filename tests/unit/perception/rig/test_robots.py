@@ -124,7 +124,8 @@ def figures(layout: Layout, poses: int, turn: float = 2.0 * math.pi, seed: int =
         rows.append((
             off[3], math.sqrt(best.covariance[3, 3]), bound_rad(cameras, layout, pose), right, best.odds, pull2,
         ))  # fmt: skip
-    return Figures(*np.array(rows).T, lost)
+    error, sigma, bound, right, odds, pulls2 = np.array(rows).T
+    return Figures(error, sigma, bound, right, odds, pulls2, lost)
 
 
 def is_at(hypothesis: PoseHypothesis, heading_rad: float) -> bool:
