@@ -132,7 +132,9 @@ def run_digest(scene: Scene, more: str) -> str:
 
 def _write_times(scene: Scene, folder: Path) -> None:
     """Write what is true over time, poses and packets, and what robots believe of their motion."""
-    if any(robot.moves for robot in scene.document.robots.values()):
+    robots = scene.document.robots.values()
+    # Where robots stand still, poses are of use where their headings show.
+    if any(robot.moves or len(robot.rig.sources) > 1 for robot in robots):
         run_folder.write_lines(folder / run_folder.POSES, (pose.record() for pose in true_poses(scene)))
     believed = [
         line for robot in observers_astir(scene) for line in odometry_of(scene, robot, scene.document.seed)
