@@ -319,7 +319,7 @@ class _Said:
             axes=rays.axes @ np.swapaxes(turn, 1, 2),
             angular_rad2=rays.angular_rad2 + wider,
         )
-        return replace(said, rays=moved)
+        return replace(said, rays=moved, together=moved)
 
     def _camera_of(self, keys: Iterable[tuple[str, int, int]]) -> NDArray[np.int64]:
         place = {name: number for number, name in enumerate(self.names)}

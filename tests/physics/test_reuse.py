@@ -50,9 +50,9 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     times_s: list[float] = []
     whole, other = groups.indirect, stock.indirect
 
-    def by_groups(snapshot: Snapshot, *rest: Any) -> Any:
+    def by_groups(snapshot: Snapshot, *rest: Any, **named: Any) -> Any:
         times_s.append(snapshot.time_s)
-        return whole(snapshot, *rest)
+        return whole(snapshot, *rest, **named)
 
     def by_stock(snapshot: Snapshot, *rest: Any) -> Any:
         times_s.append(snapshot.time_s)

@@ -34,7 +34,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_leaves_all_that_the_design_names(run_folder: Path) -> None:
     frames = [f"frames/r1.front/{index:06d}.png" for index in range(10)]
     assert _files(run_folder) == sorted(
-        ["calibration.json", "detections.paper.jsonl", "detections.robust.jsonl", *frames, "frames.jsonl",
+        ["calibration.json", "detections.paper.jsonl", "detections.robust.jsonl", *frames, "frames.jsonl", "look.png",
          "manifest.json", "measurements.paper.jsonl", "measurements.robust.jsonl", "messages.robust.jsonl",
          "mirrors.paper.jsonl", "mirrors.robust.jsonl", "poses.jsonl", "preview.gif", "preview.png", "report.html",
          "scene.yaml", "signals.robust.jsonl", "summary.json", "tracks.robust.jsonl", "truth.jsonl"]

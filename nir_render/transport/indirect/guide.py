@@ -131,11 +131,13 @@ def _chances(weight: Array, group: NDArray[np.int64], chosen: NDArray[np.bool_])
 def _tiers(brought: Array, emitters: Emitters) -> NDArray[np.int64]:
     """Return the tier of each emitter, by what its group brings to the scene on the mean over it.
 
-    That is an irradiance for all kinds of light, and can be compared.
+    That is an irradiance for all kinds of light, and can be compared. The sky goes with the strongest: paths
+    come to it by themselves, wherever they are led.
     """
     of_group = np.bincount(emitters.group, np.where(emitters.facet < 0, brought, 0.0))
     ratio = of_group.max(initial=0.0) / np.maximum(of_group, 1e-300)
     level = np.minimum(np.floor(np.log(ratio) / np.log(_TIER_RATIO)), _MOST_TIERS - 1)
+    level[emitters.group[emitters.kind == SKY]] = 0
     return np.unique(level[emitters.group], return_inverse=True)[1].astype(np.int64)
 
 
