@@ -189,10 +189,12 @@ def _overlap_warnings(recording: Recording, found: Mapping[str, tuple[Found, Fol
     if name is None:
         return
     hits, _ = found[name]
-    sets = (
-        {frame.camera: hits.get((frame.camera, frame.index), []) for frame in group}
-        for group in frame_sets(recording.records)
-    )
+    sets = []
+    for group in frame_sets(recording.records):
+        of_cameras: dict[str, list[Detection]] = {}
+        for frame in group:  # of a bracket all exposures
+            of_cameras.setdefault(frame.camera, []).extend(hits.get((frame.camera, frame.index), []))
+        sets.append(of_cameras)
     yield from overlap_warnings(sets, recording.calibrations)
 
 

@@ -199,8 +199,8 @@ class _Prior:
         if fixed:
             return _Prior(0.0, 0.0)
         return _Prior(
-            calibration.sigma.get("rotation_body_camera") or ASSUMED_TURN_RAD,
-            calibration.sigma.get("position_body_m") or ASSUMED_SHIFT_M,
+            calibration.sigma.get("rotation_body_camera", ASSUMED_TURN_RAD),
+            calibration.sigma.get("position_body_m", ASSUMED_SHIFT_M),
         )
 
     @property

@@ -32,6 +32,7 @@ def detect_set(
     calibrations: Mapping[str, Calibration],
     estimator: str | Estimator = "robust",
     planes: Sequence[MirrorPlane] = (),
+    odometry: Sequence[Odometry] = (),
 ) -> SetMeasurements:
     """Find the sources around a robot in a set of its cameras' frames.
 
@@ -45,6 +46,8 @@ def detect_set(
         As for `detect`.
     planes
         Mirrors known from earlier sets, in the body axes of today.
+    odometry
+        As for `measure_set`.
 
     Returns
     -------
@@ -58,7 +61,8 @@ def detect_set(
     ValueError
         As for `detect`, if a camera has no calibration, or the frames are of several robots.
     """
-    return measure_set(frames, detect_frames(frames, calibrations, estimator), calibrations, planes)
+    found = detect_frames(frames, calibrations, estimator)
+    return measure_set(frames, found, calibrations, planes, odometry)
 
 
 def measure_set(
@@ -108,7 +112,7 @@ def measure_set(
         mirrors,
         *((extinction.per_m, extinction.sigma_per_m) if extinction is not None else ()),
     )
-    return replace(seen, robots=told_robots(frames, detections, calibrations, measurements))
+    return replace(seen, robots=told_robots(frames, detections, calibrations, measurements, odometry))
 
 
 def _measured(

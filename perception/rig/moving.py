@@ -51,13 +51,15 @@ def at_one_time(sightings: Sightings, odometry: Sequence[Odometry]) -> OneTime:
     if not len(odometry) or not len(rays.time_s) or np.ptp(rays.time_s) == 0.0:
         return OneTime(sightings, float("nan"), ())
     time_s = float(rays.time_s.mean())
+    odometry = _around(rays.time_s, odometry)
     turn, moved_m = _from(rays.time_s, time_s, odometry)
     here = rays._replace(
         origin_m=np.einsum("kij,kj->ki", turn, rays.origin_m) + moved_m,
         axes=np.einsum("kij,kaj->kai", turn, rays.axes),
     )
     newest, apart_s = odometry[-1], float(np.ptp(rays.time_s))
-    between_s = float(np.max(np.diff([record.time_s for record in odometry]), initial=0.0))
+    gaps_s = np.diff([record.time_s for record in odometry])
+    between_s = float(np.min(gaps_s[gaps_s > 0.0], initial=np.inf)) if (gaps_s > 0.0).any() else 0.0
     share2 = min(apart_s / between_s, 1.0) ** 2 if between_s > 0.0 else 0.0
     turned_rad2 = share2 * newest.rotation_sigma_rad**2 + newest.rotation_walk_rad_per_sqrt_s**2 * apart_s
     shaken_m2 = share2 * newest.position_sigma_m**2 + newest.position_walk_m_per_sqrt_s**2 * apart_s
@@ -67,6 +69,15 @@ def at_one_time(sightings: Sightings, odometry: Sequence[Odometry]) -> OneTime:
         noise=np.sqrt(rays.noise**2 + shaken2),
     )
     return OneTime(replace(sightings, rays=here, together=together), time_s, tuple(odometry))
+
+
+def _around(times_s: Array, odometry: Sequence[Odometry]) -> Sequence[Odometry]:
+    """Return the records between which times lie, two at least: others are of no use, and cost time."""
+    known_s = np.array([record.time_s for record in odometry])
+    first = int(np.searchsorted(known_s, times_s.min(), side="right")) - 1
+    last = int(np.searchsorted(known_s, times_s.max(), side="right"))
+    first, last = min(max(first, 0), max(len(known_s) - 2, 0)), max(last, min(1, len(known_s) - 1))
+    return odometry[first : last + 1]
 
 
 def _from(times_s: Array, time_s: float, odometry: Sequence[Odometry]) -> tuple[Array, Array]:

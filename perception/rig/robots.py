@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.rig.frame_sets import Exposed
-from perception.rig.pose.layout import LEAST_ODDS, PoseModel, Posterior, Sights
+from perception.rig.moving import at_one_time
+from perception.rig.pose.layout import LEAST_ODDS, PoseModel, Sights
+from perception.rig.pose.partings import Candidate, told_apart
 from perception.rig.rays import UNKNOWN_RANGE
 from perception.rig.sightings import CAMERAS_MOST, CAMERAS_SHARE, LEAST_NOISE, UNCLAIMED_RANGE, sightings_of
-from perception.types import Calibration, Detection, Layout, Measurement, PoseHypothesis, RobotPose
+from perception.types import Calibration, Detection, Layout, Measurement, Odometry, PoseHypothesis, RobotPose
 
 Array = NDArray[np.float64]
 
@@ -25,9 +27,10 @@ PER_M3 = 0.1
 GATE_CHI2 = 30.0
 """More χ² than this beyond its degrees of freedom is another robot: less than once in a million."""
 
+_LEAST_ACROSS_M = 1e-3  # of sources from each other, level: less tells no heading
+
 MOST_FLARES = 40
 MOST_TRIED = 720
-MOST_TOGETHER = 10
 
 _GATE_HEADINGS = np.arange(72) * (2.0 * math.pi / 72.0)
 _GATE_SLACK = 0.05  # of the distance between two sources: half a step of the headings above
@@ -43,40 +46,33 @@ class _Flare:
     noise_m2: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """Some flares as one robot: posteriors by which source each is; the logarithm of its evidence."""
-
-    members: tuple[int, ...]
-    layout: Layout
-    ways: tuple[tuple[tuple[int, ...], Posterior, float], ...]
-    log_evidence: float
-
-
 def told_robots(
     frames: Sequence[Exposed],
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
     measurements: Sequence[Measurement],
+    odometry: Sequence[Odometry] = (),
 ) -> tuple[RobotPose, ...]:
     """Return the robots with several sources that a set of measurements shows.
 
-    A robot is told from two of its flares on, at least one of them with a range; mirror images are none.
-    Flares that no layout explains together are left alone.
+    A robot is told from two of its flares on, at least one of them with a range and its σ; mirror images are
+    none. Flares that no layout explains together are left alone, and so are sources straight above each
+    other, which tell no heading.
 
     Parameters
     ----------
-    frames, detections, calibrations
-        As for `measure_set`. The layouts are those of the first frame's camera.
+    frames, detections, calibrations, odometry
+        As for `measure_set`. Layouts are those that any of the cameras knows, by their kind.
     measurements
         Made of the detections.
     """
-    if len(measurements) < 2:
+    cameras = dict.fromkeys(frame.camera for frame in frames)
+    known = {each.kind: each for camera in cameras for each in calibrations[camera].layouts}
+    layouts = [each for each in known.values() if _tells_heading(each)]
+    claimed = any(math.isfinite(hit.range_sigma_m) for each in detections for hit in each)
+    if not layouts or not claimed or len(measurements) < 2:
         return ()
-    layouts = [each for each in calibrations[frames[0].camera].layouts if len(each.places_body_m) > 1]
-    if not layouts:
-        return ()
-    sights, keys = sights_of(frames, detections, calibrations)
+    sights, keys, time_s = sights_of(frames, detections, calibrations, odometry)
     row_of = {key: row for row, key in enumerate(keys)}
     flares = [
         _flare(each, tuple(row_of[key] for key in each.detections), sights)
@@ -86,17 +82,26 @@ def told_robots(
     flares = sorted(flares, key=lambda flare: float(np.linalg.norm(flare.place_m)))[:MOST_FLARES]
     candidates = _candidates(flares, sights, layouts)
     robots = []
-    for chosen, odds in _told_apart(candidates, [_alone(flare, sights) for flare in flares]):
-        robots.append(_robot(chosen, odds, flares))
+    for chosen, odds in told_apart(candidates, [_alone(flare, sights) for flare in flares]):
+        robots.append(_robot(chosen, odds, flares, time_s))
     return tuple(robots)
+
+
+def _tells_heading(layout: Layout) -> bool:
+    across_m = np.ptp(np.array(layout.places_body_m)[:, :2], axis=0)
+    return bool(across_m.max() > _LEAST_ACROSS_M)
 
 
 def sights_of(
     frames: Sequence[Exposed],
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
-) -> tuple[Sights, tuple[tuple[str, int, int], ...]]:
-    """Return what detections say, with the errors that they share told from their own; and which they are."""
+    odometry: Sequence[Odometry] = (),
+) -> tuple[Sights, tuple[tuple[str, int, int], ...], float]:
+    """Return what detections say, with the errors that they share told from their own; and which they are.
+
+    With odometry all is in the body axes of one time, which comes last: NaN without.
+    """
     exact = {
         name: replace(
             each,
@@ -108,14 +113,16 @@ def sights_of(
         )
         for name, each in calibrations.items()
     }
-    found = sightings_of(frames, detections, exact)
+    carried = at_one_time(sightings_of(frames, detections, exact), odometry)
+    found = carried.sightings
     rays, n = found.rays, len(found.keys)
     hits = [hit for each in detections for hit in each]
     cameras = [key[0] for key in found.keys]
     names = list(dict.fromkeys(cameras))
     own, constant, by_flux = np.zeros((n, 3, 3)), np.zeros(n), np.ones(n)
     shared = np.zeros((n, 3, 7 * len(names)))
-    own[:, :2, :2] = rays.angular_rad2
+    own[:, :2, :2] = found.together.angular_rad2
+    astray2 = found.together.noise**2 - rays.noise**2  # where the observer moved between its cameras
     for k, hit in enumerate(hits):
         calibration = calibrations[hit.camera]
         at_m = rays.range_m[k]
@@ -129,6 +136,7 @@ def sights_of(
             common = np.nan_to_num(hit.range_sigma_common_m) / at_m
             of_camera2 = min(CAMERAS_SHARE * common**2, CAMERAS_MOST**2)
             own[k, 2, 2] = max((hit.range_sigma_m / at_m) ** 2 - common**2, LEAST_NOISE**2)
+            own[k, 2, 2] += astray2[k]
             constant[k] = math.sqrt(common**2 - of_camera2)
             shared[k, 2, first + 6] = math.sqrt(of_camera2)
             by_flux[k] = _by_flux(float(common), calibration)
@@ -141,7 +149,7 @@ def sights_of(
     sights = Sights(
         rays.origin_m, rays.axes, np.log(rays.range_m), by_flux, own, shared.reshape(3 * n, -1), constant
     )
-    return sights, found.keys
+    return sights, found.keys, carried.time_s
 
 
 def _by_flux(common: float, calibration: Calibration) -> float:
@@ -165,7 +173,7 @@ def _flare(measurement: Measurement, rows: tuple[int, ...], sights: Sights) -> _
     )
 
 
-def _candidates(flares: Sequence[_Flare], sights: Sights, layouts: Sequence[Layout]) -> list[_Candidate]:
+def _candidates(flares: Sequence[_Flare], sights: Sights, layouts: Sequence[Layout]) -> list[Candidate]:
     """Return all groups of flares that may be a robot."""
     candidates = []
     for layout in layouts:
@@ -195,7 +203,10 @@ def _fitting_pairs(flares: Sequence[_Flare], sights: Sights, layout: Layout) -> 
     log_flux = np.log(np.array(layout.relative_flux))
     cosine, sine = np.cos(_GATE_HEADINGS), np.sin(_GATE_HEADINGS)
     fits: Pairs = {}
+    near = _stand_near(flares, layout)
     for i, j in combinations(range(len(flares)), 2):
+        if not near[i, j]:
+            continue
         for a, b in permutations(range(len(places_m)), 2):
             x, y, z = places_m[b] - places_m[a]
             length_m = math.sqrt(x**2 + y**2 + z**2)
@@ -229,6 +240,23 @@ def _fitting_pairs(flares: Sequence[_Flare], sights: Sights, layout: Layout) -> 
     return fits
 
 
+def _stand_near(flares: Sequence[_Flare], layout: Layout) -> NDArray[np.bool_]:
+    """Tell which two flares are not too far apart across the line of sight to be of one robot, generously."""
+    places_m = np.array(layout.places_body_m)
+    longest_m = float(np.linalg.norm(places_m[:, None] - places_m, axis=-1).max())
+    # A source of less flux seems farther off by the root of it, and so farther from others.
+    stretched = math.exp(0.5 * float(np.ptp(np.log(np.array(layout.relative_flux)))))
+    place_m = np.array([flare.place_m for flare in flares])
+    apart_m = place_m[:, None] - place_m
+    middle_m = 0.5 * (place_m[:, None] + place_m)
+    along = middle_m / np.maximum(np.linalg.norm(middle_m, axis=-1, keepdims=True), 1e-9)
+    across_m = np.linalg.norm(apart_m - (apart_m * along).sum(axis=-1, keepdims=True) * along, axis=-1)
+    # In sight's axes angles' noise is the least of the three, and K's error stretches all alike.
+    noise_m = np.array([math.sqrt(max(float(np.trace(flare.noise_m2)), 0.0)) for flare in flares])
+    reach_m = 1.5 * stretched * longest_m + 6.0 * np.minimum(noise_m[:, None] + noise_m, 0.1)
+    return ~(across_m > reach_m)  # what has no range is not told apart
+
+
 def _cliques(count: int, fits: Pairs, most: int) -> list[tuple[int, ...]]:
     """Return groups of two to `most` flares of which every two may be of one robot."""
     groups: list[tuple[int, ...]] = list(fits)
@@ -247,7 +275,7 @@ def _cliques(count: int, fits: Pairs, most: int) -> list[tuple[int, ...]]:
 
 def _candidate(
     members: tuple[int, ...], flares: Sequence[_Flare], sights: Sights, layout: Layout, fits: Pairs
-) -> _Candidate | None:
+) -> Candidate | None:
     sources = len(layout.places_body_m)
     hidden = sources - len(members)
     rows = np.array([row for k in members for row in flares[k].rows])
@@ -265,7 +293,7 @@ def _candidate(
     if not ways:
         return None
     logs = np.array([log for _, _, log in ways])
-    return _Candidate(members, layout, tuple(ways), float(np.logaddexp.reduce(logs)))
+    return Candidate(members, layout, tuple(ways), float(np.logaddexp.reduce(logs)))
 
 
 def _ways(members: tuple[int, ...], sources: int, fits: Pairs) -> list[tuple[int, ...]]:
@@ -293,62 +321,7 @@ def _alone(flare: _Flare, sights: Sights) -> float:
     return model.evidence_of_place() + math.log(PER_M3)
 
 
-def _told_apart(candidates: Sequence[_Candidate], alone: Sequence[float]) -> list[tuple[_Candidate, float]]:
-    """Return the most probable way to part all flares into robots, each with its odds over all ways.
-
-    Flares that no chain of candidates connects are parted by themselves.
-    """
-    chosen: list[tuple[_Candidate, float]] = []
-    for part in _connected(candidates):
-        gain = [each.log_evidence - sum(alone[k] for k in each.members) for each in part]
-        order = sorted(range(len(part)), key=lambda k: -gain[k])[: 4 * MOST_TOGETHER]
-        best: list[tuple[float, tuple[int, ...]]] = []
-        _part(order, [part[k].members for k in range(len(part))], gain, 0, (), 0.0, best)
-        top = max(best)
-        logs = np.array([log for log, _ in best])
-        total = float(np.logaddexp.reduce(logs))
-        for k in top[1]:
-            with_it = [log for log, picked in best if k in picked]
-            odds = math.exp(float(np.logaddexp.reduce(np.array(with_it))) - total)
-            chosen.append((part[k], min(odds, 1.0)))
-    return chosen
-
-
-_MOST_PARTINGS = 20_000
-
-
-def _part(
-    order: Sequence[int],
-    members: Sequence[tuple[int, ...]],
-    gain: Sequence[float],
-    begin: int,
-    picked: tuple[int, ...],
-    log: float,
-    found: list[tuple[float, tuple[int, ...]]],
-) -> None:
-    """Gather all ways to pick candidates that share no flare."""
-    found.append((log, picked))
-    used = {flare for k in picked for flare in members[k]}
-    for n in range(begin, len(order)):
-        if len(found) > _MOST_PARTINGS:
-            return
-        k = order[n]
-        if not used.intersection(members[k]):
-            _part(order, members, gain, n + 1, (*picked, k), log + gain[k], found)
-
-
-def _connected(candidates: Sequence[_Candidate]) -> list[list[_Candidate]]:
-    """Return candidates that share flares together."""
-    parts: list[tuple[set[int], list[_Candidate]]] = []
-    for each in candidates:
-        touching = [part for part in parts if part[0].intersection(each.members)]
-        parts = [part for part in parts if part not in touching]
-        joined = set(each.members).union(*(part[0] for part in touching))
-        parts.append((joined, [*(one for part in touching for one in part[1]), each]))
-    return [part for _, part in parts]
-
-
-def _robot(chosen: _Candidate, odds: float, flares: Sequence[_Flare]) -> RobotPose:
+def _robot(chosen: Candidate, odds: float, flares: Sequence[_Flare], time_s: float) -> RobotPose:
     hypotheses = []
     for way, posterior, log in chosen.ways:
         share = math.exp(log - chosen.log_evidence)
@@ -361,7 +334,7 @@ def _robot(chosen: _Candidate, odds: float, flares: Sequence[_Flare]) -> RobotPo
     members = [flares[k].measurement for k in chosen.members]
     return RobotPose(
         robot=members[0].robot,
-        time_s=float(np.mean([each.time_s for each in members])),
+        time_s=time_s if math.isfinite(time_s) else float(np.mean([each.time_s for each in members])),
         kind=chosen.layout.kind,
         flares=tuple(each.detections[0] for each in members),
         group_odds=odds,

@@ -25,7 +25,7 @@ def reason_of_none(prepared: PreparedFrame, blobs: int, *, late: bool = False) -
     One sentence.
     """
     counts_dn, black_dn = prepared.pixels.data_dn, prepared.pixels.black_level_dn
-    clipped = float(np.mean(counts_dn >= prepared.clipped_dn))
+    clipped = np.count_nonzero(counts_dn >= prepared.clipped_dn) / counts_dn.size
     if clipped > MOST_CLIPPED_SHARE:
         return (
             f"{100.0 * clipped:.0f} % of the pixels are clipped (at {prepared.clipped_dn} counts): expose "

@@ -172,6 +172,7 @@ class PoseModel:
         found = (heading, *self._placed(heading))
         chi2 = found[2]
         low = np.flatnonzero((chi2 <= np.roll(chi2, 1)) & (chi2 < np.roll(chi2, -1)))
+        low = low if len(low) else np.array([int(np.argmin(chi2))])  # all alike: nothing tells the heading
         # The lowest alone matter, but on a coarse grid a narrow valley seems shallow: all are gone down.
         best, place_m = heading[low], found[1][low]
         sigma = np.full(len(low), 0.1)
@@ -179,6 +180,7 @@ class PoseModel:
             residual, slope = self.whitened(place_m, best)
             information = np.swapaxes(slope, 1, 2) @ slope
             information[:, range(4), range(4)] *= 1.0 + 1e-9
+            information[:, 3, 3] += 1e-6  # a thousand radians: where nothing tells the heading
             step = np.linalg.solve(information, np.swapaxes(slope, 1, 2) @ residual[..., None])[..., 0]
             sigma = np.sqrt(np.linalg.inv(information)[:, 3, 3])
             short = np.minimum(1.0, 0.5 * 2.0 * math.pi / COARSE / np.maximum(np.abs(step[:, 3]), 1e-12))

@@ -99,3 +99,21 @@ def test_a_single_camera_says_what_it_said() -> None:
         np.testing.assert_allclose(turned.position_body_m, plain.position_body_m, atol=1e-12)
         np.testing.assert_allclose(turned.covariance, plain.covariance, rtol=1e-12)
         assert turned.time_s == plain.time_s
+
+
+def test_records_that_lie_far_back_do_not_make_the_motion_surer() -> None:
+    """One more record, two seconds before, says nothing of the set: σ of what cameras share stay as they were."""
+    rng = random(1533)
+    places = [np.append(place, np.zeros(3)) for place in _at_seams(rng, 5)]
+    frames, found = [], []
+    for name, camera in RIG.items():
+        middle_s = 0.25 + LATE_S[name]
+        frames.append(replace(frame_without_pixels(camera), time_s=middle_s - 0.5e-3))
+        hits = [detection(camera, _in_body(place, middle_s), rng) for place in places]
+        found.append([hit for hit in hits if hit is not None])
+    near = [_record(k / 100.0, rng, 1e-3, 2e-3) for k in range(20, 31)]
+    far = _record(-2.0, rng, 1e-3, 2e-3)
+    one, other = (measure_set(frames, found, RIG, odometry=each) for each in (near, [far, *near]))
+    assert len(one.measurements) == 5
+    for its, same in zip(one.measurements, other.measurements, strict=True):
+        assert its.position_covariance_m2 == pytest.approx(same.position_covariance_m2, rel=1e-12)
