@@ -9,6 +9,7 @@ from nir_render.transport.outside import Outlook
 Array = NDArray[np.float64]
 
 _MARGIN_M = 0.5
+_MOST_TALL = 1.0  # of a picture from above, over its width
 _LEAST_REACH_M = 1.0
 _AZIMUTH_RAD, _ELEVATION_RAD = np.deg2rad(-125.0), np.deg2rad(38.0)
 _HALF_FIELD = 0.5  # of the tangent, along the picture's shorter side
@@ -34,10 +35,11 @@ def interest_m(snapshot: Snapshot, bounds_m: Array) -> Array:
 def from_above(box_m: Array, width_px: int) -> Outlook:
     """Return the outlook straight down, x to the right and y up, that holds a box."""
     size_m = box_m[1] - box_m[0]
-    per_px = float(size_m[0]) / width_px
+    per_px = max(float(size_m[0]) / width_px, float(size_m[1]) / (_MOST_TALL * width_px))
     middle_m = np.array([*box_m.mean(axis=0)[:2], box_m[1, 2] + 1.0])
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-    return Outlook(middle_m, rotation, per_px, width_px, max(round(float(size_m[1]) / per_px), 8), True)
+    across_px, along_px = (max(round(float(one) / per_px), 8) for one in size_m[:2])
+    return Outlook(middle_m, rotation, per_px, across_px, along_px, True)
 
 
 def from_outside(box_m: Array, width_px: int, height_px: int) -> Outlook:

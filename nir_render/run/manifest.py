@@ -257,10 +257,12 @@ def group_noise_facts(light: Light) -> dict[str, dict[str, float | None]]:
     for name, radiance, variance in zip(
         light.groups, indirect.radiance_per_w, indirect.variance.astype(np.float64), strict=True
     ):
-        total, noise = float(radiance.sum(dtype=np.float64)), float(variance.sum())
+        # Nodes go along the same paths, and are off together.
+        together = np.sqrt(variance).sum(axis=0) ** 2
+        total, noise = float(radiance.sum(dtype=np.float64)), float(together.sum())
         facts[name] = {
             "error": _rounded(noise**0.5 / total) if total > 0.0 else None,
-            "uncertainty": _rounded(float((variance**2).sum()) ** 0.5 / noise) if noise > 0.0 else None,
+            "uncertainty": _rounded(float((together**2).sum()) ** 0.5 / noise) if noise > 0.0 else None,
         }
     return facts
 

@@ -1,6 +1,6 @@
 """A scene's bodies seen from outside, as grey at 940 nm: one ray a pixel, no light but the looker's own.
 
-Rectangles are open from behind, so that one looks into a room through its walls and its ceiling.
+Rectangles and meshes are open from behind, so that one looks into a room through its walls and its ceiling.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from nir_render.scene.documents.materials import (
     RoughConductor,
     number,
 )
-from nir_render.scene.documents.shapes import Rectangle
+from nir_render.scene.documents.shapes import Mesh, Rectangle
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.backend.variant import backend, dr, mi
@@ -120,7 +120,7 @@ def bodies_of(snapshot: Snapshot) -> Bodies:
             shape = snapshot.shapes[name]
             grey[key] = _grey(snapshot.materials[shape.material])
             bounds.append([np.array(body.bbox().min).ravel(), np.array(body.bbox().max).ravel()])
-            if isinstance(shape, Rectangle):
+            if isinstance(shape, Rectangle | Mesh):
                 open_behind.add(key)
         else:
             grey[key] = 1.0

@@ -254,7 +254,7 @@ def _stand_near(flares: Sequence[_Flare], layout: Layout) -> NDArray[np.bool_]:
     # In sight's axes angles' noise is the least of the three, and K's error stretches all alike.
     noise_m = np.array([math.sqrt(max(float(np.trace(flare.noise_m2)), 0.0)) for flare in flares])
     reach_m = 1.5 * stretched * longest_m + 6.0 * np.minimum(noise_m[:, None] + noise_m, 0.1)
-    return ~(across_m > reach_m)  # what has no range is not told apart
+    return np.asarray(~(across_m > reach_m))  # what has no range is not told apart
 
 
 def _cliques(count: int, fits: Pairs, most: int) -> list[tuple[int, ...]]:

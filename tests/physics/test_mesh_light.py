@@ -61,3 +61,32 @@ def test_a_mesh_without_normals_shines_like_the_box_that_it_is(tmp_path: Path) -
         ]
         assert np.abs(z).max() < 4.5
         assert np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+@pytest.mark.mitsuba
+def test_slots_of_any_name_are_all_there(tmp_path: Path) -> None:
+    """Two slots, `a.b` and `a:b`: none of them takes the other's place."""
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS)
+    text += "".join(
+        f"usemtl {'a.b' if index < 3 else 'a:b'}\nf {a} {b} {c} {d}\n"
+        for index, (a, b, c, d) in enumerate(QUADS)
+    )
+    (tmp_path / "crate.obj").write_text(text)
+    mesh = {"type": "mesh", "file": "crate.obj", "scale": SIDE_M, "position": "[2, -0.2, 0] m"}
+    one = _crate(mesh, tmp_path)
+    two = _crate({**mesh, "materials": {"a.b": "white", "a:b": "white"}}, tmp_path)
+    ours, theirs = (each.radiance_per_w[1, 0].astype(float) for each in (one, two))
+    assert ours.sum() == pytest.approx(theirs.sum(), rel=4e-3)
+
+
+@pytest.mark.mitsuba
+def test_one_can_stand_under_a_roof_and_in_a_room_but_not_in_a_solid(tmp_path: Path) -> None:
+    """A ray upwards crosses a roof once, and a room's wall once: neither makes them solids around the camera."""
+    corners = "".join(f"v {8 * x} {8 * y} {8 * z}\n" for x, y, z in CORNERS)
+    (tmp_path / "roof.obj").write_text("v -5 -5 3\nv 5 -5 3\nv 5 5 3\nv -5 5 3\nf 1 2 3 4\n")
+    (tmp_path / "solid.obj").write_text(corners + "".join(f"f {a} {b} {c} {d}\n" for a, b, c, d in QUADS))
+    (tmp_path / "room.obj").write_text(corners + "".join(f"f {d} {c} {b} {a}\n" for a, b, c, d in QUADS))
+    for name in ("roof", "room"):
+        assert _crate({"type": "mesh", "file": f"{name}.obj"}, tmp_path)
+    with pytest.raises(nr.InputError, match=r"is inside shapes\.crate"):
+        _crate({"type": "mesh", "file": "solid.obj"}, tmp_path)

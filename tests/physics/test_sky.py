@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from nir_render import render
 from tests.physics.conftest import Loader
 from tests.physics.documents import (
     camera_document,
@@ -116,6 +117,22 @@ def test_the_camera_sees_the_sky_itself_and_its_image_in_a_mirror(make: Loader) 
     beside = np.abs(np.arange(ROWS) - 11.5) > 1.0  # the pond ends before the horizon
     np.testing.assert_allclose(sky[beside], expected[beside], rtol=0.01)
     assert sky[beside].mean() == pytest.approx(expected[beside].mean(), rel=0.001)
+
+
+def test_a_sky_that_shines_alone_through_fog_has_samples_enough(make: Loader) -> None:
+    """The furnace under clouds that no sun comes through: the sky's light is known to 0.4 %, as beside a sun."""
+    floor = {"floor": rectangle_document((0, 0, -1), (2000, 2000), (0, 0, 1), "paint")}
+    phase = {"type": "henyey_greenstein", "g": 0.85}
+    fog = {"extinction": "0.2 /m", "albedo": 1.0, "top": "3 m", "phase": phase}
+    data = _yard(5, floor, samples=256, reflectance=1.0, max_depth=64, fog=fog)
+    data["sun"] = {**data["sun"], "irradiance": "1e-6 W/m^2/nm"}
+    data["robots"]["eye"]["orientation"] = {"pitch": "30 deg"}
+    scene = make(data)
+    light = render(scene, camera=scene.cameras()[0], time_s=0.0, seed=1)
+    assert light.indirect is not None
+    sky, variance = light.indirect.radiance_per_w[1, 0], light.indirect.variance[1, 0].astype(float)
+    assert np.sqrt(variance.sum()) < 0.004 * sky.sum()
+    assert sky.mean() == pytest.approx(1.0 / math.pi, rel=0.012)
 
 
 @pytest.mark.parametrize(("extinction_per_m", "g"), [(0.05, 0.85), (0.2, 0.0)])

@@ -121,7 +121,7 @@ class IndirectSettings(Document):
 
     scale: Annotated[int, Field(ge=1, le=16)] = 2
     samples: Annotated[int, Field(ge=4, le=65536)] | None = None
-    max_depth: Annotated[int, Field(ge=2, le=64)] | None = None
+    max_depth: Annotated[int, Field(ge=2, le=256)] | None = None
     every_s: Annotated[Time, Positive] | None = None
     error: NoiseTarget | None = None
 

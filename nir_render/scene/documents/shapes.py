@@ -164,8 +164,12 @@ def by_material(shapes: Mapping[str, ShapeDocument]) -> dict[str, ShapeDocument]
     """Return shapes of one material each, by name: of a mesh with `materials`, one for each slot."""
     found: dict[str, ShapeDocument] = {}
     for name, shape in shapes.items():
-        if not isinstance(shape, Mesh) or not shape.materials or shape.slot is not None:
+        if not isinstance(shape, Mesh) or not shape.materials:
             found[name] = shape
+            continue
+        if shape.slot is not None:
+            of_slot = shape.materials.get(shape.slot, shape.material)
+            found[name] = shape.model_copy(update={"material": of_slot, "materials": None})
             continue
         for part in shape.parts():
             own = {

@@ -1,5 +1,6 @@
 """What a mesh file holds: the triangles of each slot, and what must be true of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +66,7 @@ def checked(part: MeshPart) -> MeshPart:
     return MeshPart(part.slot, part.vertices, normals, part.faces[has_area])
 
 
-def lies_open(parts: tuple[MeshPart, ...]) -> str | None:
+def lies_open(parts: Sequence[MeshPart]) -> str | None:
     """Return why parts together have no inside: edges of one triangle alone, faces that look inwards."""
     corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
     _, index = np.unique(corners, axis=0, return_inverse=True)

@@ -3,6 +3,7 @@
 Textures, curves, lines, points and the file of materials are passed over.
 """
 
+import re
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from nir_render.scene.meshes.mesh import MeshPart
 
 Array = NDArray[np.float64]
+
+_COMMENT = re.compile(r"(?:^|(?<=\s))#")  # within a word it is part of a name
 
 _Corner = tuple[int, int]  # of a vertex and its normal, from 0; -1 where there is none
 
@@ -50,7 +53,7 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
     begun, kept = 0, ""
     for number, line in enumerate(text.splitlines(), 1):
         begun = begun if kept else number
-        kept += line.split("#", 1)[0].replace("\t", " ").strip()
+        kept += _COMMENT.split(line, maxsplit=1)[0].replace("\t", " ").strip()
         if kept.endswith("\\"):
             kept = kept[:-1] + " "
             continue
@@ -97,6 +100,8 @@ def _triangles(corners: list[_Corner], vertices: list[tuple[float, ...]]) -> lis
         raise ValueError("a face has three corners or more")
     if len(corners) == 3:
         return [tuple(corners)]
+    if len(corners) == 4 and _parts_well(*(vertices[vertex] for vertex, _ in corners)):
+        return [(corners[0], corners[1], corners[2]), (corners[0], corners[2], corners[3])]
     place = np.array([vertices[vertex] for vertex, _ in corners])
     normal = np.cross(place, np.roll(place, -1, axis=0)).sum(axis=0)  # Newell's: twice the area
     for first in range(len(corners)):
@@ -105,6 +110,18 @@ def _triangles(corners: list[_Corner], vertices: list[tuple[float, ...]]) -> lis
         if (across @ normal >= -1e-9 * (normal @ normal)).all():
             return [(rolled[0], *pair) for pair in pairwise(rolled[1:])]
     raise ValueError("the face has an outline that turns inwards: export with faces made triangles")
+
+
+def _parts_well(
+    a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...], d: tuple[float, ...]
+) -> bool:
+    """Tell whether the diagonal a c parts a quad into two that face one way; plain numbers are faster."""
+    ux, uy, uz = (c[k] - a[k] for k in range(3))
+    vx, vy, vz = (b[k] - a[k] for k in range(3))
+    wx, wy, wz = (d[k] - a[k] for k in range(3))
+    first = (vy * uz - vz * uy, vz * ux - vx * uz, vx * uy - vy * ux)
+    second = (uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx)
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2] > 0.0
 
 
 def _part(

@@ -32,7 +32,10 @@ def read_mesh(file: str | Path, up: Up | None = None) -> tuple[MeshPart, ...]:
         It is no such file, it is damaged, or it is too large; it says what is wrong, and where.
     """
     path = Path(file)
-    state = path.stat()
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     if state.st_size > _MOST_BYTES:
         raise ValueError(
             f"{path}: has {state.st_size >> 20} MiB, at most {_MOST_BYTES >> 20} are read; simplify it"
@@ -46,6 +49,8 @@ def _read(file: str, up: Up | None, _changed_ns: int, _size: int) -> tuple[MeshP
     kind = path.suffix.lower().removeprefix(".")
     try:
         parts = [checked(part) for part in _parts(path.read_bytes(), kind)]
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     if not parts:
@@ -57,10 +62,9 @@ def _read(file: str, up: Up | None, _changed_ns: int, _size: int) -> tuple[MeshP
 
 def _parts(data: bytes, kind: str) -> list[MeshPart]:
     if kind == "obj":
-        try:
-            return read_obj(data.decode("utf-8"))
-        except UnicodeDecodeError:
-            raise ValueError("this is no text, and so no OBJ file; export the mesh again") from None
+        if b"\0" in data:
+            raise ValueError("this is no text, and so no OBJ file; export the mesh again")
+        return read_obj(data.decode("utf-8-sig", errors="replace"))  # comments may be of any encoding
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         logging.getLogger("trimesh").setLevel(logging.CRITICAL)

@@ -14,7 +14,7 @@ from nir_render.camera.by_spectrum import group_emitters, group_fluxes
 from nir_render.camera.mean_frame import MeanFrame
 from nir_render.camera.optics.response import response
 
-_LONGER, _LONGEST = 4, 256
+_LONGER, _LONGEST = 4, 512
 _PIXELS, _SAMPLES = 1200, 128
 
 

@@ -22,6 +22,7 @@ from nir_render.scene.documents.materials import (
     number,
 )
 from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, Sphere
+from nir_render.scene.meshes.mesh import lies_open
 from nir_render.scene.pose import rotation_of
 from nir_render.scene.snapshot import Snapshot
 from nir_render.scene.text.units import LENGTH, format_vector
@@ -115,12 +116,12 @@ def described(
 
 def body_id(name: str) -> str:
     """Return the name of a shape as Mitsuba takes it: a dot would lead into a dictionary within."""
-    return name.replace(".", ":")
+    return name.replace("%", "%25").replace(":", "%3A").replace(".", ":")
 
 
 def shape_name(body: str) -> str:
     """Undo `body_id`."""
-    return body.replace(":", ".")
+    return body.replace(":", ".").replace("%3A", ":").replace("%25", "%")
 
 
 def source_spheres(bodies: Any) -> list[Any]:
@@ -130,14 +131,20 @@ def source_spheres(bodies: Any) -> list[Any]:
 
 
 def check_meshes(snapshot: Snapshot, point_m: NDArray[np.float64], what: str) -> None:
-    """Raise InputError where a point is inside a closed mesh: a ray leaves it an odd number of times."""
+    """Raise InputError where a point is inside a closed mesh: a ray leaves it an odd number of times.
+
+    What is open, a roof or a terrain, has no inside, and a room whose walls look inwards is one to be in.
+    """
     whole: dict[tuple[Any, ...], list[tuple[str, Mesh]]] = {}
     for name, shape in snapshot.shapes.items():
         if isinstance(shape, Mesh):
             key = (shape.file, shape.up, shape.scale, shape.position_m, str(shape.orientation))
             whole.setdefault(key, []).append((name, shape))
     for parts in whole.values():
-        if _crossings([shape for _, shape in parts], point_m) % 2 == 1:
+        shapes = [shape for _, shape in parts]
+        if _crossings(shapes, point_m) % 2 == 0:
+            continue
+        if lies_open([one for shape in shapes for one in shape.parts()]) is None:
             place = place_of_shape(parts[0][0])
             raise InputError(f"{snapshot.origin}: {what} is inside {place}; move one of them")
 

@@ -87,6 +87,13 @@ def test_bodies_are_where_they_are_and_as_grey_as_they_reflect() -> None:
     assert np.isnan(grey_picture(bodies, under)).sum() == 0  # the floor too is open, the ceiling is not
 
 
+@pytest.mark.parametrize("size_m", [(1.0, 30.0), (30.0, 1.0), (4.0, 4.0)])
+def test_a_picture_from_above_is_never_too_tall(size_m: tuple[float, float]) -> None:
+    outlook = from_above(np.array([[0.0, 0.0, 0.0], [*size_m, 2.0]]), 600)
+    assert max(outlook.width_px, outlook.height_px) == 600
+    assert outlook.per_px * np.array([outlook.width_px, outlook.height_px]) == pytest.approx(size_m, rel=0.05)
+
+
 def test_far_grounds_do_not_make_robots_small() -> None:
     ground = {"type": "rectangle", "center": "[0, 0, 0] m", "size": "[300, 300] m", "material": "grey"}
     scene = _room().with_({"shapes.ground": ground})

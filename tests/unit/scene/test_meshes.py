@@ -210,3 +210,21 @@ def test_what_is_wrong_with_a_mesh_is_told_when_the_scene_is_loaded(tmp_path: Pa
     for mesh, said in refused:
         with pytest.raises(InputError, match=said):
             _scene(tmp_path, mesh)
+
+
+def test_names_of_slots_are_any_text_and_comments_are_passed_over(tmp_path: Path) -> None:
+    text = "\ufeffv 0 0 0 # für\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl Wood#1\nf 1 2 3\nusemtl Wood#2\nf 1 2 4\n"
+    assert [part.slot for part in read_mesh(_write(tmp_path, text))] == ["Wood#1", "Wood#2"]
+    latin = _write(tmp_path, text.lstrip("\ufeff").encode("latin-1"), "latin.obj")
+    assert len(read_mesh(latin)) == 2
+
+
+def test_a_file_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
+        read_mesh(tmp_path / "gone.obj")
+
+
+def test_one_slot_alone_takes_its_own_of_the_materials(tmp_path: Path) -> None:
+    _write(tmp_path, BOX + "usemtl Deck\nf 5 7 8 6\nusemtl Block\nf 1 5 6 2\n")
+    scene = _scene(tmp_path, {"file": "m.obj", "slot": "Deck", "materials": {"Deck": "wood"}})
+    assert {name: shape.material for name, shape in scene.at(0.0).shapes.items()} == {"crate": "wood"}

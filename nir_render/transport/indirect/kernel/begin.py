@@ -109,15 +109,23 @@ def _brought_to_fog(
     scene: DeviceScene, origin: Point, direction: Vector, begin: Float, end: Float
 ) -> list[Float]:
     """Return each tier's share in what lights bring to the fog on a ray."""
+    fog = scene.fog
+    assert fog is not None  # only called in fog
     if not weighs_all(scene):
-        return _brought_to_place(scene, origin + direction * dr.minimum(0.5 * (begin + end), _FAR))
+        within = dr.minimum(0.5 * (end - begin), 1.0 / fog.extinction)
+        return _brought_to_place(scene, origin + direction * (begin + within))
     active, tiers = mi.Bool(end > begin), scene.lights.tiers
+    lost = absorbed_share(fog.extinction * (end - begin)) / fog.extinction
+    row = mi.UInt32(max(scene.lights.sky, 0))
+    of_sky = dr.gather(mi.Float, scene.lights.power, row) * lost / (2.0 * dr.pi)
 
     def more(k: UInt, _sums: list[Float]) -> Mask:
         return k < scene.lights.count
 
     def add(k: UInt, sums: list[Float]) -> tuple[UInt, list[Float]]:
         brought = brought_to_stretch(scene, k, origin, direction, begin, end, active)
+        if scene.lights.sky >= 0:  # fog does not ask for it, but its paths come from there
+            brought = dr.select(k == scene.lights.sky, of_sky, brought)
         sums = [
             total + connect.of_tier(scene.lights, k, mi.UInt32(number), brought)
             for number, total in enumerate(sums)

@@ -129,13 +129,21 @@ def leave_in_fog(
 
 
 def _share_from_fog(scene: DeviceScene, state: PathState) -> Float:
-    """Return the share of directions from fog that go into halos, by whether the path serves the sun."""
-    if scene.lights.sun < 0:
-        return mi.Float(_FROM_FOG)
-    if state.tier is None:
-        return mi.Float(_FROM_FOG_TO_SUN)
-    of_sun = dr.gather(mi.UInt32, scene.lights.tier, mi.UInt32(scene.lights.sun))
-    return dr.select(state.tier == of_sun, _FROM_FOG_TO_SUN, _FROM_FOG)
+    """Return the share of directions from fog that go into halos, by whether the path serves sun or sky.
+
+    The sky has no halo: paths that serve it alone go as fog sends them.
+    """
+    lights, share = scene.lights, mi.Float(_FROM_FOG)
+    of_sky = 0.0 if lights.sky_alone else _FROM_FOG_TO_SUN
+    for row, own in ((lights.sky, of_sky), (lights.sun, _FROM_FOG_TO_SUN)):
+        if row < 0:
+            continue
+        if state.tier is None:
+            share = mi.Float(own)
+        else:
+            serves = state.tier == dr.gather(mi.UInt32, lights.tier, mi.UInt32(row))
+            share = dr.select(serves, own, share)
+    return share
 
 
 class _Halos:

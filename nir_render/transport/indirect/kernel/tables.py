@@ -49,6 +49,7 @@ class Lights:
     pattern_polars: int
     sun: int  # row of the sun, −1 for none
     sky: int  # row of the sky, −1 for none
+    sky_alone: bool  # in its tier
     sky_table: SkyTable | None
     has_spheres: bool
     has_rectangles: bool
@@ -191,6 +192,7 @@ def upload_lights(
         pattern_polars=0 if all(pattern is None for pattern in patterns) else polars,
         sun=int(suns[0]) if suns.size else -1,
         sky=int(skies[0]) if skies.size else -1,
+        sky_alone=bool(skies.size) and int(np.count_nonzero(tier == tier[skies[0]])) == 1,
         sky_table=None if sky is None else upload_sky(sky),
         has_spheres=bool((emitters.kind == SPHERE).any()),
         has_rectangles=bool((emitters.kind == RECTANGLE).any()),
