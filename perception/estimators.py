@@ -18,7 +18,7 @@ from typing import Any
 from perception.own_code import error_line, kind_of, load_function
 from perception.paper import detect_paper
 from perception.robust.detect import detect_robust
-from perception.types import Calibration, Detection, Detections, RawFrame
+from perception.types import Calibration, Detection, Detections, Odometry, RawFrame
 
 Estimator = Callable[[RawFrame, Calibration], Iterable[Detection]]
 """Anything that turns a frame and its calibration into detections."""
@@ -184,7 +184,10 @@ class OwnSetEstimator:
     function: Callable[..., Iterable[Detection]]
 
     def __call__(
-        self, frames: Sequence[RawFrame], calibrations: Mapping[str, Calibration], odometry: None = None
+        self,
+        frames: Sequence[RawFrame],
+        calibrations: Mapping[str, Calibration],
+        odometry: Sequence[Odometry] | None = None,
     ) -> list[Detection]:
         """Find the flares of a set of frames; otherwise as `OwnEstimator`.
 
@@ -195,7 +198,7 @@ class OwnSetEstimator:
         calibrations
             Of each camera, by its name.
         odometry
-            What the robot knows of its own motion: nothing yet, None.
+            What the robot knows of its own motion, by time; None where it knows nothing.
 
         Raises
         ------

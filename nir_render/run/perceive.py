@@ -36,9 +36,11 @@ from perception import (
 from perception.causes import DetectionCauses, detection_causes
 from perception.command_estimator import LIMIT_S, is_command
 from perception.messages.own import DecoderError
+from perception.rig.frame_sets import robot_of
 from perception.rig.overlap import finest, overlap_warnings
+from perception.robust.reason import NO_FAULT
 from perception.track.own import TrackerError
-from perception.types import FrameKey
+from perception.types import FrameKey, Odometry
 
 RunEstimator = Estimator | OwnSetEstimator | CommandEstimator
 """What can be run over a folder: a function of a frame, a function of a set of frames, or a command."""
@@ -221,7 +223,7 @@ def _read_all(
                 found.pop(name, None)
 
         def start(name: str, estimator: RunEstimator) -> None:
-            readers[name] = _Reader.of(estimator, calibrations, stack)
+            readers[name] = _Reader.of(estimator, calibrations, odometry, stack)
             found[name] = {}, Follower(name, calibrations, odometry, own)
 
         def read(name: str, frames: Sequence[RawFrame], files: Sequence[Path]) -> None:
@@ -252,24 +254,39 @@ def _read_all(
 class _Notes:
     """What an estimator says of frames as a whole: why they hold nothing, and how many hold too much."""
 
-    reasons: Counter[str] = field(default_factory=Counter)
+    reasons: dict[str, Counter[str]] = field(default_factory=dict)  # by camera
+    found: Counter[str] = field(default_factory=Counter)  # detections of each camera
     truncated: int = 0
 
-    def take(self, found: Detections) -> Detections:
-        """Note what is said of a frame, and return its detections."""
-        self.reasons.update([found.reason] if found.reason else [])
+    def take(self, camera: str, found: Detections) -> Detections:
+        """Note what is said of a camera's frame, and return its detections."""
+        self.reasons.setdefault(camera, Counter()).update([found.reason] if found.reason else [])
+        self.found[camera] += len(found)
         self.truncated += found.truncated
         return found
 
     def warnings(self, name: str, total: int) -> Iterator[str]:
-        """Yield what is to be told, of an estimator that made so many detections in all."""
-        if total == 0 and self.reasons:
-            of = sum(self.reasons.values())
-            said = "; ".join(f"{reason} ({count})" for reason, count in self.reasons.most_common(3))
-            yield f"{name} found nothing in {of} frame{'s'[: of != 1]}: {said}"
+        """Yield what is to be told, of an estimator that made so many detections in all.
+
+        Of one camera alone that found nothing: where that is its frames' own fault, not for want of flares.
+        """
+        if total == 0:
+            yield from self._nothing(name, "", sum(self.reasons.values(), Counter()))
+        else:
+            for camera, reasons in self.reasons.items():
+                faults = Counter({one: n for one, n in reasons.items() if not one.startswith(NO_FAULT)})
+                if not self.found[camera] and faults:
+                    yield from self._nothing(name, f" of {camera}", faults)
         if self.truncated:
             frames = "one frame" if self.truncated == 1 else f"{self.truncated} frames"
             yield f"{name} saw more in {frames} than it measures: the brightest alone are reported"
+
+    @staticmethod
+    def _nothing(name: str, whose: str, reasons: Counter[str]) -> Iterator[str]:
+        of = sum(reasons.values())
+        if of:
+            said = "; ".join(f"{reason} ({count})" for reason, count in reasons.most_common(3))
+            yield f"{name} found nothing in {of} frame{'s'[: of != 1]}{whose}: {said}"
 
 
 @dataclass(frozen=True)
@@ -281,7 +298,12 @@ class _Reader:
     notes: _Notes = field(default_factory=_Notes)
 
     @staticmethod
-    def of(estimator: RunEstimator, calibrations: Mapping[str, Calibration], stack: ExitStack) -> "_Reader":
+    def of(
+        estimator: RunEstimator,
+        calibrations: Mapping[str, Calibration],
+        odometry: Mapping[str, Sequence[Odometry]],
+        stack: ExitStack,
+    ) -> "_Reader":
         """Set an estimator to work; a process that this starts ends with the stack."""
         if isinstance(estimator, CommandEstimator):
             process = stack.enter_context(estimator.started(calibrations))
@@ -294,13 +316,17 @@ class _Reader:
                 process.finish,
             )
         if isinstance(estimator, OwnSetEstimator):
-            return _Reader(lambda frames, _: estimator(frames, calibrations))
+            return _Reader(
+                lambda frames, _: estimator(frames, calibrations, odometry.get(robot_of(frames[0].camera)))
+            )
         notes = _Notes()
         return _Reader(
             lambda frames, _: [
                 detection
                 for frame in frames
-                for detection in notes.take(detect(frame, calibrations[frame.camera], estimator))
+                for detection in notes.take(
+                    frame.camera, detect(frame, calibrations[frame.camera], estimator)
+                )
             ],
             notes=notes,
         )

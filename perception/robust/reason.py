@@ -7,6 +7,9 @@ from perception.robust.search.prepare import PreparedFrame
 MOST_CLIPPED_SHARE = 0.5
 """A frame with more clipped pixels than this is called overexposed."""
 
+NO_FAULT = ("nothing exceeds the noise", "of what exceeds the noise")
+"""How reasons begin that are no fault of the frame: there is no flare in it."""
+
 
 def reason_of_none(prepared: PreparedFrame, blobs: int, *, late: bool = False) -> str:
     """Say why nothing was found in a frame.
@@ -42,5 +45,5 @@ def reason_of_none(prepared: PreparedFrame, blobs: int, *, late: bool = False) -
     if late:
         return "time was up before any flare was measured: give more"
     if blobs == 0:
-        return "nothing exceeds the noise"
-    return f"of what exceeds the noise, in {blobs} place{'s'[: blobs != 1]}, nothing looks like a source"
+        return NO_FAULT[0]
+    return f"{NO_FAULT[1]}, in {blobs} place{'s'[: blobs != 1]}, nothing looks like a source"

@@ -214,7 +214,7 @@ OTHER = dataclasses.replace(FRAME, camera="r1.left", index=FRAME.index + 4)
 
 
 def test_a_function_of_sets_gets_all_frames_and_calibrations_by_name(tmp_path: Path) -> None:
-    """Parameters may stand in any order; odometry is None for now; detections are of any frame of the set."""
+    """Parameters may stand in any order; odometry is None where there is none; detections are of any frame of the set."""
     estimator = _load_set(
         tmp_path,
         """

@@ -12,10 +12,12 @@ import pytest
 from nir_render.errors import InputError
 from nir_render.run.perceive import chosen_estimators, frame_estimators, perceive_run
 from perception import (
+    Odometry,
     calibration_document,
     encode_png16,
     frame_record,
     frame_sets,
+    odometry_record,
     parse_frame_record,
 )
 from tests.system.command import nir_render
@@ -96,7 +98,7 @@ def test_estimators_of_sets_and_commands_run_beside_the_others(recording: Path) 
 
 
 def test_a_recording_without_flares_is_told_why(recording: Path) -> None:
-    """Six frames, two of them clipped all over; with one flare among them nothing is to be told."""
+    """Six frames, two of them clipped all over; with flares in one camera's the other's faults still are told."""
     dark = encode_png16(np.full((100, 120), 64, dtype=np.uint16))
     for file in recording.glob("*.png"):
         file.write_bytes(
@@ -108,7 +110,25 @@ def test_a_recording_without_flares_is_told_why(recording: Path) -> None:
     assert "read out (4); 100 % of the pixels are clipped (at 4095 counts)" in said
     assert said.endswith("saturation_dn (2)")
     (recording / "r1.front-0.png").write_bytes(encode_png16(FRAME.data_dn))
+    (said,) = perceive_run(recording, estimators=chosen, progress=lambda *_: None).warnings
+    assert said.startswith("robust found nothing in 3 frames of r1.left: all pixels read 64 counts")
+    (recording / "r1.left-0.png").write_bytes(encode_png16(FRAME.data_dn))
     assert perceive_run(recording, estimators=chosen, progress=lambda *_: None).warnings == ()
+
+
+def test_an_estimator_of_sets_gets_its_robot_s_odometry(recording: Path) -> None:
+    (recording.parent / "own.py").write_text(
+        "from perception import detect\n"
+        "def sets(frames, calibrations, odometry):\n"
+        "    assert [record.time_s for record in odometry] == [0.0, 0.5]\n"
+        "    return [hit for frame in frames for hit in detect(frame, calibrations[frame.camera])]\n"
+    )
+    records = [Odometry(robot, at_s, np.zeros(3), np.eye(3)) for robot in ("r1", "r2") for at_s in (0.0, 0.5)]
+    lines = [json.dumps(odometry_record(record)) for record in records]
+    (recording / "odometry.jsonl").write_text("\n".join(lines))
+    chosen = chosen_estimators([f"{recording.parent / 'own.py'}:sets"])
+    done = perceive_run(recording, estimators=chosen, progress=lambda *_: None)
+    assert (done.detections, done.failures) == ({"sets": 6}, {})
 
 
 @pytest.mark.parametrize(
