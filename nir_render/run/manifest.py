@@ -119,7 +119,7 @@ def ambient_facts(scene: Scene) -> dict[str, Any] | None:
             "level_lx": level_lx,
             "factor_of_lamps": _rounded(level_lx / written_lx),
             "interreflection": False,
-            "why_not": "lamps are scaled by their direct light; what walls reflect over 380 to 780 nm is not reckoned",
+            "why_not": "direct light alone: what walls reflect over 380 to 780 nm is not reckoned",
         }
     return facts or None
 
