@@ -23,7 +23,7 @@ from nir_render.scene.documents.materials import (
 from nir_render.scene.documents.shapes import Mesh, Rectangle
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
-from nir_render.transport.backend.variant import backend, dr, mi
+from nir_render.transport.backend.variant import backend, dr, mi, shape_number
 from nir_render.transport.world import mitsuba_scene
 
 Array = NDArray[np.float64]
@@ -111,12 +111,12 @@ def bodies_of(snapshot: Snapshot) -> Bodies:
     grey, numbers = {}, {}
     open_behind, bounds = set(), []
     for order, body in enumerate(scene.shapes()):
-        name = mitsuba_scene.shape_name(body.id().removeprefix("shape_").rpartition("_")[0])
+        name = mitsuba_scene.shape_of_body(snapshot, body.id())
         key = order
         if backend().vectorised:  # as rays that meet it tell it
-            key = int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(body)))[0])
+            key = shape_number(body)
         numbers[body.id()] = key
-        if body.id().startswith("shape_") and name in snapshot.shapes:
+        if name is not None:
             shape = snapshot.shapes[name]
             grey[key] = _grey(snapshot.materials[shape.material])
             bounds.append([np.array(body.bbox().min).ravel(), np.array(body.bbox().max).ravel()])

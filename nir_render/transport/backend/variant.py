@@ -100,6 +100,11 @@ def set_threads(count: int) -> None:
     dr.set_thread_count(count)
 
 
+def shape_number(shape: Any) -> int:
+    """Return the number by which rays of a vectorised variant tell a shape that they meet."""
+    return int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0])
+
+
 def blocked(
     scene: Any,
     origins_m: Array,
@@ -133,7 +138,7 @@ def blocked(
         hit = scene.ray_intersect_preliminary(ray)
         hits = np.array(hit.is_valid(), dtype=bool)
         found = np.array(dr.reinterpret_array(mi.UInt32, hit.shape))
-        numbers = [int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s)))[0]) for s in shapes]
+        numbers = [shape_number(shape) for shape in shapes]
         return np.asarray(hits & ((own < 0) | (found != np.array([*numbers, 0])[own])), dtype=bool)
     hits = np.zeros(len(reach_m), dtype=bool)
     for index, (origin, direction, reach) in enumerate(zip(origins_m, directions, reach_m, strict=True)):

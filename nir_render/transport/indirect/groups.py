@@ -24,7 +24,7 @@ from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
 from nir_render.spectra.skies import CieSky, cie_sky
-from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.backend.variant import dr, mi, shape_number
 from nir_render.transport.indirect.guide import guide
 from nir_render.transport.indirect.kernel.begin import Film
 from nir_render.transport.indirect.kernel.draws import lane_draws
@@ -335,7 +335,7 @@ def _shape_columns(
 ) -> dict[str, NDArray[np.int64]]:
     """Return what each of Mitsuba's shapes is, by its number in Mitsuba."""
     numbers = [
-        (shape.id(), int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]))
+        (shape.id(), shape_number(shape))
         for bodies in worlds
         for shape in bodies.shapes()  # type: ignore[attr-defined]
     ]
@@ -350,8 +350,8 @@ def _shape_columns(
     first_facet = {name: index for index, name in reversed(list(enumerate(flat.name)))}
     for body, number in numbers:
         columns["light"][number] = light_of_body.get(body, -1)
-        name = mitsuba_scene.shape_name(body.removeprefix("shape_").rpartition("_")[0])
-        if not body.startswith("shape_") or name not in snapshot.shapes:
+        name = mitsuba_scene.shape_of_body(snapshot, body)
+        if name is None:
             continue
         shape = snapshot.shapes[name]
         material = snapshot.materials[shape.material]

@@ -119,9 +119,11 @@ def body_id(name: str) -> str:
     return name.replace("%", "%25").replace(":", "%3A").replace(".", ":")
 
 
-def shape_name(body: str) -> str:
-    """Undo `body_id`."""
-    return body.replace(":", ".").replace("%3A", ":").replace("%25", "%")
+def shape_of_body(snapshot: Snapshot, body: str) -> str | None:
+    """Return the name of the shape that one of Mitsuba's is of, by its id; None of lamps and sources."""
+    name = body.removeprefix("shape_").rpartition("_")[0]
+    name = name.replace(":", ".").replace("%3A", ":").replace("%25", "%")
+    return name if body.startswith("shape_") and name in snapshot.shapes else None
 
 
 def source_spheres(bodies: Any) -> list[Any]:
