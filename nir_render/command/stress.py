@@ -49,7 +49,8 @@ def stress(
     from nir_render.command.progress import progress_bar
     from nir_render.stress.campaign import load_campaign
     from nir_render.stress.jobs import plan
-    from nir_render.stress.sweep import StoppedError, sweep
+    from nir_render.stress.refine import sweep_refined
+    from nir_render.stress.sweep import StoppedError
 
     campaign = load_campaign(file)
     limit_bytes = light_limit_bytes(light_gib)
@@ -60,16 +61,15 @@ def stress(
         _show_plan(campaign, jobs, folder, as_json)
         return
     try:
-        with progress_bar("stress") as progress:
-            result = sweep(
-                campaign,
-                jobs,
-                folder,
-                workers=workers,
-                progress=progress,
-                light=light_folder,
-                light_limit_bytes=limit_bytes,
-            )
+        result = sweep_refined(
+            campaign,
+            jobs,
+            folder,
+            workers=workers,
+            bar=progress_bar,
+            light=light_folder,
+            light_limit_bytes=limit_bytes,
+        )
     except StoppedError as stopped:
         note(f"{stopped}; the same command goes on: {shlex.join(['nir-render', *sys.argv[1:]])}")
         raise typer.Exit(128 + signal.SIGINT) from None

@@ -1,11 +1,9 @@
-"""The jobs of a campaign: one for each combination of values and seed, named by a hash of what it does."""
+"""The jobs of a campaign: one for each point and seed, named by a hash of what it does."""
 
 import hashlib
-import itertools
-import math
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from nir_render.run.manifest import versions as run_versions
 from nir_render.run.perceive import frame_estimators
 from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
+from nir_render.stress.design.points import Point, number_of_points, points_of
 from nir_render.transport.fingerprint import code_hash
 from perception.estimators import OwnEstimator
 
@@ -35,74 +34,70 @@ class Job:
     ----------
     key
         32 hexadecimal digits: the hash of the resolved scene with its seed, the estimators, and the code.
-    values
-        The index into each axis's values, shape (axes,).
+    point
+        What is set in the campaign's scene.
     settings
-        What is changed in the campaign's scene, the seed included, by dotted path.
+        The same with the seed, by dotted path.
     light
         Jobs with the same words here see the same geometry: they share light.
     """
 
     key: str
-    values: tuple[int, ...]
+    point: Point
     seed: int
     settings: dict[str, Any]
     light: str
 
 
-def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: None) -> list[Job]:
-    """Return the jobs of a campaign, in the order of its axes and seeds.
+def plan(
+    campaign: Campaign,
+    progress: Callable[[int, int], None] = lambda *_: None,
+    planned: Sequence[Job] = (),
+) -> list[Job]:
+    """Return the jobs of a campaign, in the order of its points and seeds.
 
     Every scene is built, so that nothing that the input does wrong is found after hours. `progress` is told
-    how many are, of all.
+    how many are, of all; `planned` are jobs of the same campaign with fewer points, whose scenes were built.
 
     Raises
     ------
     InputError
-        A combination of values that makes no scene, or one whose camera cannot see.
+        A point that makes no scene, or one whose camera cannot see.
     """
-    sizes = [len(axis.values) for axis in campaign.axes]
+    number = number_of_points(campaign.axes, campaign.sample)
     made_by = _made_by(campaign)
+    known: dict[tuple[float | str, ...], list[Job]] = {}
+    for job in planned:
+        known.setdefault(job.point.written, []).append(job)
     jobs: list[Job] = []
     problems: list[str] = []
-    values_of_scene: dict[str, tuple[int, ...]] = {}
-    for built, values in enumerate(itertools.product(*map(range, sizes))):
-        progress(built, math.prod(sizes))
-        settings = settings_of(campaign, values)
+    place_of_scene: dict[str, str] = {}
+    for built, point in enumerate(points_of(campaign.axes, campaign.sample)):
+        progress(built, number)
+        if point.written in known:
+            jobs += [replace(job, point=point) for job in known[point.written]]
+            continue
+        place = ", ".join(
+            f"{axis.name} = {label}" for axis, label in zip(campaign.axes, point.labels, strict=True)
+        )
         try:
-            scene = campaign.scene.with_({**settings, "seed": 0})
+            scene = campaign.scene.with_({**point.settings, "seed": 0})
             geometry = _geometry(scene)
         except InputError as error:
-            problems += [
-                f"{campaign.path}: at {_place(campaign, values)}: {problem}" for problem in error.problems
-            ]
+            problems += [f"{campaign.path}: at {place}: {problem}" for problem in error.problems]
             continue
         scene_hash = hashlib.sha256(scene.document.model_dump_json().encode()).hexdigest()
-        if scene_hash in values_of_scene:
-            same = _place(campaign, values_of_scene[scene_hash])
-            problems.append(f"{campaign.path}: at {_place(campaign, values)}: the same scene as at {same}")
-        values_of_scene[scene_hash] = values
+        if scene_hash in place_of_scene:
+            problems.append(f"{campaign.path}: at {place}: the same scene as at {place_of_scene[scene_hash]}")
+        place_of_scene[scene_hash] = place
         for seed in campaign.seeds:
             parts = (scene_hash, f"seed {seed}", geometry, *made_by)
             key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:_DIGITS]
-            jobs.append(Job(key, values, seed, {**settings, "seed": seed}, f"{seed} {geometry}"))
-    progress(math.prod(sizes), math.prod(sizes))
+            jobs.append(Job(key, point, seed, {**point.settings, "seed": seed}, f"{seed} {geometry}"))
+    progress(number, number)
     if problems:
         raise InputError(*_first_of(problems))
     return jobs
-
-
-def _place(campaign: Campaign, values: tuple[int, ...]) -> str:
-    return ", ".join(f"{axis.name} = {axis.labels[i]}" for axis, i in zip(campaign.axes, values, strict=True))
-
-
-def settings_of(campaign: Campaign, values: tuple[int, ...]) -> dict[str, Any]:
-    """Return what a combination of values changes in the campaign's scene, by dotted path."""
-    return {
-        path: value
-        for axis, index in zip(campaign.axes, values, strict=True)
-        for path, value in axis.settings(index).items()
-    }
 
 
 def _geometry(scene: Scene) -> str:

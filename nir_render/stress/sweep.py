@@ -201,7 +201,7 @@ def _gather(
         rows, frames_sha256 = part
         done.append(job)
         tables.append(rows)
-        labels = {axis.name: axis.labels[i] for axis, i in zip(campaign.axes, job.values, strict=True)}
+        labels = dict(zip((axis.name for axis in campaign.axes), job.point.labels, strict=True))
         lines.append(
             {
                 "format": 1,

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from nir_render.report.parts import Table, named_mark
 from nir_render.report.wording import counted, share
-from nir_render.stress.axes import Axis
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS, Metric
 from nir_render.stress.page.words import metric_text
 from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, JobSums

@@ -8,12 +8,12 @@ import pyarrow as pa
 
 from nir_render.report.wording import counted, metres, share, significant
 from nir_render.scene.text.units import ANGLE, LENGTH
-from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.crossings import Edge, Span
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import COUNTS, METRICS, SHARES, Bound
-from nir_render.stress.reach import Extent, Reach, corners_kept, reaches_of
-from nir_render.stress.sums import job_sums
+from nir_render.stress.reach import Extent, Reach, campaign_reaches, corners_kept
+from nir_render.stress.sums import at_written_values, job_sums
 
 _BEYOND = {"nothing there": "nothing to judge", "not defined": "no such figure"}
 _MOST_NAMED = 6
@@ -193,13 +193,14 @@ def _listed(labels: Sequence[str]) -> str:
 def reach_lines(campaign: Campaign, rows: pa.Table) -> list[str]:
     """Say of each bound how each estimator keeps it, in lines for a terminal."""
     sums = job_sums(campaign.axes, rows)
-    reaches = reaches_of(campaign.axes, campaign.bounds, sums, campaign.seeds[0])
+    reaches = campaign_reaches(campaign, sums)
+    _, written = at_written_values(campaign.axes, sums)
     lines = []
     for bound in campaign.bounds:
         lines.append(bound_text(bound))
         for name in sums.estimators:
             of_estimator = [reach for reach in reaches if reach.bound == bound and reach.estimator == name]
             lines.append(
-                f"  {name} {sentence_of(campaign.axes, of_estimator, corners_kept(bound, name, sums))}"
+                f"  {name} {sentence_of(campaign.axes, of_estimator, corners_kept(bound, name, written))}"
             )
     return lines

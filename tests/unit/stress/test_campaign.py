@@ -69,7 +69,7 @@ def test_every_combination_gets_every_seed(tmp_path: Path) -> None:
     campaign, jobs = planned(tmp_path)
     assert campaign.seeds == (1, 2)
     assert len(jobs) == len({job.key for job in jobs}) == 3 * 2 * 2
-    assert [job.values for job in jobs[:4]] == [(0, 0), (0, 0), (0, 1), (0, 1)]
+    assert [job.point.values for job in jobs[:4]] == [(0, 0), (0, 0), (0, 1), (0, 1)]
     scene = campaign.scene.with_(jobs[-1].settings)
     assert scene.document.robots["r2"].position_m == (4.0, 0.2, 0.0)
     assert scene.camera("r1.front")[1].exposure_s == 1e-3
@@ -80,7 +80,7 @@ def test_light_is_shared_where_only_the_exposure_differs(tmp_path: Path) -> None
     _, jobs = planned(tmp_path)
     assert len({job.light for job in jobs}) == 3 * 2  # each range, each seed
     for job in jobs:
-        assert {other.values[0] for other in jobs if other.light == job.light} == {job.values[0]}
+        assert {other.point.values[0] for other in jobs if other.light == job.light} == {job.point.values[0]}
 
 
 def test_a_job_is_named_by_what_it_does(tmp_path: Path) -> None:
