@@ -54,20 +54,27 @@ class Repetitions:
 
 @dataclass(frozen=True, eq=False)
 class AlongAxis:
-    """The jobs that tell of one axis (`sums.along`), and their repetitions."""
+    """The jobs that tell of one axis (`sums.along`), and their repetitions.
+
+    `has_corners` is false where jobs are samples of the space of all axes: no combination of the others is
+    run at all values of this one.
+    """
 
     sums: JobSums
     repetitions: Repetitions
+    has_corners: bool
 
 
-def along_axes(axes: Sequence[Axis], sums: JobSums, seed: int) -> tuple[AlongAxis, ...]:
+def along_axes(
+    axes: Sequence[Axis], sums: JobSums, seed: int, *, sampled: bool = False
+) -> tuple[AlongAxis, ...]:
     """Return the jobs and the repetitions for each axis; `seed` keys them, as in `draw_repetitions`."""
     if not any(any(axis.added) for axis in axes):
-        return tuple(AlongAxis(sums, drawn) for drawn in draw_repetitions(sums.place, seed))
+        return tuple(AlongAxis(sums, drawn, not sampled) for drawn in draw_repetitions(sums.place, seed))
     found = []
     for index in range(len(axes)):
         own = along(axes, sums, index)
-        found.append(AlongAxis(own, draw_repetitions(own.place, seed)[index]))
+        found.append(AlongAxis(own, draw_repetitions(own.place, seed)[index], not sampled))
     return tuple(found)
 
 

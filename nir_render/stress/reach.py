@@ -116,9 +116,9 @@ def reaches_of(
     sampled
         The jobs are samples of the space of all axes: it has no corners, and none is worst.
     """
-    told = along_axes(axes, sums, seed)
+    told = along_axes(axes, sums, seed, sampled=sampled)
     return tuple(
-        _reach(axes, axis, bound, name, told[axis], sampled=sampled)
+        _reach(axes, axis, bound, name, told[axis])
         for bound in bounds
         for axis in range(len(axes))
         for name in sums.estimators
@@ -142,9 +142,7 @@ def corners_kept(bound: Bound, estimator: str, sums: JobSums) -> tuple[int, int]
     return int(kept.sum()), int((cells[ASKED] > 0.0).sum())
 
 
-def _reach(
-    axes: Sequence[Axis], index: int, bound: Bound, name: str, told: AlongAxis, *, sampled: bool
-) -> Reach:
+def _reach(axes: Sequence[Axis], index: int, bound: Bound, name: str, told: AlongAxis) -> Reach:
     sums, repetitions = told.sums, told.repetitions
     axis, metric, size = axes[index], METRICS[bound.metric], len(axes[index].labels)
     totals, at = sums.by_metric[name, bound.metric], sums.place[:, index]
@@ -162,7 +160,7 @@ def _reach(
         slices=int(everywhere.status != "nothing to judge"),
         slices_kept=int(everywhere.status in ("throughout", "wherever judged")),
     )
-    if count <= 1 or sampled:
+    if count <= 1 or not told.has_corners:
         return reach
     cells = pooled(totals, slice_of * size + at, count * size).reshape(-1, count, size)
     value, judged = metric.value(cells[TOTAL], cells[COUNT]), cells[ASKED] > 0.0

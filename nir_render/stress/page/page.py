@@ -54,13 +54,14 @@ def campaign_html(campaign: Campaign, rows: pa.Table, facts: Mapping[str, Any]) 
     axes, sums = campaign.axes, job_sums(campaign.axes, rows)
     reaches = campaign_reaches(campaign, sums)
     _, written = at_written_values(axes, sums)
+    told = along_axes(axes, sums, campaign.seeds[0], sampled=campaign.sample is not None)
     noise_sentence, noise_warning = render_noise_sentences(rows)
     return render_page(
         "stress/page/page.html",
         title=campaign.name,
         subtitle=[
             f"{counted(len(sums.jobs), 'job')}, {counted(_frames(sums), 'frame')}",
-            " × ".join(f"{axis.title} ({len(axis.labels)})" for axis in axes),
+            _design(campaign),
             counted(len(campaign.seeds), "seed"),
             f"estimators: {', '.join(sums.estimators) or 'none'}",
         ],
@@ -73,7 +74,8 @@ def campaign_html(campaign: Campaign, rows: pa.Table, facts: Mapping[str, Any]) 
         overall=overall_table(written),
         repeated_in_corners=repeated_in_corners(written.place),
         least_of_one=LEAST_OF_ONE,
-        metrics=metric_sections(campaign, sums, along_axes(axes, sums, campaign.seeds[0])),
+        sampled=campaign.sample is not None,
+        metrics=metric_sections(campaign, sums, told),
         worst=_worst(campaign, sums, facts),
         false_alarms=false_alarms_table(rows, sums),
         render_noise={"sentence": noise_sentence, "warning": noise_warning},
@@ -83,6 +85,19 @@ def campaign_html(campaign: Campaign, rows: pa.Table, facts: Mapping[str, Any]) 
         facts=_facts(facts),
         known_metrics=list(METRICS.values()),
     )
+
+
+def _design(campaign: Campaign) -> str:
+    """Say how many points there are, and of what: 32 Sobol points of range × exposure."""
+    if campaign.sample is not None:
+        words = {"sobol": "Sobol points", "latin_hypercube": "points of a Latin hypercube"}
+        kind = words.get(campaign.sample.design, "random points")
+        return f"{campaign.sample.count} {kind} of {' × '.join(axis.title for axis in campaign.axes)}"
+    parts = []
+    for axis in campaign.axes:
+        written, added = len(axis.written()), sum(axis.added)
+        parts.append(f"{axis.title} ({written}{f' + {added} at limits' if added else ''})")
+    return " × ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -136,9 +151,11 @@ def _bound_section(campaign: Campaign, bound: Bound, sums: JobSums, reaches: Seq
         row: list[str] = [axis.title]
         for name in sums.estimators:
             reach = next(reach for reach in of_bound if (reach.axis, reach.estimator) == (index, name))
-            row += [_pooled_cell(campaign, reach), _worst_cell(campaign, reach)]
+            row.append(_pooled_cell(campaign, reach))
+            if campaign.sample is None:
+                row.append(_worst_cell(campaign, reach))
         rows.append(row)
-    slices = ("all corners together", "worst corner")
+    slices = ("all corners together", "worst corner") if campaign.sample is None else ("all points",)
     headings = ["along", *(f"{name}: {which}" for name in sums.estimators for which in slices)]
     return BoundSection(bound_text(bound), sentences, Table(headings, rows))
 

@@ -54,7 +54,9 @@ def against_axes(
             of = {name: sums.by_metric[name, metric.name] for name in names}
             points = {name: points_of(metric, of[name], at, size, told[index].repetitions) for name in names}
             for panel, name in zip(row, names, strict=True):
-                corners = _corners(metric, of[name], sums.place, index, size)
+                corners = np.empty((0, size))
+                if told[index].has_corners:
+                    corners = _corners(metric, of[name], sums.place, index, size)
                 _panel(panel, metric, name, names, x, points, corners, bound)
                 _ticks_x(panel, axis, x, points[name], metric)
                 panel.set_xlabel(short(axis.title, 40) + (f", {axis.unit}" if axis.unit else ""))

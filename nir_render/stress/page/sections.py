@@ -57,6 +57,7 @@ def metric_sections(campaign: Campaign, sums: JobSums, told: Sequence[AlongAxis]
         The jobs and repetitions for each axis (see `along_axes`).
     """
     bounds = {bound.metric: bound for bound in campaign.bounds}
+    sampled = campaign.sample is not None
     sections: list[MetricSection] = []
     drawn = 0
     for name in metrics_shown(campaign):
@@ -69,7 +70,7 @@ def metric_sections(campaign: Campaign, sums: JobSums, told: Sequence[AlongAxis]
                 explained=_capitalised(metric.explained),
                 unfolded=len(sections) < _UNFOLDED,
                 counts_key=_counts_key(metric),
-                line_key=tuple(_line_key(sums, metric, bounded=bound is not None)),
+                line_key=tuple(_line_key(sums, metric, bounded=bound is not None, sampled=sampled)),
                 against_axes=tuple(against),
                 map_key=_map_key(metric, bound) if _small_pairs(campaign.axes) else "",
                 over_axes=tuple(over),
@@ -134,11 +135,13 @@ def _counts_key(metric: Metric) -> str:
     return "Below each value stands of how many sources, of those that count, the figure is."
 
 
-def _line_key(sums: JobSums, metric: Metric, *, bounded: bool) -> Iterator[LineKey]:
+def _line_key(sums: JobSums, metric: Metric, *, bounded: bool, sampled: bool) -> Iterator[LineKey]:
     """Explain the lines of a plot against an axis."""
     colour = style.look(sums.estimators[0], sums.estimators).colour if sums.estimators else style.INK
-    yield LineKey(colour, "all corners together, with bars of 68 %", width="2.5")
-    if sums.place.shape[1] > 1:
+    yield LineKey(
+        colour, f"all {'points' if sampled else 'corners'} together, with bars of 68 %", width="2.5"
+    )
+    if sums.place.shape[1] > 1 and not sampled:
         yield LineKey(colour, "each corner, or many as a band", width="0.8")
     if len(sums.estimators) > 1:
         yield LineKey(style.INK, "the other estimators", dashes="4 2")

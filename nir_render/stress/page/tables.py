@@ -130,6 +130,7 @@ def axes_table(axes: Sequence[Axis]) -> Table:
         shown = ", ".join(axis.labels[:_MOST_LABELS])
         more = len(axis.labels) - _MOST_LABELS
         last = f", … {axis.labels[-1]} ({len(axis.labels)} values)" if more > 0 else ""
+        last += f"; {counted(sum(axis.added), 'value')} of these added at limits" if any(axis.added) else ""
         rows.append([axis.title, ", ".join(axis.paths), shown + last])
     return Table(("axis", "sets", "values"), rows)
 

@@ -95,11 +95,12 @@ def sentence_of(axes: Sequence[Axis], reaches: Sequence[Reach], corners: tuple[i
         In how many combinations of all axes' values it is kept, and in how many there is something to judge.
     """
     kept, judged = corners
+    of_what = "values" if all(axis.edges is None for axis in axes) else "parts"
     if not judged:
         return "has nothing to be judged by."
     if not kept:
-        return f"keeps it at none of {counted(judged, 'combination')} of values."
-    parts = [f"keeps it at {kept} of {counted(judged, 'combination')} of values"]
+        return f"keeps it at none of {counted(judged, 'combination')} of {of_what}."
+    parts = [f"keeps it at {kept} of {counted(judged, 'combination')} of {of_what}"]
     for reach in reaches:
         axis = axes[reach.axis]
         text = f"along {axis.title} {extent_text(axis, reach.pooled)}"
