@@ -115,12 +115,15 @@ def sweep(
 def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[str, Any]:
     """Return what a sweep has to do, as one JSON object: jobs, those that the folder holds, geometries.
 
+    Files of jobs are counted, not read: one that is broken counts here, and is done again by the sweep.
+
     Errors as `sweep`.
     """
     done = 0
     if folder.exists():
         check_folder(folder, campaign)
-        done = sum(read_part(part_file(folder / _PARTS, job)) is not None for job in jobs)
+        held = {path.name for path in (folder / _PARTS).glob("*")}
+        done = sum(part_file(folder / _PARTS, job).name in held for job in jobs)
     geometries = len({job.light for job in jobs})
     return {"campaign": campaign.name, "jobs": len(jobs), "done": done, "geometries": geometries}
 

@@ -1,6 +1,7 @@
 """Campaign documents: what they become, and what is refused before anything runs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,21 @@ def test_every_combination_gets_every_seed(tmp_path: Path) -> None:
     assert scene.document.robots["r2"].position_m == (4.0, 0.2, 0.0)
     assert scene.camera("r1.front")[1].exposure_s == 1e-3
     assert (scene.document.seed, scene.document.clock.frames) == (2, 1)
+
+
+def test_processes_plan_the_same_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign, jobs = planned(tmp_path)
+    monkeypatch.setattr("nir_render.stress.jobs._MANY", 2)
+    monkeypatch.setattr("nir_render.stress.jobs._CHUNK", 2)
+    monkeypatch.setattr("nir_render.stress.jobs.usual_workers", lambda: 2)
+    assert plan(campaign) == jobs
+    broken = replace(campaign, axes=(replace(campaign.axes[0], values=("0 m", "2 m", "inf m")),))
+    with pytest.raises(InputError) as told:
+        plan(broken)
+    monkeypatch.undo()
+    with pytest.raises(InputError) as alone:
+        plan(broken)
+    assert told.value.problems == alone.value.problems
 
 
 def test_light_is_shared_where_only_the_exposure_differs(tmp_path: Path) -> None:
