@@ -295,6 +295,7 @@ def test_parts_that_are_written_alike_are_read_once_but_not_those_that_follow_fr
     document = {
         "format": 1,
         "name": "two",
+        "observe": ["r1.front"],
         "robots": {
             "r1": {"rig": "infra_swarm"},
             "r2": {"rig": "infra_swarm", "position": "[1, 0, 0] m"},
