@@ -37,6 +37,14 @@ def stress(
             "--workers", min=1, help="Processes to work in; by default as many as cores, at most 8."
         ),
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Have the workers of a Dask scheduler do it: tcp://host:8786.",
+        ),
+    ] = None,
     light_folder: LightFolder = None,
     light_gib: LightLimit = 4.0,
     only_plan: Annotated[
@@ -52,6 +60,8 @@ def stress(
     from nir_render.stress.refine import sweep_refined
     from nir_render.stress.sweep import StoppedError
 
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers: the scheduler has its own; leave out one of both")
     campaign = load_campaign(file)
     limit_bytes = light_limit_bytes(light_gib)
     folder = output if output is not None else Path("outputs") / campaign.name
@@ -69,6 +79,7 @@ def stress(
             bar=progress_bar,
             light=light_folder,
             light_limit_bytes=limit_bytes,
+            scheduler=scheduler,
         )
     except StoppedError as stopped:
         note(f"{stopped}; the same command goes on: {shlex.join(['nir-render', *sys.argv[1:]])}")

@@ -193,7 +193,8 @@ def _made_by(campaign: Campaign) -> tuple[str, ...]:
     ]
     contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in _with_imports(own_files))
     packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")
-    return (*estimators, *contents, _code_hash(), *packages, *versions(backend().variant, backend().compiler))
+    computed_by = versions(backend().variant, backend().compiler)
+    return (*estimators, *contents, results_code_hash(), *packages, *computed_by)
 
 
 def _with_imports(estimators: list[Path]) -> list[Path]:
@@ -207,7 +208,7 @@ def _with_imports(estimators: list[Path]) -> list[Path]:
 
 
 @cache
-def _code_hash() -> str:
+def results_code_hash() -> str:
     """Return the hash of all code and tables that results follow from."""
     root = Path(__file__).parents[2]
     return code_hash((root, _code_files(root)))

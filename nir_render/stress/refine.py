@@ -31,6 +31,7 @@ def sweep_refined(
     bar: Callable[[str], AbstractContextManager[Progress]],
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
+    scheduler: str | None = None,
 ) -> Sweep:
     """Do a campaign's jobs (`sweep`); then add values where bounds are crossed, until limits are exact.
 
@@ -58,6 +59,7 @@ def sweep_refined(
                 progress=progress,
                 light=light,
                 light_limit_bytes=light_limit_bytes,
+                scheduler=scheduler,
             )
         finer = refined(campaign, result.table)
         if finer is campaign:

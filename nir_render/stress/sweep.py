@@ -64,6 +64,7 @@ def sweep(
     progress: Progress,
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
+    scheduler: str | None = None,
 ) -> Sweep:
     """Do the jobs of a campaign that the folder does not hold yet, and gather all into its table.
 
@@ -79,6 +80,8 @@ def sweep(
         Where light is kept for other jobs and campaigns; in the folder by default.
     light_limit_bytes
         How large that may grow.
+    scheduler
+        The address of a Dask scheduler whose workers do the jobs instead; `workers` then has no say.
 
     Raises
     ------
@@ -95,11 +98,13 @@ def sweep(
         progress(done, len(jobs))
         if missing:
             workers = min(usual_workers() if workers is None else workers, len(missing))
-            kept = folder / _LIGHT if light is None else light
-            threads = max(cores() // workers, 1)
-            work = Work(campaign.scene, campaign.estimators, parts, kept, light_limit_bytes, threads)
+            kept = (folder / _LIGHT if light is None else light).resolve()
+            threads = max(cores() // workers, 1) if scheduler is None else None
+            work = Work(
+                campaign.scene, campaign.estimators, parts.resolve(), kept, light_limit_bytes, threads
+            )
             try:
-                with closing(run_jobs(work, missing, workers, folder / _SCRATCH)) as ending:
+                with closing(run_jobs(work, missing, workers, folder / _SCRATCH, scheduler)) as ending:
                     for ended in ending:
                         if ended.error is not None:
                             failed[ended.job.key] = ended.error
