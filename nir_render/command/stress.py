@@ -37,6 +37,14 @@ def stress(
             "--workers", min=1, help="Processes to work in; by default as many as cores, at most 8."
         ),
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Have the workers of a Dask scheduler do it: tcp://host:8786.",
+        ),
+    ] = None,
     light_folder: LightFolder = None,
     light_gib: LightLimit = 4.0,
     only_plan: Annotated[
@@ -49,8 +57,11 @@ def stress(
     from nir_render.command.progress import progress_bar
     from nir_render.stress.campaign import load_campaign
     from nir_render.stress.jobs import plan
-    from nir_render.stress.sweep import StoppedError, sweep
+    from nir_render.stress.refine import sweep_refined
+    from nir_render.stress.sweep import StoppedError
 
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers: the scheduler has its own; leave out one of both")
     campaign = load_campaign(file)
     limit_bytes = light_limit_bytes(light_gib)
     folder = output if output is not None else Path("outputs") / campaign.name
@@ -60,16 +71,16 @@ def stress(
         _show_plan(campaign, jobs, folder, as_json)
         return
     try:
-        with progress_bar("stress") as progress:
-            result = sweep(
-                campaign,
-                jobs,
-                folder,
-                workers=workers,
-                progress=progress,
-                light=light_folder,
-                light_limit_bytes=limit_bytes,
-            )
+        result = sweep_refined(
+            campaign,
+            jobs,
+            folder,
+            workers=workers,
+            bar=progress_bar,
+            light=light_folder,
+            light_limit_bytes=limit_bytes,
+            scheduler=scheduler,
+        )
     except StoppedError as stopped:
         note(f"{stopped}; the same command goes on: {shlex.join(['nir-render', *sys.argv[1:]])}")
         raise typer.Exit(128 + signal.SIGINT) from None

@@ -4,6 +4,7 @@ A pose takes local coordinates to outer ones: x_outer = rotation @ x_local + pos
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -67,7 +68,10 @@ def camera_mount(camera: Camera) -> Pose:
     return Pose(rotation_of(camera.orientation) @ _MOUNT_FROM_CAMERA, np.array(camera.position_m))
 
 
+@lru_cache(maxsize=4096)  # of mounts: the same for every robot and scene of a campaign
 def _rotation(yaw_rad: float, pitch_rad: float, roll_rad: float) -> NDArray[np.float64]:
     from scipy.spatial.transform import Rotation  # takes a while to load; a check may need none
 
-    return np.asarray(Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_matrix())
+    matrix = np.asarray(Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_matrix())
+    matrix.flags.writeable = False
+    return matrix

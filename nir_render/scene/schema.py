@@ -111,7 +111,7 @@ def _or_preset(definition: dict[str, Any], folder: str) -> dict[str, Any]:
 
     No key is required: a preset further up may hold it. What is missing in the end, the loader tells.
     """
-    names = preset_names(folder)
+    names = list(preset_names(folder))
     name = {"type": "string", "description": "a preset, or a .yaml file beside the scene", "examples": names}
     whole = {**definition, "properties": {**definition["properties"], "preset": name}}
     whole.pop("required", None)

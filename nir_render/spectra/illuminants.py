@@ -34,6 +34,7 @@ CIE_END_M = 780e-9
 _FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 
+@lru_cache(maxsize=256)
 def gaussian_spectrum(centroid_m: float, fwhm_m: float, name: str) -> Curve:
     """Return a Gaussian emission spectrum of unit flux, in 1/m.
 
@@ -44,7 +45,9 @@ def gaussian_spectrum(centroid_m: float, fwhm_m: float, name: str) -> Curve:
     wavelength_m = np.linspace(centroid_m - reach_m, centroid_m + reach_m, 1001)
     sigma_m = fwhm_m / _FWHM_PER_SIGMA
     density = np.exp(-0.5 * ((wavelength_m - centroid_m) / sigma_m) ** 2)
-    return Curve(wavelength_m, density, name).normalised()
+    curve = Curve(wavelength_m, density, name).normalised()
+    curve.wavelength_m.flags.writeable = curve.value.flags.writeable = False  # many have it
+    return curve
 
 
 def planck_shape(wavelength_m: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:

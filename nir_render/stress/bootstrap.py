@@ -7,14 +7,16 @@ of the axis are drawn from, so that intervals hold the differences between corne
 rather than too narrow.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.randomness import generator
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import Metric, Values
-from nir_render.stress.sums import COUNT, TOTAL, slices
+from nir_render.stress.sums import COUNT, TOTAL, JobSums, along, slices
 
 LEAST_OF_ONE = 5
 """A single corner has no interval below so many jobs: of fewer it would hold far less than it says."""
@@ -48,6 +50,32 @@ class Repetitions:
         onto = at[:, None] == np.arange(size)
         total, count = (self.weight @ (sums[row][:, None] * onto) for row in (TOTAL, COUNT))
         return metric.value(total, count)
+
+
+@dataclass(frozen=True, eq=False)
+class AlongAxis:
+    """The jobs that tell of one axis (`sums.along`), and their repetitions.
+
+    `has_corners` is false where jobs are samples of the space of all axes: no combination of the others is
+    run at all values of this one.
+    """
+
+    sums: JobSums
+    repetitions: Repetitions
+    has_corners: bool
+
+
+def along_axes(
+    axes: Sequence[Axis], sums: JobSums, seed: int, *, sampled: bool = False
+) -> tuple[AlongAxis, ...]:
+    """Return the jobs and the repetitions for each axis; `seed` keys them, as in `draw_repetitions`."""
+    if not any(any(axis.added) for axis in axes):
+        return tuple(AlongAxis(sums, drawn, not sampled) for drawn in draw_repetitions(sums.place, seed))
+    found = []
+    for index in range(len(axes)):
+        own = along(axes, sums, index)
+        found.append(AlongAxis(own, draw_repetitions(own.place, seed)[index], not sampled))
+    return tuple(found)
 
 
 def draw_repetitions(place: NDArray[np.int64], seed: int) -> tuple[Repetitions, ...]:

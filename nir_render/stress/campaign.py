@@ -1,7 +1,6 @@
 """A campaign document: which scene is swept along which axes, and what is to hold there."""
 
 import difflib
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ from nir_render.scene.load import load_scene
 from nir_render.scene.problems import Places, explain
 from nir_render.scene.scene import Scene
 from nir_render.scene.text.yaml_text import read_yaml
-from nir_render.stress.axes import Axis, AxisDocument, DottedPath
+from nir_render.stress.design.axes import Axis, AxisDocument, DottedPath
+from nir_render.stress.design.points import SampleDocument, number_of_points
 from nir_render.stress.metrics import METRICS, Bound, known_metric, parse_bound
 
 MOST_JOBS = 100_000
@@ -29,6 +29,7 @@ _DEFAULT_METRICS = ("range_rmse", "recall", "ranged", "false_alarms")
 class Campaign:
     """A campaign, read and checked, but for its combinations of values.
 
+    `sample` is None where all combinations of the axes' values are run.
     `scene` is the base scene with the campaign's own changes; `settings` are these, by dotted path.
     `metrics` are names of `METRICS`; those with a bound are among them. `path` names the file in errors.
     """
@@ -38,6 +39,7 @@ class Campaign:
     scene: Scene
     settings: Mapping[str, Any]
     axes: tuple[Axis, ...]
+    sample: SampleDocument | None
     seeds: tuple[int, ...]
     estimators: tuple[str, ...]
     metrics: tuple[str, ...]
@@ -49,7 +51,8 @@ class CampaignDocument(Document):
     """A campaign as written.
 
     `scene` is a file beside the campaign, `set` what is changed in it throughout. Every combination of the
-    axes' values is rendered with every seed: a list, or how many, counted from 1.
+    axes' values, or every point of `sample`, is rendered with every seed: a list, or how many, counted
+    from 1.
     """
 
     format: Literal[1]
@@ -58,6 +61,7 @@ class CampaignDocument(Document):
     scene: str
     settings: Annotated[dict[DottedPath, Any], Field(alias="set")] = {}
     axes: Annotated[dict[DottedPath, AxisDocument], Field(min_length=1)]
+    sample: SampleDocument | None = None
     seeds: Annotated[int, Field(ge=1, le=MOST_JOBS)] | Annotated[tuple[int, ...], Field(min_length=1)] = (1,)
     estimators: Annotated[tuple[str, ...], Field(min_length=1)] = ("paper", "robust")
     figures: Annotated[tuple[str, ...], Field(min_length=1)] = _DEFAULT_METRICS
@@ -104,7 +108,7 @@ def load_campaign(path: str | Path) -> Campaign:
     axes, bounds = [], []
     for name, written in document.axes.items():
         try:
-            axes.append(written.axis(name))
+            axes.append(written.axis(name) if document.sample is None else written.sampled(name))
         except ValueError as error:
             problems.append(places.tell(("axes", name), ("axes", name), str(error)))
     for name, value in document.bounds.items():
@@ -117,12 +121,17 @@ def load_campaign(path: str | Path) -> Campaign:
     place = ("estimators",)
     problems += [places.tell(place, place, problem) for problem in _not_estimators(estimators)]
     seeds = range(1, document.seeds + 1) if isinstance(document.seeds, int) else document.seeds
-    sizes = [len(axis.values) for axis in axes]
-    if not problems and math.prod(sizes) * len(seeds) > MOST_JOBS:
+    number = number_of_points(axes, document.sample) * len(seeds)
+    if not problems and number > MOST_JOBS:
+        points = " × ".join(str(len(axis.values)) for axis in axes) + " values"
+        if document.sample is not None:
+            points = f"{document.sample.count} points"
         problems.append(
-            f"{file}: {' × '.join(map(str, sizes))} values and {len(seeds)} seeds are "
-            f"{math.prod(sizes) * len(seeds)} jobs; at most {MOST_JOBS} are taken at once: split the campaign"
+            f"{file}: {points} and {len(seeds)} seeds are {number} jobs; at most {MOST_JOBS} are taken at "
+            "once: split the campaign"
         )
+    if document.sample is not None and all(axis.edges is None for axis in axes):
+        problems.append(f"{file}: sample: no axis is a range: there is nothing to draw from; leave it out")
     if problems:
         raise InputError(*problems)
     scene = _base_scene(file, document, places)
@@ -133,6 +142,7 @@ def load_campaign(path: str | Path) -> Campaign:
         scene,
         document.settings,
         tuple(axes),
+        document.sample,
         tuple(seeds),
         estimators,
         tuple(name for name in METRICS if name in document.figures or name in document.bounds),

@@ -1,20 +1,25 @@
-"""The jobs of a campaign: one for each combination of values and seed, named by a hash of what it does."""
+"""The jobs of a campaign: one for each point and seed, named by a hash of what it does."""
 
 import hashlib
 import itertools
-import math
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from nir_render.errors import InputError
 from nir_render.run.manifest import versions as run_versions
 from nir_render.run.perceive import frame_estimators
+from nir_render.scene.documents.camera import Rig
+from nir_render.scene.documents.document import SceneDocument
 from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
+from nir_render.stress.design.points import Point, number_of_points, points_of
+from nir_render.transport.backend.cores import usual_workers
 from nir_render.transport.fingerprint import code_hash
 from perception.estimators import OwnEstimator
 
@@ -25,6 +30,8 @@ _NOT_IN_A_RESULT = (
 )
 _OF_STRESS = ("stress/job/", "stress/table.py")
 _DIGITS = 32
+_MANY, _CHUNK = 4000, 500
+"""Scenes from which on they are shared among processes, and how many a process builds at a time."""
 
 
 @dataclass(frozen=True)
@@ -35,74 +42,133 @@ class Job:
     ----------
     key
         32 hexadecimal digits: the hash of the resolved scene with its seed, the estimators, and the code.
-    values
-        The index into each axis's values, shape (axes,).
+    point
+        What is set in the campaign's scene.
     settings
-        What is changed in the campaign's scene, the seed included, by dotted path.
+        The same with the seed, by dotted path.
     light
         Jobs with the same words here see the same geometry: they share light.
     """
 
     key: str
-    values: tuple[int, ...]
+    point: Point
     seed: int
     settings: dict[str, Any]
     light: str
 
 
-def plan(campaign: Campaign, progress: Callable[[int, int], None] = lambda *_: None) -> list[Job]:
-    """Return the jobs of a campaign, in the order of its axes and seeds.
+def plan(
+    campaign: Campaign,
+    progress: Callable[[int, int], None] = lambda *_: None,
+    planned: Sequence[Job] = (),
+) -> list[Job]:
+    """Return the jobs of a campaign, in the order of its points and seeds.
 
     Every scene is built, so that nothing that the input does wrong is found after hours. `progress` is told
-    how many are, of all.
+    how many are, of all; `planned` are jobs of the same campaign with fewer points, whose scenes were built.
 
     Raises
     ------
     InputError
-        A combination of values that makes no scene, or one whose camera cannot see.
+        A point that makes no scene, or one whose camera cannot see.
     """
-    sizes = [len(axis.values) for axis in campaign.axes]
+    number = number_of_points(campaign.axes, campaign.sample)
     made_by = _made_by(campaign)
+    known: dict[tuple[float | str, ...], list[Job]] = {}
+    for job in planned:
+        known.setdefault(job.point.written, []).append(job)
     jobs: list[Job] = []
     problems: list[str] = []
-    values_of_scene: dict[str, tuple[int, ...]] = {}
-    for built, values in enumerate(itertools.product(*map(range, sizes))):
-        progress(built, math.prod(sizes))
-        settings = settings_of(campaign, values)
-        try:
-            scene = campaign.scene.with_({**settings, "seed": 0})
-            geometry = _geometry(scene)
-        except InputError as error:
-            problems += [
-                f"{campaign.path}: at {_place(campaign, values)}: {problem}" for problem in error.problems
-            ]
+    place_of_scene: dict[str, str] = {}
+    points = list(points_of(campaign.axes, campaign.sample))
+    hashes = _hashes(campaign.scene, [point.settings for point in points if point.written not in known])
+    for built, point in enumerate(points):
+        progress(built, number)
+        if point.written in known:
+            jobs += [replace(job, point=point) for job in known[point.written]]
             continue
-        scene_hash = hashlib.sha256(scene.document.model_dump_json().encode()).hexdigest()
-        if scene_hash in values_of_scene:
-            same = _place(campaign, values_of_scene[scene_hash])
-            problems.append(f"{campaign.path}: at {_place(campaign, values)}: the same scene as at {same}")
-        values_of_scene[scene_hash] = values
+        place = ", ".join(
+            f"{axis.name} = {label}" for axis, label in zip(campaign.axes, point.labels, strict=True)
+        )
+        found = next(hashes)
+        problems += [f"{campaign.path}: at {place}: {problem}" for problem in found.problems]
+        if found.problems:
+            continue
+        if found.scene in place_of_scene:
+            problems.append(
+                f"{campaign.path}: at {place}: the same scene as at {place_of_scene[found.scene]}"
+            )
+        place_of_scene[found.scene] = place
         for seed in campaign.seeds:
-            parts = (scene_hash, f"seed {seed}", geometry, *made_by)
+            parts = (found.scene, f"seed {seed}", found.geometry, *made_by)
             key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:_DIGITS]
-            jobs.append(Job(key, values, seed, {**settings, "seed": seed}, f"{seed} {geometry}"))
-    progress(math.prod(sizes), math.prod(sizes))
+            jobs.append(Job(key, point, seed, {**point.settings, "seed": seed}, f"{seed} {found.geometry}"))
+    progress(number, number)
     if problems:
         raise InputError(*_first_of(problems))
     return jobs
 
 
-def _place(campaign: Campaign, values: tuple[int, ...]) -> str:
-    return ", ".join(f"{axis.name} = {axis.labels[i]}" for axis, i in zip(campaign.axes, values, strict=True))
+@dataclass(frozen=True)
+class _Hashes:
+    """The hashes of a scene and of its geometry; or what is wrong with it."""
+
+    scene: str = ""
+    geometry: str = ""
+    problems: tuple[str, ...] = ()
 
 
-def settings_of(campaign: Campaign, values: tuple[int, ...]) -> dict[str, Any]:
-    """Return what a combination of values changes in the campaign's scene, by dotted path."""
-    return {
-        path: value
-        for axis, index in zip(campaign.axes, values, strict=True)
-        for path, value in axis.settings(index).items()
-    }
+def _hashes(scene: Scene, settings: Sequence[Mapping[str, Any]]) -> Iterator[_Hashes]:
+    """Yield what a scene is with each of the settings, in their order.
+
+    Building one takes a millisecond or some: many are shared among processes.
+    """
+    workers = usual_workers()
+    if len(settings) < _MANY or workers == 1:
+        yield from (_hashes_of(scene, one) for one in settings)
+        return
+    chunks = [settings[first : first + _CHUNK] for first in range(0, len(settings), _CHUNK)]
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        for found in pool.map(_hashes_of_all, itertools.repeat(scene), chunks):
+            yield from found
+
+
+def _hashes_of_all(scene: Scene, settings: Sequence[Mapping[str, Any]]) -> list[_Hashes]:
+    return [_hashes_of(scene, one) for one in settings]
+
+
+def _hashes_of(scene: Scene, settings: Mapping[str, Any]) -> _Hashes:
+    try:
+        changed = scene.with_({**settings, "seed": 0})
+        return _Hashes(_scene_hash(changed.document), _geometry(changed))
+    except InputError as error:
+        return _Hashes(problems=error.problems)
+
+
+def _scene_hash(document: SceneDocument) -> str:
+    """Return the hash of a resolved scene; what robots carry is written once, however many carry the same."""
+    hashed = hashlib.sha256(document.model_dump_json(exclude={"robots": {"__all__": {"rig"}}}).encode())
+    for robot in document.robots.values():
+        hashed.update(b"\0" + _rig_text(_Same(robot.rig)))
+    return hashed.hexdigest()
+
+
+@dataclass(frozen=True)
+class _Same:
+    """A rig as itself: two are equal where they are one object."""
+
+    rig: Rig
+
+    def __hash__(self) -> int:
+        return id(self.rig)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.rig is self.rig
+
+
+@lru_cache(maxsize=256)
+def _rig_text(same: _Same) -> bytes:
+    return same.rig.model_dump_json().encode()
 
 
 def _geometry(scene: Scene) -> str:
@@ -127,11 +193,14 @@ def _made_by(campaign: Campaign) -> tuple[str, ...]:
     ]
     contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in _with_imports(own_files))
     packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")
-    return (*estimators, *contents, _code_hash(), *packages, *versions(backend().variant, backend().compiler))
+    computed_by = versions(backend().variant, backend().compiler)
+    return (*estimators, *contents, results_code_hash(), *packages, *computed_by)
 
 
 def _with_imports(estimators: list[Path]) -> list[Path]:
     """Return files of estimators, and what they have imported from beside them."""
+    if not estimators:
+        return []
     folders = {file.parent for file in estimators}
     files = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
     imported = {Path(file).resolve() for file in files if file is not None}
@@ -139,7 +208,7 @@ def _with_imports(estimators: list[Path]) -> list[Path]:
 
 
 @cache
-def _code_hash() -> str:
+def results_code_hash() -> str:
     """Return the hash of all code and tables that results follow from."""
     root = Path(__file__).parents[2]
     return code_hash((root, _code_files(root)))

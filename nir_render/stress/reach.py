@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.stress.axes import Axis
-from nir_render.stress.bootstrap import LEAST_OF_ONE, Repetitions, draw_repetitions, repeated_in_corners
+from nir_render.stress.bootstrap import LEAST_OF_ONE, AlongAxis, Repetitions, along_axes, repeated_in_corners
+from nir_render.stress.campaign import Campaign
 from nir_render.stress.crossings import Span, interval, kept_length, spans
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS, Bound, Metric, Values
 from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, JobSums, pooled, slices
 
@@ -102,7 +103,7 @@ def points_of(
 
 
 def reaches_of(
-    axes: Sequence[Axis], bounds: Sequence[Bound], sums: JobSums, seed: int = 0
+    axes: Sequence[Axis], bounds: Sequence[Bound], sums: JobSums, seed: int = 0, *, sampled: bool = False
 ) -> tuple[Reach, ...]:
     """Return where each bound holds along each axis, for each estimator: bound by bound, axis by axis.
 
@@ -112,13 +113,22 @@ def reaches_of(
         The campaign's table (see `job_sums`).
     seed
         Keys the repetitions: the same table gives the same intervals.
+    sampled
+        The jobs are samples of the space of all axes: it has no corners, and none is worst.
     """
-    repetitions = draw_repetitions(sums.place, seed)
+    told = along_axes(axes, sums, seed, sampled=sampled)
     return tuple(
-        _reach(axes, axis, bound, name, sums, repetitions[axis])
+        _reach(axes, axis, bound, name, told[axis])
         for bound in bounds
         for axis in range(len(axes))
         for name in sums.estimators
+    )
+
+
+def campaign_reaches(campaign: Campaign, sums: JobSums) -> tuple[Reach, ...]:
+    """Return where each bound of a campaign holds along each of its axes (`reaches_of`)."""
+    return reaches_of(
+        campaign.axes, campaign.bounds, sums, campaign.seeds[0], sampled=campaign.sample is not None
     )
 
 
@@ -132,9 +142,8 @@ def corners_kept(bound: Bound, estimator: str, sums: JobSums) -> tuple[int, int]
     return int(kept.sum()), int((cells[ASKED] > 0.0).sum())
 
 
-def _reach(
-    axes: Sequence[Axis], index: int, bound: Bound, name: str, sums: JobSums, repetitions: Repetitions
-) -> Reach:
+def _reach(axes: Sequence[Axis], index: int, bound: Bound, name: str, told: AlongAxis) -> Reach:
+    sums, repetitions = told.sums, told.repetitions
     axis, metric, size = axes[index], METRICS[bound.metric], len(axes[index].labels)
     totals, at = sums.by_metric[name, bound.metric], sums.place[:, index]
     everywhere = _extent(axis, metric, bound, totals, at, repetitions)
@@ -151,7 +160,7 @@ def _reach(
         slices=int(everywhere.status != "nothing to judge"),
         slices_kept=int(everywhere.status in ("throughout", "wherever judged")),
     )
-    if count <= 1:
+    if count <= 1 or not told.has_corners:
         return reach
     cells = pooled(totals, slice_of * size + at, count * size).reshape(-1, count, size)
     value, judged = metric.value(cells[TOTAL], cells[COUNT]), cells[ASKED] > 0.0

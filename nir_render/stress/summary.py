@@ -6,12 +6,12 @@ from typing import Any
 
 import pyarrow as pa
 
-from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.crossings import Edge
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS
-from nir_render.stress.reach import Extent, Reach, reaches_of
-from nir_render.stress.sums import COUNT, TOTAL, JobSums, job_sums
+from nir_render.stress.reach import Extent, Reach, campaign_reaches
+from nir_render.stress.sums import COUNT, TOTAL, JobSums, at_written_values, job_sums
 
 
 def summary_of(campaign: Campaign, rows: pa.Table) -> dict[str, Any]:
@@ -20,10 +20,10 @@ def summary_of(campaign: Campaign, rows: pa.Table) -> dict[str, Any]:
     Values are in m, rad, or plain numbers, places on an axis as they are written.
     """
     sums = job_sums(campaign.axes, rows)
-    reaches = reaches_of(campaign.axes, campaign.bounds, sums, campaign.seeds[0])
+    _, written = at_written_values(campaign.axes, sums)
     return {
-        "estimators": {name: _metric_values(sums, name) for name in sums.estimators},
-        "limits": [_reach_record(campaign.axes, reach) for reach in reaches],
+        "estimators": {name: _metric_values(written, name) for name in sums.estimators},
+        "limits": [_reach_record(campaign.axes, reach) for reach in campaign_reaches(campaign, sums)],
     }
 
 
@@ -49,7 +49,9 @@ def _reach_record(axes: Sequence[Axis], reach: Reach) -> dict[str, Any]:
         "axis": axis.name,
         "unit": axis.unit,
         "all": _extent_record(axis, reach.pooled),
-        "worst_corner": None if reach.worst is None else {"at": corner, **_extent_record(axis, reach.worst)},
+        "worst_corner": None
+        if reach.worst is None
+        else {"corner": corner, **_extent_record(axis, reach.worst)},
     }
 
 

@@ -1,8 +1,9 @@
 """A campaign's table as sums per job, of which every metric is made, for any part of the campaign."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from nir_render.stress.axes import Axis
+from nir_render.stress.design.axes import Axis, without_added
 from nir_render.stress.metrics import METRICS, Metric, Values
 
 TOTAL, COUNT, ASKED, LIMIT, LIMITED = range(5)
@@ -50,6 +51,43 @@ class JobSums:
     place: NDArray[np.int64]
     estimators: tuple[str, ...]
     by_metric: Mapping[tuple[str, str], Values]
+
+    def subset(self, chosen: NDArray[np.bool_]) -> "JobSums":
+        """Return the sums of some of the jobs; `chosen` has the shape (jobs,)."""
+        jobs = tuple(itertools.compress(self.jobs, chosen))
+        by_metric = {key: sums[:, chosen] for key, sums in self.by_metric.items()}
+        return replace(
+            self, jobs=jobs, seeds=self.seeds[chosen], place=self.place[chosen], by_metric=by_metric
+        )
+
+
+def along(axes: Sequence[Axis], sums: JobSums, index: int) -> JobSums:
+    """Return the jobs that tell of one axis: all its values, and of the other axes those that were written.
+
+    Values that were put in to find a limit on another axis would count twice the places where it is reached.
+    """
+    return sums.subset(_all_of(np.delete(_is_written(axes, sums), index, axis=1)))
+
+
+def at_written_values(axes: Sequence[Axis], sums: JobSums) -> tuple[tuple[Axis, ...], JobSums]:
+    """Return axes and jobs without the values that were added."""
+    chosen = sums.subset(_all_of(_is_written(axes, sums)))
+    place = [np.searchsorted(axis.written(), at) for axis, at in zip(axes, chosen.place.T, strict=True)]
+    written = np.stack(place, axis=1) if place else chosen.place
+    return tuple(without_added(axis) for axis in axes), replace(chosen, place=written)
+
+
+def _all_of(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.asarray(flags.all(axis=1), dtype=np.bool_)
+
+
+def _is_written(axes: Sequence[Axis], sums: JobSums) -> NDArray[np.bool_]:
+    """Return which values of which jobs were written, shape (jobs, axes)."""
+    flags: NDArray[np.bool_] = np.ones(sums.place.shape, dtype=np.bool_)
+    for index, axis in enumerate(axes):
+        if axis.added:
+            flags[:, index] = ~np.array(axis.added)[sums.place[:, index]]
+    return flags
 
 
 def job_sums(axes: Sequence[Axis], table: pa.Table) -> JobSums:
@@ -133,6 +171,8 @@ def _sums(metric: Metric, rows: Mapping[str, NDArray[Any]], at: NDArray[np.int64
 
 
 def _place(axis: Axis, values: Sequence[Any]) -> NDArray[np.int64]:
+    if axis.edges_si is not None:
+        return np.array([axis.part_of(value) for value in values], dtype=np.int64)
     known = {
         value: index for index, value in enumerate(axis.labels if axis.values_si is None else axis.values_si)
     }

@@ -64,6 +64,7 @@ def sweep(
     progress: Progress,
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
+    scheduler: str | None = None,
 ) -> Sweep:
     """Do the jobs of a campaign that the folder does not hold yet, and gather all into its table.
 
@@ -79,6 +80,8 @@ def sweep(
         Where light is kept for other jobs and campaigns; in the folder by default.
     light_limit_bytes
         How large that may grow.
+    scheduler
+        The address of a Dask scheduler whose workers do the jobs instead; `workers` then has no say.
 
     Raises
     ------
@@ -95,11 +98,13 @@ def sweep(
         progress(done, len(jobs))
         if missing:
             workers = min(usual_workers() if workers is None else workers, len(missing))
-            kept = folder / _LIGHT if light is None else light
-            threads = max(cores() // workers, 1)
-            work = Work(campaign.scene, campaign.estimators, parts, kept, light_limit_bytes, threads)
+            kept = (folder / _LIGHT if light is None else light).resolve()
+            threads = max(cores() // workers, 1) if scheduler is None else None
+            work = Work(
+                campaign.scene, campaign.estimators, parts.resolve(), kept, light_limit_bytes, threads
+            )
             try:
-                with closing(run_jobs(work, missing, workers, folder / _SCRATCH)) as ending:
+                with closing(run_jobs(work, missing, workers, folder / _SCRATCH, scheduler)) as ending:
                     for ended in ending:
                         if ended.error is not None:
                             failed[ended.job.key] = ended.error
@@ -115,12 +120,15 @@ def sweep(
 def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[str, Any]:
     """Return what a sweep has to do, as one JSON object: jobs, those that the folder holds, geometries.
 
+    Files of jobs are counted, not read: one that is broken counts here, and is done again by the sweep.
+
     Errors as `sweep`.
     """
     done = 0
     if folder.exists():
         check_folder(folder, campaign)
-        done = sum(read_part(part_file(folder / _PARTS, job)) is not None for job in jobs)
+        held = {path.name for path in (folder / _PARTS).glob("*")}
+        done = sum(part_file(folder / _PARTS, job).name in held for job in jobs)
     geometries = len({job.light for job in jobs})
     return {"campaign": campaign.name, "jobs": len(jobs), "done": done, "geometries": geometries}
 
@@ -201,7 +209,7 @@ def _gather(
         rows, frames_sha256 = part
         done.append(job)
         tables.append(rows)
-        labels = {axis.name: axis.labels[i] for axis, i in zip(campaign.axes, job.values, strict=True)}
+        labels = dict(zip((axis.name for axis in campaign.axes), job.point.labels, strict=True))
         lines.append(
             {
                 "format": 1,

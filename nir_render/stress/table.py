@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from nir_render.run.folder import write_file
-from nir_render.stress.axes import Axis
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.job.sequences import Row
 from nir_render.stress.jobs import Job
 
@@ -118,10 +118,8 @@ def gathered(jobs: Sequence[Job], parts: Sequence[pa.Table], axes: Sequence[Axis
             ("job", pa.repeat(pa.scalar(job.key, _TEXT), len(part))),
             ("seed", pa.repeat(pa.scalar(job.seed, _WHOLE), len(part))),
         ]
-        for axis, index in zip(axes, job.values, strict=True):
-            is_number = axis.values_si is not None
-            value = axis.values_si[index] if axis.values_si is not None else axis.labels[index]
-            scalar = pa.scalar(value, _NUMBER if is_number else _TEXT)
+        for axis, value in zip(axes, job.point.written, strict=True):
+            scalar = pa.scalar(value, _TEXT if axis.values_si is None else _NUMBER)
             columns.append((f"axis.{axis.name}", pa.repeat(scalar, len(part))))
         names, arrays = zip(*columns, strict=True)
         job_columns = pa.table(list(arrays), names=list(names))

@@ -15,7 +15,7 @@ from tests.paths import ROOT
 FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.command": (),
     "nir_render.experiments": ("communication",),
-    "nir_render.stress": ("page", "workers", "job"),
+    "nir_render.stress": ("page", "workers", "job", "design"),
     "nir_render.regress": ("stages",),
     "nir_render.compare": (),
     "nir_render.budget": (),

@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import (
@@ -57,6 +58,7 @@ _COLOUR_KEYS = {"rgb", "color", "colour", "srgb"}
 RGB_REFUSED = "RGB colours have no meaning at 940 nm; give the value in the band, a number from 0 to 1"
 
 
+@cache
 def document_key(field: str) -> str:
     """Return a field's key in the document: `exposure_s` is written `exposure: 1 ms`."""
     for suffix in _UNIT_SUFFIXES:

@@ -2,18 +2,23 @@
 
 import copy
 import difflib
+import json
+import re
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
-from pydantic import ValidationInfo, model_validator
+from pydantic import ModelWrapValidatorHandler, ValidationInfo, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import Document
 from nir_render.scene.text.yaml_text import parse_yaml, read_yaml
 
+_MOST_READ = 1024
+_READ: dict[tuple[type, str, str], "PresetDocument"] = {}
+_NAMES_A_FILE = re.compile(r'\.[A-Za-z]\w*\s*"')
 _MOST_NAME_BYTES = 255  # of a file, in the file systems in use
 # Keys of which a document has one: a change that writes another replaces the first.
 _ALTERNATIVES = (
@@ -44,15 +49,42 @@ _GOES_WITH = {
 class PresetDocument(Document):
     """A part that may be named instead of written: a preset of `data/`, or a `.yaml` file beside the scene.
 
-    `sensor: mt9m031` takes a preset whole; `sensor: {preset: mt9m031, read_noise: 5 e}` changes a part.
+    `sensor: mt9m031` takes a preset whole; `sensor: {preset: mt9m031, read_noise: 5 e}` changes a part. Parts
+    that are written alike are read once: thirty robots with one rig, or a campaign's scenes, share them.
     """
 
     preset_folder: ClassVar[str]
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _read_once(cls, data: Any, read: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
+        written = _written_alike(data)
+        if written is None:
+            return read(data)
+        key = cls, str(_folder_of(info)), written
+        known = _READ.get(key)
+        if known is None:
+            known = read(data)
+            if len(_READ) >= _MOST_READ:
+                _READ.pop(next(iter(_READ)), None)
+            _READ[key] = known
+        assert isinstance(known, cls)
+        return known
 
     @model_validator(mode="before")
     @classmethod
     def _expand_preset(cls, data: Any, info: ValidationInfo) -> Any:
         return expand_preset(data, cls.preset_folder, _folder_of(info))
+
+
+def _written_alike(data: Any) -> str | None:
+    """Return the text that tells a part from all others; None where it may follow from files beside it."""
+    try:
+        written = json.dumps(data)
+    except (TypeError, ValueError, RecursionError):
+        return None
+    # Quotes in the text are written \\", so a name of a file ends before one.
+    return None if _NAMES_A_FILE.search(written) else written
 
 
 def _folder_of(info: ValidationInfo) -> Path:
@@ -90,10 +122,13 @@ def exists(path: Path) -> bool:
         return False
 
 
-def preset_names(folder: str) -> list[str]:
+@cache
+def preset_names(folder: str) -> tuple[str, ...]:
     """Return the names of the presets of one kind."""
     entries = resources.files("nir_render").joinpath("data", folder).iterdir()
-    return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
+    return tuple(
+        sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
+    )
 
 
 def expand_preset(data: Any, kind: str, folder: Path, trail: tuple[str, ...] = ()) -> Any:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nir_render.report.drawing import ratio_ticks, sheet, short, svg_of
 from nir_render.report.style import BAD, FAINT, INK, MATPLOTLIB, PANEL, look
-from nir_render.stress.axes import Axis
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import Metric, Values
 from nir_render.stress.page.words import marked_unit, metric_text, tick_text
 from nir_render.stress.sums import ASKED, COUNT, TOTAL, JobSums, pooled

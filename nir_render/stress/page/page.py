@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from nir_render.report.parts import Table, facts_table, render_page
 from nir_render.report.wording import counted, share, significant
-from nir_render.stress.bootstrap import LEAST_OF_ONE, draw_repetitions, repeated_in_corners
+from nir_render.stress.bootstrap import LEAST_OF_ONE, along_axes, repeated_in_corners
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.metrics import METRICS, Bound
 from nir_render.stress.page.sections import metric_sections, metrics_shown
@@ -22,8 +22,8 @@ from nir_render.stress.page.tables import (
     worst_table,
 )
 from nir_render.stress.page.words import bound_text, corner_text, extent_text, metric_text, sentence_of
-from nir_render.stress.reach import Extent, Reach, corners_kept, reaches_of
-from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, JobSums, job_sums
+from nir_render.stress.reach import Extent, Reach, campaign_reaches, corners_kept
+from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, JobSums, at_written_values, job_sums
 
 _MOST_WARNINGS = 12
 _MOST_LETTERS = 400
@@ -52,28 +52,30 @@ def campaign_html(campaign: Campaign, rows: pa.Table, facts: Mapping[str, Any]) 
     An HTML document that needs no network and no scripts. Whatever comes from outside is escaped in it.
     """
     axes, sums = campaign.axes, job_sums(campaign.axes, rows)
-    seed = campaign.seeds[0] if campaign.seeds else 0
-    reaches = reaches_of(axes, campaign.bounds, sums, seed)
+    reaches = campaign_reaches(campaign, sums)
+    _, written = at_written_values(axes, sums)
+    told = along_axes(axes, sums, campaign.seeds[0], sampled=campaign.sample is not None)
     noise_sentence, noise_warning = render_noise_sentences(rows)
     return render_page(
         "stress/page/page.html",
         title=campaign.name,
         subtitle=[
             f"{counted(len(sums.jobs), 'job')}, {counted(_frames(sums), 'frame')}",
-            " × ".join(f"{axis.title} ({len(axis.labels)})" for axis in axes),
+            _design(campaign),
             counted(len(campaign.seeds), "seed"),
             f"estimators: {', '.join(sums.estimators) or 'none'}",
         ],
         names=sums.estimators,
         description=campaign.description,
         warnings=_warnings(facts),
-        overall_sentences=" ".join(_overall_sentence(sums, name) for name in sums.estimators),
-        compared=_compared(sums),
-        bounds=[_bound_section(campaign, bound, sums, reaches) for bound in campaign.bounds],
-        overall=overall_table(sums),
-        repeated_in_corners=repeated_in_corners(sums.place),
+        overall_sentences=" ".join(_overall_sentence(written, name) for name in sums.estimators),
+        compared=_compared(written),
+        bounds=[_bound_section(campaign, bound, written, reaches) for bound in campaign.bounds],
+        overall=overall_table(written),
+        repeated_in_corners=repeated_in_corners(written.place),
         least_of_one=LEAST_OF_ONE,
-        metrics=metric_sections(campaign, sums, draw_repetitions(sums.place, seed)),
+        sampled=campaign.sample is not None,
+        metrics=metric_sections(campaign, sums, told),
         worst=_worst(campaign, sums, facts),
         false_alarms=false_alarms_table(rows, sums),
         render_noise={"sentence": noise_sentence, "warning": noise_warning},
@@ -83,6 +85,19 @@ def campaign_html(campaign: Campaign, rows: pa.Table, facts: Mapping[str, Any]) 
         facts=_facts(facts),
         known_metrics=list(METRICS.values()),
     )
+
+
+def _design(campaign: Campaign) -> str:
+    """Say how many points there are, and of what: 32 Sobol points of range × exposure."""
+    if campaign.sample is not None:
+        words = {"sobol": "Sobol points", "latin_hypercube": "points of a Latin hypercube"}
+        kind = words.get(campaign.sample.design, "random points")
+        return f"{campaign.sample.count} {kind} of {' × '.join(axis.title for axis in campaign.axes)}"
+    parts = []
+    for axis in campaign.axes:
+        written, added = len(axis.written()), sum(axis.added)
+        parts.append(f"{axis.title} ({written}{f' + {added} at limits' if added else ''})")
+    return " × ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -136,9 +151,11 @@ def _bound_section(campaign: Campaign, bound: Bound, sums: JobSums, reaches: Seq
         row: list[str] = [axis.title]
         for name in sums.estimators:
             reach = next(reach for reach in of_bound if (reach.axis, reach.estimator) == (index, name))
-            row += [_pooled_cell(campaign, reach), _worst_cell(campaign, reach)]
+            row.append(_pooled_cell(campaign, reach))
+            if campaign.sample is None:
+                row.append(_worst_cell(campaign, reach))
         rows.append(row)
-    slices = ("all corners together", "worst corner")
+    slices = ("all corners together", "worst corner") if campaign.sample is None else ("all points",)
     headings = ["along", *(f"{name}: {which}" for name in sums.estimators for which in slices)]
     return BoundSection(bound_text(bound), sentences, Table(headings, rows))
 

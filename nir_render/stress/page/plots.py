@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from nir_render.report.drawing import ratio_ticks, rounded_up, sheet, short, svg_of, symmetric_log
 from nir_render.report.style import BAD, LIMIT, MATPLOTLIB, look
-from nir_render.stress.axes import Axis
-from nir_render.stress.bootstrap import Repetitions
+from nir_render.stress.bootstrap import AlongAxis
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import Metric, Values
 from nir_render.stress.page.words import marked_unit, tick_text
 from nir_render.stress.reach import Point, points_of
-from nir_render.stress.sums import COUNT, TOTAL, JobSums, pooled, slices
+from nir_render.stress.sums import COUNT, TOTAL, pooled, slices
 
 _MOST_LINES = 24
 _RASTER_BEYOND = 400
@@ -26,8 +26,7 @@ def against_axes(
     metric: Metric,
     axes: Sequence[Axis],
     chosen: Sequence[int],
-    sums: JobSums,
-    repetitions: Sequence[Repetitions],
+    told: Sequence[AlongAxis],
     bound: float | None,
 ) -> str:
     """Draw a metric against axes: a row of panels for each, a panel per estimator, all on one scale.
@@ -40,21 +39,24 @@ def against_axes(
     ----------
     chosen
         Indices of the axes to draw.
-    repetitions
-        The repetitions for each axis (see `draw_repetitions`).
+    told
+        The jobs and repetitions for each axis (see `along_axes`).
     """
-    names = sums.estimators
+    names = told[0].sums.estimators
     with mpl.rc_context(MATPLOTLIB):
         drawn = sheet(2.35 * len(chosen) + 0.2)
         panels = drawn.subplots(len(chosen), len(names), sharey=True, squeeze=False)
         shown: list[Values] = []
         for row, index in zip(panels, chosen, strict=True):
-            axis, at, size = axes[index], sums.place[:, index], len(axes[index].labels)
+            axis, sums = axes[index], told[index].sums
+            at, size = sums.place[:, index], len(axis.labels)
             x = np.arange(size, dtype=np.float64) if axis.numbers is None else np.array(axis.numbers)
             of = {name: sums.by_metric[name, metric.name] for name in names}
-            points = {name: points_of(metric, of[name], at, size, repetitions[index]) for name in names}
+            points = {name: points_of(metric, of[name], at, size, told[index].repetitions) for name in names}
             for panel, name in zip(row, names, strict=True):
-                corners = _corners(metric, of[name], sums.place, index, size)
+                corners = np.empty((0, size))
+                if told[index].has_corners:
+                    corners = _corners(metric, of[name], sums.place, index, size)
                 _panel(panel, metric, name, names, x, points, corners, bound)
                 _ticks_x(panel, axis, x, points[name], metric)
                 panel.set_xlabel(short(axis.title, 40) + (f", {axis.unit}" if axis.unit else ""))

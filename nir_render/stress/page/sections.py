@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 from nir_render.report import style
 from nir_render.report.drawing import Drawing
-from nir_render.stress.axes import Axis
-from nir_render.stress.bootstrap import Repetitions
+from nir_render.stress.bootstrap import AlongAxis
 from nir_render.stress.campaign import Campaign
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS, Bound, Metric
 from nir_render.stress.page.maps import MOST_VALUES, heat_maps
 from nir_render.stress.page.plots import against_axes
 from nir_render.stress.page.words import bound_text
-from nir_render.stress.sums import JobSums
+from nir_render.stress.sums import JobSums, at_written_values
 
 _ROWS = 4
 _UNFOLDED = 3
@@ -46,24 +46,23 @@ class MetricSection:
     cut: bool
 
 
-def metric_sections(
-    campaign: Campaign, sums: JobSums, repetitions: Sequence[Repetitions]
-) -> list[MetricSection]:
+def metric_sections(campaign: Campaign, sums: JobSums, told: Sequence[AlongAxis]) -> list[MetricSection]:
     """Return a section of each metric that is asked for: those with a bound first, the first few unfolded.
 
     Parameters
     ----------
     sums
         The campaign's table (see `job_sums`).
-    repetitions
-        The repetitions for each axis (see `draw_repetitions`).
+    told
+        The jobs and repetitions for each axis (see `along_axes`).
     """
     bounds = {bound.metric: bound for bound in campaign.bounds}
+    sampled = campaign.sample is not None
     sections: list[MetricSection] = []
     drawn = 0
     for name in metrics_shown(campaign):
         metric, bound = METRICS[name], bounds.get(name)
-        against, over, wanted = _drawings(metric, bound, campaign.axes, sums, repetitions, _MOST_ROWS - drawn)
+        against, over, wanted = _drawings(metric, bound, campaign.axes, sums, told, _MOST_ROWS - drawn)
         drawn += wanted
         sections.append(
             MetricSection(
@@ -71,7 +70,7 @@ def metric_sections(
                 explained=_capitalised(metric.explained),
                 unfolded=len(sections) < _UNFOLDED,
                 counts_key=_counts_key(metric),
-                line_key=tuple(_line_key(sums, metric, bounded=bound is not None)),
+                line_key=tuple(_line_key(sums, metric, bounded=bound is not None, sampled=sampled)),
                 against_axes=tuple(against),
                 map_key=_map_key(metric, bound) if _small_pairs(campaign.axes) else "",
                 over_axes=tuple(over),
@@ -97,7 +96,7 @@ def _drawings(
     bound: Bound | None,
     axes: Sequence[Axis],
     sums: JobSums,
-    repetitions: Sequence[Repetitions],
+    told: Sequence[AlongAxis],
     room: int,
 ) -> tuple[list[Drawing], list[Drawing], int]:
     """Draw a metric against each axis and over pairs of them, while there is room for more rows of panels.
@@ -109,10 +108,11 @@ def _drawings(
     for first in range(0, len(axes), _ROWS):
         chosen = range(len(axes))[first : first + _ROWS]
         if rows < room:
-            svg = against_axes(metric, axes, chosen, sums, repetitions, value)
+            svg = against_axes(metric, axes, chosen, told, value)
             against.append(Drawing(svg, f"{metric.title} against {_and(axes[i].title for i in chosen)}"))
         rows += len(chosen)
     small = _small_pairs(axes)
+    axes, sums = at_written_values(axes, sums)
     for first in range(0, len(small), _ROWS):
         pairs = small[first : first + _ROWS]
         if rows < room:
@@ -135,11 +135,13 @@ def _counts_key(metric: Metric) -> str:
     return "Below each value stands of how many sources, of those that count, the figure is."
 
 
-def _line_key(sums: JobSums, metric: Metric, *, bounded: bool) -> Iterator[LineKey]:
+def _line_key(sums: JobSums, metric: Metric, *, bounded: bool, sampled: bool) -> Iterator[LineKey]:
     """Explain the lines of a plot against an axis."""
     colour = style.look(sums.estimators[0], sums.estimators).colour if sums.estimators else style.INK
-    yield LineKey(colour, "all corners together, with bars of 68 %", width="2.5")
-    if sums.place.shape[1] > 1:
+    yield LineKey(
+        colour, f"all {'points' if sampled else 'corners'} together, with bars of 68 %", width="2.5"
+    )
+    if sums.place.shape[1] > 1 and not sampled:
         yield LineKey(colour, "each corner, or many as a band", width="0.8")
     if len(sums.estimators) > 1:
         yield LineKey(style.INK, "the other estimators", dashes="4 2")

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from nir_render.report.parts import Table, named_mark
 from nir_render.report.wording import counted, share
-from nir_render.stress.axes import Axis
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS, Metric
 from nir_render.stress.page.words import metric_text
 from nir_render.stress.sums import ASKED, COUNT, LIMIT, LIMITED, TOTAL, JobSums
@@ -130,6 +130,7 @@ def axes_table(axes: Sequence[Axis]) -> Table:
         shown = ", ".join(axis.labels[:_MOST_LABELS])
         more = len(axis.labels) - _MOST_LABELS
         last = f", … {axis.labels[-1]} ({len(axis.labels)} values)" if more > 0 else ""
+        last += f"; {counted(sum(axis.added), 'value')} of these added at limits" if any(axis.added) else ""
         rows.append([axis.title, ", ".join(axis.paths), shown + last])
     return Table(("axis", "sets", "values"), rows)
 

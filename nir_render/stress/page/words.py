@@ -8,12 +8,12 @@ import pyarrow as pa
 
 from nir_render.report.wording import counted, metres, share, significant
 from nir_render.scene.text.units import ANGLE, LENGTH
-from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.crossings import Edge, Span
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import COUNTS, METRICS, SHARES, Bound
-from nir_render.stress.reach import Extent, Reach, corners_kept, reaches_of
-from nir_render.stress.sums import job_sums
+from nir_render.stress.reach import Extent, Reach, campaign_reaches, corners_kept
+from nir_render.stress.sums import at_written_values, job_sums
 
 _BEYOND = {"nothing there": "nothing to judge", "not defined": "no such figure"}
 _MOST_NAMED = 6
@@ -95,11 +95,12 @@ def sentence_of(axes: Sequence[Axis], reaches: Sequence[Reach], corners: tuple[i
         In how many combinations of all axes' values it is kept, and in how many there is something to judge.
     """
     kept, judged = corners
+    of_what = "values" if all(axis.edges is None for axis in axes) else "parts"
     if not judged:
         return "has nothing to be judged by."
     if not kept:
-        return f"keeps it at none of {counted(judged, 'combination')} of values."
-    parts = [f"keeps it at {kept} of {counted(judged, 'combination')} of values"]
+        return f"keeps it at none of {counted(judged, 'combination')} of {of_what}."
+    parts = [f"keeps it at {kept} of {counted(judged, 'combination')} of {of_what}"]
     for reach in reaches:
         axis = axes[reach.axis]
         text = f"along {axis.title} {extent_text(axis, reach.pooled)}"
@@ -193,13 +194,14 @@ def _listed(labels: Sequence[str]) -> str:
 def reach_lines(campaign: Campaign, rows: pa.Table) -> list[str]:
     """Say of each bound how each estimator keeps it, in lines for a terminal."""
     sums = job_sums(campaign.axes, rows)
-    reaches = reaches_of(campaign.axes, campaign.bounds, sums, campaign.seeds[0])
+    reaches = campaign_reaches(campaign, sums)
+    _, written = at_written_values(campaign.axes, sums)
     lines = []
     for bound in campaign.bounds:
         lines.append(bound_text(bound))
         for name in sums.estimators:
             of_estimator = [reach for reach in reaches if reach.bound == bound and reach.estimator == name]
             lines.append(
-                f"  {name} {sentence_of(campaign.axes, of_estimator, corners_kept(bound, name, sums))}"
+                f"  {name} {sentence_of(campaign.axes, of_estimator, corners_kept(bound, name, written))}"
             )
     return lines

@@ -5,11 +5,12 @@ is killed is started again, and its job goes to another; one that dies with seve
 """
 
 import contextlib
+import hashlib
 import logging
 import multiprocessing
 import shutil
 import signal
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
@@ -18,6 +19,7 @@ from pathlib import Path
 import cv2
 import dask
 from distributed import Client, Future, LocalCluster, as_completed, get_worker
+from distributed.comm.addressing import get_address_host
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.scheduler import KilledWorker
 
@@ -27,7 +29,8 @@ from nir_render.scene.scene import Scene
 from nir_render.stress.job.execute import execute
 from nir_render.stress.jobs import Job
 from nir_render.stress.table import read_part, write_part
-from nir_render.transport.backend.cores import thread_settings
+from nir_render.stress.workers.cluster import connected
+from nir_render.transport.backend.cores import cores, thread_settings
 from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
 from perception import Estimator
@@ -43,7 +46,8 @@ _PLUGIN = "nir_render"
 class Work:
     """What all jobs of a campaign share.
 
-    `scene` is what the jobs' settings change; `threads` how many each worker computes with.
+    `scene` is what the jobs' settings change; `threads` how many each worker computes with, None where
+    workers of one host share its cores. `parts` and `light` are absolute: workers have folders of their own.
     """
 
     scene: Scene
@@ -51,7 +55,7 @@ class Work:
     parts: Path
     light: Path
     light_limit_bytes: int
-    threads: int
+    threads: int | None
 
 
 @dataclass(frozen=True)
@@ -67,8 +71,10 @@ def part_file(parts: Path, job: Job) -> Path:
     return parts / f"{job.key}.parquet"
 
 
-def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Generator[Done]:
-    """Do jobs in `workers` processes; yield each as it ends.
+def run_jobs(
+    work: Work, jobs: Sequence[Job], workers: int, scratch: Path, scheduler: str | None = None
+) -> Generator[Done]:
+    """Do jobs in `workers` processes, or by those of a `scheduler` at an address; yield each as it ends.
 
     The first job of those that share light renders it; the others begin when it has ended, and find it in the
     cache. When the generator is closed, or an exception goes through it, the workers end.
@@ -79,12 +85,21 @@ def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Ge
     settings = {
         "distributed.scheduler.allowed-failures": _DEATHS,
         "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
-        "distributed.nanny.pre-spawn-environ": thread_settings(work.threads),
+        "distributed.nanny.pre-spawn-environ": thread_settings(work.threads or 1),
         "temporary-directory": str(scratch),
     }
     try:
-        with dask.config.set(settings), _client(workers) as client:
-            _tell_workers(client, work)
+        hosts: dict[str, int] = {}
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(dask.config.set(settings))
+            if scheduler is None:
+                client = stack.enter_context(_client(workers))
+            else:
+                client, hosts = stack.enter_context(connected(scheduler, work.parts))
+            plugin = _plugin_name(work)
+            _tell_workers(client, _Context(work, hosts), plugin)
+            if scheduler is not None:  # it outlives this campaign
+                stack.callback(_forget, client, plugin)
             order = {job.key: number for number, job in enumerate(jobs)}
             followers: dict[str, list[Job]] = {}
             first: list[Job] = []
@@ -97,7 +112,9 @@ def run_jobs(work: Work, jobs: Sequence[Job], workers: int, scratch: Path) -> Ge
             job_of: dict[Future, Job] = {}
 
             def submitted(job: Job) -> Future:
-                future = client.submit(_do, job, key=job.key, priority=-order[job.key], retries=0, pure=False)
+                # Named after the campaign's folder too: others may do the same job by the same scheduler.
+                key, priority = f"{plugin}-{job.key}", -order[job.key]
+                future = client.submit(_do, job, plugin, key=key, priority=priority, retries=0, pure=False)
                 job_of[future] = job
                 return future
 
@@ -142,11 +159,21 @@ def _started(workers: int) -> LocalCluster:
     raise AssertionError
 
 
-def _tell_workers(client: Client, work: Work) -> None:
+def _plugin_name(work: Work) -> str:
+    return f"{_PLUGIN}-{hashlib.sha256(str(work.parts).encode()).hexdigest()[:12]}"
+
+
+def _forget(client: Client, plugin: str) -> None:
+    """Take from workers what this campaign told them; a scheduler that is gone has forgotten it."""
+    with contextlib.suppress(OSError, TimeoutError):
+        client.unregister_worker_plugin(plugin)
+
+
+def _tell_workers(client: Client, context: "_Context", plugin: str) -> None:
     """Give workers what their jobs share; again where one is killed meanwhile."""
     for attempt in range(_STARTS):
         try:
-            client.register_plugin(_Context(work), name=_PLUGIN)
+            client.register_plugin(context, name=plugin)
         except OSError:  # Dask's CommClosedError is one
             if attempt == _STARTS - 1:
                 raise
@@ -185,16 +212,17 @@ def _interrupts_held() -> Iterator[None]:
 class _Context(WorkerPlugin):  # type: ignore[misc]
     """What a worker keeps from job to job: estimators, light, and how many threads it has."""
 
-    def __init__(self, work: Work) -> None:
-        self.work = work
+    def __init__(self, work: Work, hosts: Mapping[str, int]) -> None:
+        self.work, self.hosts = work, hosts
         self._estimators: dict[str, Estimator] | None = None
         self._cache: LightCache | None = None
 
     def do(self, job: Job) -> None:
         """Do a job, and leave its file."""
         if self._estimators is None:  # here, not at the start: Mitsuba's variant belongs to this thread
-            set_threads(self.work.threads)
-            cv2.setNumThreads(self.work.threads)
+            threads = self._threads()
+            set_threads(threads)
+            cv2.setNumThreads(threads)
             self._estimators = frame_estimators(self.work.estimators)
             self._cache = LightCache(
                 self.work.light,
@@ -207,10 +235,16 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
         rows, frames_sha256 = execute(scene, self._estimators, self._cache)
         write_part(part_file(self.work.parts, job), rows, frames_sha256)
 
+    def _threads(self) -> int:
+        if self.work.threads is not None:
+            return self.work.threads
+        beside = self.hosts.get(get_address_host(get_worker().address), 1)
+        return max(cores() // beside, 1)
 
-def _do(job: Job) -> str | None:
+
+def _do(job: Job, plugin: str) -> str | None:
     """Do one job in a worker; return what went wrong, in words."""
-    context = get_worker().plugins[_PLUGIN]
+    context = get_worker().plugins[plugin]
     try:
         context.do(job)
     except Exception as error:  # one job that fails must not take the others along

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from nir_render import InputError, Scene, load_scene
+from nir_render.scene.scene import parse_scene
 from tests.paths import SCENES
 
 FRONT = "robots.r1.rig.cameras.front"
@@ -285,6 +286,36 @@ def test_presets_and_curves_may_be_files_beside_the_scene(tmp_path: Path) -> Non
     assert np.array(sensor.quantum_efficiency.points) == pytest.approx(
         np.array([[800e-9, 0.3], [940e-9, 0.1], [1100e-9, 0.02]])
     )
+
+
+def test_parts_that_are_written_alike_are_read_once_but_not_those_that_follow_from_files(
+    tmp_path: Path,
+) -> None:
+    """A file that has changed between two scenes of one process is read again, however deep it is named."""
+    document = {
+        "format": 1,
+        "name": "two",
+        "observe": ["r1.front"],
+        "robots": {
+            "r1": {"rig": "infra_swarm"},
+            "r2": {"rig": "infra_swarm", "position": "[1, 0, 0] m"},
+            "r3": {
+                "rig": {"preset": "infra_swarm", "sources": {"top": "mine.yaml"}},
+                "position": "[2, 0, 0] m",
+            },
+        },
+    }
+    seen = []
+    for flux in ("0.1 W", "0.2 W"):
+        (tmp_path / "mine.yaml").write_text(
+            f'preset: infra_swarm\nposition: "[0, 0, 0.28] m"\nflux: {flux}\n'
+        )
+        seen.append(parse_scene(document, tmp_path).document.robots)
+    assert seen[0]["r1"].rig is seen[0]["r2"].rig is seen[1]["r1"].rig
+    assert [robots["r3"].rig.sources["top"].flux_w for robots in seen] == [0.1, 0.2]
+    other = parse_scene(document, tmp_path).with_({"robots.r2.rig.sources.top.flux": "0.3 W"})
+    assert other.document.robots["r2"].rig.sources["top"].flux_w == 0.3
+    assert other.document.robots["r1"].rig is seen[0]["r1"].rig
 
 
 def test_an_override_inside_a_preset_changes_that_part_only(scene: Scene) -> None:

@@ -1,6 +1,5 @@
 """Campaigns whose errors are known: tables as `gathered` makes them, of errors drawn from a formula."""
 
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -9,8 +8,9 @@ import pyarrow as pa
 
 from nir_render.randomness import generator
 from nir_render.scene.scene import Scene
-from nir_render.stress.axes import Axis
 from nir_render.stress.campaign import Campaign
+from nir_render.stress.design.axes import Axis
+from nir_render.stress.design.points import combinations_of
 from nir_render.stress.metrics import METRICS, parse_bound
 
 RANGE = Axis(
@@ -40,7 +40,7 @@ def campaign(
     asked = tuple(name for name in METRICS if name in {*bounds, *metrics})
     return Campaign(
         name=named.get("name", "clutter"), description=named.get("description", ""), scene=cast(Scene, None), settings={},
-        axes=tuple(axes), seeds=tuple(range(1, seeds + 1)), estimators=("paper", "robust"), metrics=asked,
+        axes=tuple(axes), sample=None, seeds=tuple(range(1, seeds + 1)), estimators=("paper", "robust"), metrics=asked,
         bounds=tuple(parse_bound(name, text) for name, text in bounds.items()), path="clutter.yaml",
     )  # fmt: skip
 
@@ -82,7 +82,7 @@ def table(
 ) -> pa.Table:
     """Return the table of every combination of values; `rows` gets the indices by axis name, seed, estimator."""
     out: list[Row] = []
-    for values in itertools.product(*(range(len(axis.labels)) for axis in axes)):
+    for values in combinations_of(axes):
         for seed in range(1, seeds + 1):
             at = {axis.name: index for axis, index in zip(axes, values, strict=True)}
             own: Row = {"job": f"{'-'.join(map(str, values))}-{seed}", "seed": seed}

@@ -6,7 +6,7 @@ import yaml
 from pydantic import ValidationError
 
 from nir_render.scene.problems import explain
-from nir_render.stress.axes import Axis, AxisDocument
+from nir_render.stress.design.axes import Axis, AxisDocument
 
 
 def axis(written: Any, name: str = "robots.r2.position.x") -> Axis:
@@ -66,6 +66,7 @@ def test_spacing_of_a_list_is_read_off_it() -> None:
         ({"from": "here", "to": "5 m", "count": 3}, "'here' is no number"),
         ({"from": 0.0, "to": 5.0, "count": 3, "spacing": "log"}, "above 0"),
         ({"from": "1 m", "to": "100 cm", "count": 3}, "the same"),
+        ({"from": "1 m", "to": "5 m"}, "needs 'from', 'to' and 'count'"),
         (["1 m", "100 cm"], "stands twice"),
         (["a", "a"], "stands twice"),
     ],
@@ -78,7 +79,7 @@ def test_an_axis_without_sense_says_so(written: Any, said: str) -> None:
 @pytest.mark.parametrize(
     ("written", "said"),
     [
-        ({"from": "1 m", "to": "5 m"}, "needs 'from', 'to' and 'count'"),
+        ({"from": "1 m", "count": 3}, "needs 'from', 'to' and 'count'"),
         ({"values": [1], "count": 3}, "write either"),
         ({"path": "a.b"}, "write either"),
         ({"values": [1, 2], "labels": ["one"]}, "as many"),

@@ -1,6 +1,7 @@
 """Campaign documents: what they become, and what is refused before anything runs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,18 +70,33 @@ def test_every_combination_gets_every_seed(tmp_path: Path) -> None:
     campaign, jobs = planned(tmp_path)
     assert campaign.seeds == (1, 2)
     assert len(jobs) == len({job.key for job in jobs}) == 3 * 2 * 2
-    assert [job.values for job in jobs[:4]] == [(0, 0), (0, 0), (0, 1), (0, 1)]
+    assert [job.point.values for job in jobs[:4]] == [(0, 0), (0, 0), (0, 1), (0, 1)]
     scene = campaign.scene.with_(jobs[-1].settings)
     assert scene.document.robots["r2"].position_m == (4.0, 0.2, 0.0)
     assert scene.camera("r1.front")[1].exposure_s == 1e-3
     assert (scene.document.seed, scene.document.clock.frames) == (2, 1)
 
 
+def test_processes_plan_the_same_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign, jobs = planned(tmp_path)
+    monkeypatch.setattr("nir_render.stress.jobs._MANY", 2)
+    monkeypatch.setattr("nir_render.stress.jobs._CHUNK", 2)
+    monkeypatch.setattr("nir_render.stress.jobs.usual_workers", lambda: 2)
+    assert plan(campaign) == jobs
+    broken = replace(campaign, axes=(replace(campaign.axes[0], values=("0 m", "2 m", "inf m")),))
+    with pytest.raises(InputError) as told:
+        plan(broken)
+    monkeypatch.undo()
+    with pytest.raises(InputError) as alone:
+        plan(broken)
+    assert told.value.problems == alone.value.problems
+
+
 def test_light_is_shared_where_only_the_exposure_differs(tmp_path: Path) -> None:
     _, jobs = planned(tmp_path)
     assert len({job.light for job in jobs}) == 3 * 2  # each range, each seed
     for job in jobs:
-        assert {other.values[0] for other in jobs if other.light == job.light} == {job.values[0]}
+        assert {other.point.values[0] for other in jobs if other.light == job.light} == {job.point.values[0]}
 
 
 def test_a_job_is_named_by_what_it_does(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nir_render.stress.axes import AxisDocument
 from nir_render.stress.campaign import load_campaign
+from nir_render.stress.design.axes import AxisDocument
 from tests.paths import SCENES
 
 CENTROID = {"a.centroid": {"mean": "940 nm", "sigma": "4 nm"}}

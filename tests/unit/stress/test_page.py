@@ -9,9 +9,9 @@ import pytest
 from matplotlib.figure import Figure as MatplotlibFigure
 
 from nir_render.report.drawing import ratio_ticks
-from nir_render.stress.axes import Axis
-from nir_render.stress.bootstrap import draw_repetitions
+from nir_render.stress.bootstrap import along_axes
 from nir_render.stress.crossings import Edge, Span
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS, Bound
 from nir_render.stress.page import plots as campaign_plots
 from nir_render.stress.page.page import campaign_html
@@ -140,9 +140,8 @@ def test_the_limit_lies_within_the_picture(limit_m: float, monkeypatch: pytest.M
     drawings: list[MatplotlibFigure] = []
     monkeypatch.setattr(campaign_plots, "svg_of", drawings.append)
     rows = table([RANGE], 1, lambda at, seed, name: [frame(), source(0.03, range_limit_m=limit_m)])
-    sums = job_sums([RANGE], rows)
-    again = draw_repetitions(sums.place, 1)
-    campaign_plots.against_axes(METRICS["range_rmse"], [RANGE], [0], sums, again, 0.05)
+    told = along_axes([RANGE], job_sums([RANGE], rows), 1)
+    campaign_plots.against_axes(METRICS["range_rmse"], [RANGE], [0], told, 0.05)
     shown = [panel.get_ylim() for panel in drawings[0].axes]
     assert all(low < limit_m < high for low, high in shown)
     assert len(shown) == 2

@@ -7,7 +7,7 @@ import pytest
 from distributed import Client
 from distributed.comm import CommClosedError
 
-from nir_render.stress.workers.pool import Work, _tell_workers
+from nir_render.stress.workers.pool import _Context, _tell_workers
 
 
 @pytest.mark.parametrize(("kills", "survives"), [(0, True), (3, True), (4, False)])
@@ -21,10 +21,10 @@ def test_a_worker_killed_while_it_is_told_does_not_end_the_campaign(kills: int, 
             raise CommClosedError("Stream is closed")
 
     client = cast("Client", SimpleNamespace(register_plugin=register_plugin))
-    work = cast("Work", None)
+    context = cast("_Context", None)
     if survives:
-        _tell_workers(client, work)
+        _tell_workers(client, context, "name")
         assert len(told) == kills + 1
     else:
         with pytest.raises(CommClosedError):
-            _tell_workers(client, work)
+            _tell_workers(client, context, "name")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from nir_render.randomness import generator
-from nir_render.stress.axes import Axis
 from nir_render.stress.crossings import Edge, spans
+from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS, Bound
 from nir_render.stress.reach import Reach, corners_kept, reaches_of
 from nir_render.stress.summary import _edge_record, summary_of

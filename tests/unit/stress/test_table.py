@@ -5,7 +5,8 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from nir_render.stress.axes import AxisDocument
+from nir_render.stress.design.axes import AxisDocument
+from nir_render.stress.design.points import points_of
 from nir_render.stress.jobs import Job
 from nir_render.stress.table import gathered, read_part, read_table, write_part, write_table
 
@@ -27,7 +28,8 @@ ROWS = [
 
 
 def job(number: int, values: tuple[int, int]) -> Job:
-    return Job(f"{number:032x}", values, number, {}, "light")
+    point = next(point for point in points_of(AXES, None) if point.values == values)
+    return Job(f"{number:032x}", point, number, {}, "light")
 
 
 def test_a_part_comes_back_as_it_was_written(tmp_path: Path) -> None:

@@ -1,25 +1,41 @@
 """The axes of a campaign: what is changed in the scene, and through which values."""
 
+import bisect
 import itertools
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
 from nir_render.errors import shown
-from nir_render.randomness import generator
 from nir_render.scene.documents.base import Document, KeyProblem
-from nir_render.scene.text.units import Reading, read_quantity
+from nir_render.scene.text.units import FRACTION, Reading, read_quantity
+from nir_render.stress.design.draws import Distribution, drawn_units
 
 MOST_VALUES = 1000
-_MOST_DRAWS = 1000
+_PARTS_SHOWN = 8
 
 DottedPath = Annotated[str, Field(max_length=200)]
 Label = Annotated[str, Field(max_length=100)]
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How near neighbours are brought where a bound is crossed.
+
+    `step` is in the axis's unit, or, `by_ratio`, how much larger the one may be than the other, as a share.
+    """
+
+    step: float
+    by_ratio: bool
+
+    def is_kept(self, low: float, high: float) -> bool:
+        """Tell whether two neighbours are near enough; a millionth of the step is for their last digits."""
+        distance = high / low - 1.0 if self.by_ratio else high - low
+        return distance <= self.step * (1.0 + 1e-6)
 
 
 @dataclass(frozen=True)
@@ -48,6 +64,16 @@ class Axis:
         Whether neighbours differ by ratios rather than by steps.
     units
         Of an axis that draws: what each unit sets, by dotted path, shape (n,); else None.
+    edges
+        Of a range that is drawn from: the ends of the parts that are shown as its values, increasing, in its
+        unit, shape (n + 1,); else None.
+    edges_si
+        The same in SI units.
+    added
+        Which values were put between those written, to find a limit more exactly, shape (n,); empty where
+        none was. They are run with the written values of the other axes alone.
+    refinement
+        How exactly limits along it are wanted; None where the values stay those written.
     """
 
     name: str
@@ -60,6 +86,18 @@ class Axis:
     values_si: tuple[float, ...] | None = None
     log: bool = False
     units: tuple[Mapping[str, Any], ...] | None = None
+    edges: tuple[float, ...] | None = None
+    edges_si: tuple[float, ...] | None = None
+    added: tuple[bool, ...] = ()
+    refinement: Refinement | None = None
+
+    def written(self) -> tuple[int, ...]:
+        """Return the indices of the values that were written, not added."""
+        return tuple(i for i in range(len(self.labels)) if not self.added or not self.added[i])
+
+    def part_of(self, value_si: float) -> int:
+        """Return in which part of a range that is drawn from a value lies, as index into its values."""
+        return min(max(bisect.bisect_right(self.edges_si or (), value_si) - 1, 0), len(self.labels) - 1)
 
     def settings(self, index: int) -> dict[str, Any]:
         """Return what the value of this index sets, by dotted path."""
@@ -68,84 +106,14 @@ class Axis:
         return dict.fromkeys(self.paths, self.values[index])
 
 
-class Distribution(Document):
-    """How a value spreads over units: normal about `mean` with `sigma`, or uniform from `least` to `most`.
-
-    A normal one with `least` or `most` is cut off there: units beyond are sorted out, as bins do.
-    """
-
-    example: ClassVar[str] = "{mean: 940 nm, sigma: 4 nm, least: 920 nm, most: 960 nm}"
-
-    mean: Any = None
-    sigma: Any = None
-    least: Any = None
-    most: Any = None
-
-    @model_validator(mode="after")
-    def _normal_or_uniform(self) -> Self:
-        if (self.mean is None) != (self.sigma is None) or (
-            self.mean is None and (self.least is None or self.most is None)
-        ):
-            raise ValueError(
-                "wanted 'mean' and 'sigma', or 'least' and 'most' alone (all values between alike), such as "
-                f"{self.example}"
-            )
-        return self
-
-    def value(self, rng: np.random.Generator) -> str | float:
-        """Return a drawn value, as a scene file holds it.
-
-        Raises
-        ------
-        ValueError
-            A figure is no number, they are not of one kind, or hardly a unit lies within the bounds.
-        """
-        like, (mean, sigma, least, most) = self._numbers()
-        if mean is None or sigma is None:
-            assert least is not None
-            assert most is not None
-            if not least < most:
-                raise ValueError(f"'least', {self.least}, is not below 'most', {self.most}")
-            number = rng.uniform(least, most)
-        else:
-            if not sigma > 0.0:
-                raise ValueError(f"'sigma' is {shown(self.sigma)}; wanted one above 0")
-            low, high = -np.inf if least is None else least, np.inf if most is None else most
-            drawn = rng.normal(mean, sigma, _MOST_DRAWS)
-            within = drawn[(drawn >= low) & (drawn <= high)]
-            if not within.size:
-                raise ValueError(
-                    f"not one unit in {_MOST_DRAWS} lies from {shown(self.least)} to {shown(self.most)}; "
-                    "check them"
-                )
-            number = within[0]
-        rounded = float(f"{number:.12g}")
-        return f"{rounded!r} {like.unit}" if like.unit else rounded
-
-    def _numbers(self) -> tuple[Reading, list[float | None]]:
-        """Return a figure whose unit is taken, and all in that unit."""
-        written = [self.mean, self.sigma, self.least, self.most]
-        readings = [None if one is None else read_quantity(one) for one in written]
-        for one, reading in zip(written, readings, strict=True):
-            if one is not None and reading is None:
-                raise ValueError(f"{shown(one)} is no number with a unit; write such as {self.example}")
-        known = [reading for reading in readings if reading is not None]
-        like = known[0]
-        if any(reading.quantity is not like.quantity for reading in known):
-            raise ValueError(
-                f"wanted figures of one kind, not {' and '.join(r.quantity.name for r in known)}"
-            )
-        unit = read_quantity(f"1 {like.unit}".rstrip())
-        assert unit is not None  # it was read before
-        return like, [None if reading is None else reading.value_si / unit.value_si for reading in readings]
-
-
 class AxisDocument(Document):
     """An axis as written: a list of values, a range `from` … `to` of `count` values, or units that are drawn.
 
     `path` is the dotted path, or several that get the same value; without it the axis's name is the path.
-    `labels` name the values, one for each. `draw` holds distributions by dotted path; each of `count` units
-    draws all of them, keyed by `seed`.
+    `labels` name the values, one for each. `refine` says how exactly limits along the axis are wanted, in its
+    unit or as a share of the value: values are added where a bound is crossed. `draw` holds distributions by
+    dotted path; each of `count` units draws all of them, keyed by `seed`. In a campaign of samples a range is
+    drawn from evenly, and `count` is in how many parts its page shows it.
     """
 
     example: ClassVar[str] = "{path: robots.r2.position.x, from: 1 m, to: 6 m, count: 6}"
@@ -158,6 +126,7 @@ class AxisDocument(Document):
     to: Any = None
     count: Annotated[int, Field(ge=2, le=MOST_VALUES)] | None = None
     spacing: Literal["linear", "log"] = "linear"
+    refine: Any = None
     draw: Annotated[dict[DottedPath, Distribution], Field(min_length=1)] | None = None
     seed: Annotated[int, Field(ge=0)] = 1
 
@@ -180,7 +149,7 @@ class AxisDocument(Document):
         of_range = (self.start, self.to, self.count)
         if (self.values is None) == all(part is None for part in of_range):
             raise ValueError(f"write either 'values' or 'from', 'to' and 'count', such as {self.example}")
-        if self.values is None and any(part is None for part in of_range):
+        if self.values is None and (self.start is None or self.to is None):
             raise ValueError(f"a range needs 'from', 'to' and 'count', such as {self.example}")
         if self.labels is not None and (self.values is None or len(self.labels) != len(self.values)):
             raise ValueError("'labels' names each of the 'values': wanted as many of them")
@@ -190,6 +159,7 @@ class AxisDocument(Document):
 
     def _drawn(self) -> Self:
         others = {"path": self.path, "values": self.values, "from": self.start, "to": self.to}
+        others["refine"] = self.refine
         written = [key for key, value in {**others, "labels": self.labels}.items() if value is not None]
         if written or self.count is None:
             wrong = f"{written[0]!r} has no place there" if written else "'count' is missing"
@@ -208,10 +178,12 @@ class AxisDocument(Document):
             A range whose ends are no numbers of one unit, or the same; a value that stands twice.
         """
         if self.draw is not None:
-            units = _drawn_units(self.draw, name, self.seed, self.count or 1)
+            units = drawn_units(self.draw, name, self.seed, self.count or 1)
             labels = tuple(f"{name} {number}" for number in range(1, len(units) + 1))
             return Axis(name, self.title or name, tuple(self.draw), units, labels, units=units)
         paths = self.path if isinstance(self.path, tuple) else (self.path or name,)
+        if self.values is None and self.count is None:
+            raise ValueError(f"a range needs 'from', 'to' and 'count', such as {self.example}")
         values = self._range() if self.values is None else self.values
         read = [read_quantity(value) for value in values]
         title = self.title or (name if self.path is not None else name.rpartition(".")[2].replace("_", " "))
@@ -219,26 +191,40 @@ class AxisDocument(Document):
         if self.labels is not None or None in read or len({reading.quantity for reading in readings}) > 1:
             labels = self.labels or tuple(_label(value) for value in values)
             _refuse_repeats(labels)
+            if self.refine is not None:
+                raise ValueError("'refine' puts values between numbers: there is nothing between labels")
             return Axis(name, title, paths, values, labels)
         unit = readings[0].unit
         si = tuple(reading.value_si for reading in readings)
         numbers = tuple(_in_unit(reading, readings[0]) for reading in readings)
-        labels = tuple(f"{number:.4g} {unit}".rstrip() for number in numbers)
         _refuse_repeats(si)
-        if len(set(labels)) != len(labels):
-            labels = tuple(f"{number!r} {unit}".rstrip() for number in numbers)
         order = sorted(range(len(si)), key=si.__getitem__)
+        numbers = tuple(numbers[i] for i in order)
         return Axis(
             name,
             title,
             paths,
             tuple(values[i] for i in order),
-            tuple(labels[i] for i in order),
+            _number_labels(numbers, unit),
             unit,
-            tuple(numbers[i] for i in order),
+            numbers,
             tuple(si[i] for i in order),
             self._spaced_by_ratios(sorted(si)),
+            refinement=None if self.refine is None else self._refinement(readings[0], min(si)),
         )
+
+    def _refinement(self, like: Reading, least_si: float) -> Refinement:
+        """Return how near neighbours are brought: a length of an axis of lengths, or a share of the value."""
+        step = read_quantity(self.refine)
+        wanted = f"wanted a step, such as {_like(like, 0.1)}, or a share of the value, such as 2 %"
+        if step is None or not step.value_si > 0.0:
+            raise ValueError(f"'refine' is {shown(self.refine)}; {wanted}")
+        by_ratio = step.quantity is FRACTION and like.quantity is not FRACTION
+        if not by_ratio and step.quantity is not like.quantity:
+            raise ValueError(f"'refine' is {shown(self.refine)}, a {step.quantity.name}; {wanted}")
+        if by_ratio and least_si <= 0.0:
+            raise ValueError(f"'refine' is a share, {self.refine}, of values down to 0 or less; write a step")
+        return Refinement(step.value_si if by_ratio else _in_unit(step, like), by_ratio)
 
     def _spaced_by_ratios(self, si: list[float]) -> bool:
         if self.values is None:
@@ -249,7 +235,35 @@ class AxisDocument(Document):
         ratios = [math.log(later / earlier) for earlier, later in itertools.pairwise(si)]
         return max(ratios) / min(ratios) < max(steps) / min(steps)
 
-    def _range(self) -> tuple[Any, ...]:
+    def sampled(self, name: str) -> Axis:
+        """Return the axis for a campaign of samples: of a range the parts that are shown, each a value.
+
+        Raises
+        ------
+        ValueError
+            As `axis`; and `refine`, which asks for values at places of its own.
+        """
+        if self.refine is not None:
+            raise ValueError("'refine' puts values into a grid; a campaign of samples has none: leave it out")
+        if self.draw is not None or self.values is not None:
+            return self.axis(name)
+        parts, by_ratio = self.count or _PARTS_SHOWN, self.spacing == "log"
+        first, begin, end = self._ends()
+        edges = sorted(_between(begin, end, part / parts, by_ratio) for part in range(parts + 1))
+        pairs = list(itertools.pairwise(edges))
+        middles = tuple(_written(_between(low, high, 0.5, by_ratio), first.unit) for low, high in pairs)
+        shown = self.model_copy(update={"values": middles}).axis(name)
+        readings = [read_quantity(_written(edge, first.unit)) for edge in edges]
+        return replace(
+            shown,
+            labels=tuple(f"{low:.4g} to {high:.4g} {first.unit}".rstrip() for low, high in pairs),
+            log=by_ratio,
+            edges=tuple(edges),
+            edges_si=tuple(reading.value_si for reading in readings if reading is not None),
+        )
+
+    def _ends(self) -> tuple[Reading, float, float]:
+        """Return the first end of a range, and both in its unit."""
         first, last = read_quantity(self.start), read_quantity(self.to)
         if first is None or last is None:
             wrong = self.start if first is None else self.to
@@ -262,42 +276,93 @@ class AxisDocument(Document):
         begin, end = first.number, _in_unit(last, first)
         if begin == end:
             raise ValueError("'from' and 'to' are the same; write two ends")
-        count = self.count or 2
         if self.spacing == "log" and min(begin, end) <= 0.0:
             raise ValueError("a log range needs 'from' and 'to' above 0")
+        return first, begin, end
+
+    def _range(self) -> tuple[Any, ...]:
+        first, begin, end = self._ends()
+        count = self.count or 2
         shares = [step / (count - 1) for step in range(count)]
-        if self.spacing == "log":
-            numbers = [begin * (end / begin) ** share for share in shares]
-        else:
-            numbers = [begin + (end - begin) * share for share in shares]
-        # Twelve digits: 0.1 + 2 · 0.1 is to be 0.3.
-        rounded = [float(f"{number:.12g}") for number in numbers]
+        rounded = [_between(begin, end, share, self.spacing == "log") for share in shares]
         whole = all(isinstance(end, int) for end in (self.start, self.to)) and all(
             number.is_integer() for number in rounded
         )
-        if not first.unit:
-            return tuple(int(number) for number in rounded) if whole else tuple(rounded)
-        return tuple(f"{number:.12g} {first.unit}" for number in rounded)
+        return tuple(int(one) if whole and not first.unit else _written(one, first.unit) for one in rounded)
 
 
-def _drawn_units(
-    draws: Mapping[str, Distribution], name: str, seed: int, count: int
-) -> tuple[dict[str, Any], ...]:
-    """Return what each of so many units sets, by dotted path.
+def _between(begin: float, end: float, share: float, log: bool) -> float:
+    """Return what lies at a share of the way; in twelve digits, as 0.1 + 2 · 0.1 is to be 0.3."""
+    number = begin * (end / begin) ** share if log else begin + (end - begin) * share
+    return float(f"{number:.12g}")
 
-    Unit k of an axis `name` is the same whatever the count and the other paths: its numbers are keyed by the
-    seed, the axis, the path, and k. Raises ValueError as `Distribution.value`.
+
+def _written(number: float, unit: str) -> Any:
+    return f"{number:.12g} {unit}" if unit else number
+
+
+def with_values(axis: Axis, added: Sequence[float]) -> Axis:
+    """Return an axis of numbers with more values, in its unit; they are marked as added.
+
+    Raises
+    ------
+    ValueError
+        It is no axis of numbers, or has one of them already.
     """
-    units: list[dict[str, Any]] = []
-    for unit in range(count):
-        values = {}
-        for path, distribution in draws.items():
-            try:
-                values[path] = distribution.value(generator(seed, f"draw/{name}", path, unit))
-            except ValueError as error:
-                raise ValueError(f"draw.{path}: {error}") from None
-        units.append(values)
-    return tuple(units)
+    if axis.numbers is None or axis.values_si is None:
+        raise ValueError(f"the axis {axis.name!r} is not one of numbers")
+    whole = all(isinstance(value, int) for value in axis.values)
+    values: list[Any] = [*axis.values]
+    si = [*axis.values_si]
+    for number in added:
+        value = f"{number:.12g} {axis.unit}" if axis.unit else round(number) if whole else number
+        reading = read_quantity(value)
+        assert reading is not None  # a number, and a unit that was read before
+        values.append(value)
+        si.append(reading.value_si)
+    _refuse_repeats(tuple(si))
+    flags = [*(axis.added or (False,) * len(axis.values)), *(True for _ in added)]
+    order = sorted(range(len(si)), key=si.__getitem__)
+    numbers = [*axis.numbers, *(float(value) for value in added)]
+    numbers = [numbers[i] for i in order]
+    return replace(
+        axis,
+        values=tuple(values[i] for i in order),
+        labels=_number_labels(numbers, axis.unit),
+        numbers=tuple(numbers),
+        values_si=tuple(si[i] for i in order),
+        added=tuple(flags[i] for i in order),
+    )
+
+
+def without_added(axis: Axis) -> Axis:
+    """Return an axis with the values that were written alone."""
+    if not any(axis.added):
+        return axis
+    kept = axis.written()
+    assert axis.numbers is not None
+    assert axis.values_si is not None
+    numbers = tuple(axis.numbers[i] for i in kept)
+    return replace(
+        axis,
+        values=tuple(axis.values[i] for i in kept),
+        labels=_number_labels(numbers, axis.unit),
+        numbers=numbers,
+        values_si=tuple(axis.values_si[i] for i in kept),
+        added=(),
+    )
+
+
+def _number_labels(numbers: Sequence[float], unit: str) -> tuple[str, ...]:
+    """Return how numbers are called: four digits where these tell them apart, else all."""
+    labels = tuple(f"{number:.4g} {unit}".rstrip() for number in numbers)
+    if len(set(labels)) != len(labels):
+        labels = tuple(f"{number!r} {unit}".rstrip() for number in numbers)
+    return labels
+
+
+def _like(reading: Reading, number: float) -> str:
+    return f"{number:g} {reading.unit}".rstrip()
 
 
 def _in_unit(reading: Reading, like: Reading) -> float:

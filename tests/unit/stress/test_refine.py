@@ -1,0 +1,128 @@
+"""Limits found more exactly: where values are added, when that ends, and what they must not change."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from nir_render.randomness import generator
+from nir_render.stress.campaign import Campaign
+from nir_render.stress.design.axes import Axis, AxisDocument, with_values
+from nir_render.stress.design.points import combinations_of, number_of_points
+from nir_render.stress.reach import campaign_reaches
+from nir_render.stress.refine import refined
+from nir_render.stress.summary import summary_of
+from nir_render.stress.sums import job_sums
+from tests.unit.stress.synthetic import LAMP, Row, campaign, frame, source, table
+
+LIMIT_M = 0.05
+PER_SQUARE = 0.003  # the error grows as range²: 5 cm are reached at 4.0825 m
+
+
+def axis(refine: object, count: int = 5, spacing: str = "log") -> Axis:
+    written = {"from": "1 m", "to": "8 m", "count": count, "spacing": spacing, "refine": refine}
+    return AxisDocument.model_validate(written).axis("robots.r2.x")
+
+
+def asked(axes: tuple[Axis, ...], seeds: int = 1) -> Campaign:
+    return replace(campaign(axes, {"range_rmse": "5 cm"}, seeds), estimators=("robust",))
+
+
+def rendered(wanted: Campaign, noise: float = 0.0) -> pa.Table:
+    """Return what the jobs of a campaign would have found, behind the lamp 1.4 × the error."""
+    ranges = wanted.axes[0]
+
+    def rows(at: dict[str, int], seed: int, name: str) -> list[Row]:
+        range_m = (ranges.values_si or ())[at[ranges.name]]
+        error_m = PER_SQUARE * range_m**2 * (1.4 if at.get("lamp") == 2 else 1.0)
+        random = generator(seed, "refine", "", round(1e6 * range_m))
+        errors = error_m * (1.0 + noise * random.standard_normal(4))
+        return [frame(), *(source(float(error)) for error in errors)]
+
+    return table(wanted.axes, len(wanted.seeds), rows, ["robust"])
+
+
+def settled(wanted: Campaign, noise: float = 0.0) -> Campaign:
+    """Return a campaign after as many rounds as it takes."""
+    for _ in range(50):
+        finer = refined(wanted, rendered(wanted, noise))
+        if finer is wanted:
+            return wanted
+        wanted = finer
+    raise AssertionError("no end of rounds")
+
+
+@pytest.mark.parametrize(("spacing", "refine", "step"), [("log", "1 %", 0.01), ("linear", "4 cm", 0.04)])
+def test_a_limit_is_bracketed_by_a_quarter_of_the_grids_jobs_or_fewer(
+    spacing: str, refine: str, step: float
+) -> None:
+    found = settled(asked((axis(refine, spacing=spacing),)))
+    truth_m = (LIMIT_M / PER_SQUARE) ** 0.5
+    numbers = np.array(found.axes[0].numbers)
+    after = int(np.searchsorted(numbers, truth_m))
+    low, high = numbers[after - 1 : after + 1]
+    assert (high / low - 1.0 if spacing == "log" else high - low) <= step * 1.000001
+    # A grid as fine: in how many values would it have the same gap?
+    grid = np.log(8.0) / np.log1p(step) + 1 if spacing == "log" else 7.0 / step + 1
+    assert numbers.size <= grid / 4
+    (reach,) = campaign_reaches(found, job_sums(found.axes, rendered(found)))
+    # Straight in the logarithms between neighbours, as range² is: on a log axis nothing is left.
+    assert reach.pooled.spans[0].end.value == pytest.approx(truth_m, rel=1e-9 if spacing == "log" else 1e-4)
+
+
+def test_the_worst_corner_has_values_of_its_own_and_other_axes_keep_their_figures() -> None:
+    coarse = asked((axis("1 %"), LAMP))
+    found = settled(coarse)
+    numbers = np.array(found.axes[0].numbers)
+    for error in (PER_SQUARE * 1.4, PER_SQUARE * np.sqrt((1.0 + 1.0 + 1.4**2) / 3.0)):
+        after = int(np.searchsorted(numbers, (LIMIT_M / error) ** 0.5))
+        assert numbers[after] / numbers[after - 1] - 1.0 <= 0.010001
+    before, behind = (summary_of(wanted, rendered(wanted)) for wanted in (coarse, found))
+    assert before["estimators"] == behind["estimators"]
+    assert before["limits"][1] == behind["limits"][1]  # along the lamps
+    assert behind["limits"][0]["worst_corner"]["corner"] == {"lamp": "behind"}
+
+
+def test_a_limit_that_seeds_leave_open_is_not_divided_further() -> None:
+    sure = settled(asked((axis("0.1 %"),), seeds=6), noise=0.002)
+    open_ = settled(asked((axis("0.1 %"),), seeds=6), noise=0.5)
+    assert len(sure.axes[0].labels) > len(open_.axes[0].labels) + 2
+    (reach,) = campaign_reaches(open_, job_sums(open_.axes, rendered(open_, 0.5)))
+    end = reach.pooled.spans[-1].end
+    numbers = np.array(open_.axes[0].numbers)
+    after = int(np.searchsorted(numbers, end.value))
+    assert end.low is not None
+    assert end.high is not None
+    assert end.high - end.low > numbers[after] - numbers[after - 1]
+
+
+def test_whole_numbers_stay_whole() -> None:
+    written = AxisDocument.model_validate({"values": [1, 8], "refine": 1}).axis("robots.r2.x")
+    found = settled(asked((written,)))
+    assert found.axes[0].values == (1, 4, 5, 6, 8)[: len(found.axes[0].values)] or all(
+        isinstance(value, int) for value in found.axes[0].values
+    )
+    assert {4, 5} <= set(found.axes[0].values)  # 4.08 lies between
+
+
+def test_added_values_go_with_the_written_ones_of_other_axes() -> None:
+    one, other = axis("1 %", 3), replace(axis("1 %", 3), name="b", paths=("b",))
+    axes = (with_values(one, [1.5, 2.0]), with_values(other, [4.0]))
+    points = combinations_of(axes)
+    assert number_of_points(axes, None) == len(points) == 9 + 2 * 3 + 1 * 3
+    assert all(not (axes[0].added[i] and axes[1].added[j]) for i, j in points)
+
+
+def test_what_is_written_of_it_is_checked() -> None:
+    for refine, said in (
+        ("5 s", "a time"),
+        ("0 m", "wanted a step"),
+        ("fine", "wanted a step"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            axis(refine)
+    with pytest.raises(ValueError, match="between labels"):
+        AxisDocument.model_validate({"values": ["a", "b"], "refine": "1 %"}).axis("x")
+    with pytest.raises(ValueError, match="write a step"):
+        AxisDocument.model_validate({"values": ["0 m", "1 m"], "refine": "1 %"}).axis("x")
