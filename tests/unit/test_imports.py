@@ -15,6 +15,7 @@ from tests.paths import ROOT
 FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.command": (),
     "nir_render.experiments": ("communication",),
+    "nir_render.export": (),
     "nir_render.stress": ("page", "workers", "job"),
     "nir_render.regress": ("stages",),
     "nir_render.compare": (),
