@@ -141,7 +141,7 @@ def experiment(
 ) -> None:
     """Run an experiment of the paper in closed loop: robots move by what they see."""
     from nir_render.command.console import print_json
-    from nir_render.experiments.outcome import ARENA
+    from nir_render.experiments.flocking.outcome import ARENA
 
     if seconds is not None and not (math.isfinite(seconds) and seconds >= 1.0):
         raise InputError(f"--seconds {seconds:g}: wanted a second or more, such as 120")
@@ -167,9 +167,9 @@ def _flocking(
     workers: int | None,
 ) -> tuple[str, Path, dict[str, Any]]:  # fmt: skip
     from nir_render.command.progress import progress_bar
-    from nir_render.experiments.flocking import Flocking
-    from nir_render.experiments.outcome import outcome_of
-    from nir_render.experiments.page import sentence, write_outcome
+    from nir_render.experiments.flocking.loop import Flocking
+    from nir_render.experiments.flocking.outcome import outcome_of
+    from nir_render.experiments.flocking.page import sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
 
     plan = Flocking(law=law, level=level, stack=stack, lasts_s=seconds or 120.0)

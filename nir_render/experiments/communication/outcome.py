@@ -14,8 +14,8 @@ from nir_render.experiments.communication.loop import (
     Communication,
     truth_of,
 )
-from nir_render.experiments.controllers import COMMANDED_M
-from nir_render.experiments.runs import Progress, run_seeds
+from nir_render.experiments.loop.controllers import COMMANDED_M
+from nir_render.experiments.loop.runs import Progress, run_seeds
 from nir_render.scene.scene import Scene
 
 _NO_ERROR_95 = 0.05

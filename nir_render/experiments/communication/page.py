@@ -8,7 +8,7 @@ import numpy as np
 from nir_render.experiments.communication.judge import Command
 from nir_render.experiments.communication.loop import ORDER, PACKET_S, PAPERS_INTERVALS_S
 from nir_render.experiments.communication.outcome import Outcome, Run, off_by_timetable_m
-from nir_render.experiments.controllers import COMMANDED_M
+from nir_render.experiments.loop.controllers import COMMANDED_M
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.parts import Table, render_page
 from nir_render.report.style import FAINT, INK, MATPLOTLIB

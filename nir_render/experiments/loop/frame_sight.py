@@ -5,9 +5,9 @@ from typing import Any
 from nir_render.camera.mean_frame import Rates, electron_rates, exposed_frame
 from nir_render.camera.timing.exposure_control import own_setting
 from nir_render.camera.timing.shutter import mid_exposure_s
-from nir_render.experiments.controllers import neighbours_of
-from nir_render.experiments.sight import Seen
-from nir_render.experiments.world import World
+from nir_render.experiments.loop.controllers import neighbours_of
+from nir_render.experiments.loop.sight import Seen
+from nir_render.experiments.loop.world import World
 from nir_render.randomness import RandomKey
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
@@ -49,7 +49,7 @@ class FrameSight:
         frames = [self._frame(snapshot, name) for name in self._cameras]
         self._index += 1
         heard = self._pipeline.push(frames, world.odometry(self._robot))
-        return Seen(neighbours_of(heard.tracks), heard.messages, heard.tracks)
+        return Seen(neighbours_of(heard.tracks), heard.messages, heard.tracks, tuple(frames))
 
     def signals(self) -> tuple[Signal, ...]:
         """Return how bright every track was so far, where that is kept."""

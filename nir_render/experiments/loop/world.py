@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.experiments.controllers import clipped
+from nir_render.experiments.loop.controllers import clipped
 from nir_render.scene.documents.times.clocks import OdometryNoise
 from nir_render.scene.pose import Pose
 from nir_render.scene.scene import Scene

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.experiments.flocking import Flocking, Run, run_of
-from nir_render.experiments.runs import Progress, run_seeds
+from nir_render.experiments.flocking.loop import Flocking, Run, run_of
+from nir_render.experiments.loop.runs import Progress, run_seeds
 from nir_render.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
-ARENA = Path(__file__).parents[1] / "data" / "experiments" / "arena.yaml"
+ARENA = Path(__file__).parents[2] / "data" / "experiments" / "arena.yaml"
 """The paper's arena."""
 
 WANTED_M = 0.05

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nir_render.experiments.flocking import Run
-from nir_render.experiments.outcome import Outcome
-from nir_render.experiments.plots import flock_plot
+from nir_render.experiments.flocking.loop import Run
+from nir_render.experiments.flocking.outcome import Outcome
+from nir_render.experiments.flocking.plots import flock_plot
 from nir_render.report.parts import Table, render_page
 from nir_render.report.wording import counted, metres, share
 from nir_render.run.folder import write_file, write_json
@@ -55,7 +55,7 @@ def outcome_html(outcome: Outcome) -> str:
     middle = outcome.runs[int(order[(len(order) - 1) // 2])]
     plan = outcome.plan
     return render_page(
-        "experiments/page.html",
+        "experiments/flocking/page.html",
         title=f"flocking: law {plan.law}, {plan.level}",
         subtitle=[counted(len(outcome.runs), "seed"), f"{plan.lasts_s:g} s each", outcome.scene],
         sentence=sentence(outcome),
