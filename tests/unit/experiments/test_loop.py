@@ -9,12 +9,12 @@ import pytest
 
 from nir_render import Scene, load_scene
 from nir_render.errors import InputError
-from nir_render.experiments.loop import runs
 from nir_render.experiments.flocking.loop import Flocking, Loop
-from nir_render.experiments.loop.frame_sight import FrameSight
-from nir_render.experiments.loop.measurement_sight import MeasurementSight
 from nir_render.experiments.flocking.outcome import ARENA, outcome_of
 from nir_render.experiments.flocking.page import write_outcome
+from nir_render.experiments.loop import runs
+from nir_render.experiments.loop.frame_sight import FrameSight
+from nir_render.experiments.loop.measurement_sight import MeasurementSight
 from nir_render.experiments.loop.world import Base, World
 from perception.model.fisher import flare_limit
 from perception.model.ranging import flux_at_one_metre_dn
@@ -122,7 +122,10 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bits(
     assert (tmp_path / "killed" / "runs" / "0003.state").exists()
     runs.run_seed(scene, plan, 3, tmp_path / "killed")
     whole, killed = (
-        {path.relative_to(tmp_path / folder): path.read_bytes() for path in (tmp_path / folder).rglob("*.json*")}
+        {
+            path.relative_to(tmp_path / folder): path.read_bytes()
+            for path in (tmp_path / folder).rglob("*.json*")
+        }
         for folder in ("whole", "killed")
     )
     assert whole == killed
