@@ -38,7 +38,7 @@ class LoopPlan:
     lasts_s, period_s
         How long it goes, and how often robots look and decide.
     refresh_s
-        At the level of frames: how often indirect light is rendered.
+        At the level of frames: after how long indirect light is rendered again, first (`FrameSight`).
     keep_frames
         At the level of frames: every how many looks frames are kept; 0 for none.
     """

@@ -74,4 +74,7 @@ def frame_rows(plan: LoopPlan, held_light_share: float | None) -> list[tuple[str
     off = ""
     if held_light_share is not None:
         off = f"; off by {share(held_light_share)} of the noise's variance before it is, at most"
-    return [("stack", plan.stack), ("indirect light", f"rendered every {plan.refresh_s:g} s{off}")]
+    return [
+        ("stack", plan.stack),
+        ("indirect light", f"rendered again after {plan.refresh_s:g} s, then as seldom as it changes{off}"),
+    ]
