@@ -24,6 +24,7 @@ RULES = {
         "the MAE of an estimator without bias at the Cramér–Rao bound of these very frames, √(2/π) of it."
     ),
     "found": "a detection within 3 px of the source, or its image's radius; lower limit one-sided, 95 %.",
+    "false alarms": "detections that are neither of the source nor of a lamp.",
     "robust": "maximum likelihood of the whole flare: place, range, and background together.",
     "paper": "its mask, its mean grey value, and the slope of its regression of m against 1/d².",
 }
@@ -34,7 +35,8 @@ _WHY = (
     "mask, all that is above twice the frame's mean, shrinks with the flare and leaves its skirt out. The "
     "regression of m against 1/d² is led by the nearest places, and its line misses the origin, here by "
     "{sigmas:.0f} σ at most. Over 1 to 10 m no constant makes up for that. What it reports could be had over "
-    "a short span about where its constant was fitted, or with a flare whose mask does not change."
+    "a short span about where its constant was fitted, or with a flare whose mask does not change. What it "
+    "does not find fails its tests of area (> 4 px) and aspect (0.8 to 1.2), or is not above its threshold."
 )
 
 
@@ -83,7 +85,7 @@ def _beside(figures: dict[str, Any]) -> Table:
 
 
 def _found(figures: dict[str, Any]) -> str:
-    return f"{_of(figures)}; at least {share(figures['found_lower_95'], more=2)}"
+    return f"{_of(figures)}; at least {share(figures['found_lower_95'], more=1)}"
 
 
 def _of(figures: dict[str, Any]) -> str:
@@ -132,6 +134,7 @@ def error_plot(outcome: Outcome) -> Drawing:
         axes.plot(*np.array(order).T, color=FAINT, linewidth=1.2, label="MAE at the limit")
         axes.axhline(0.028, color=FAINT, linewidth=0.9, linestyle="--", label="the paper's 2.8 cm")
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")  # style has formulas off
         axes.set_ylim(1e-4, None)
         axes.set_xlabel("range in m")
         axes.set_ylabel("absolute error of the range in m")

@@ -8,10 +8,11 @@ import numpy as np
 from nir_render.camera.mean_frame import Rates, exposed_frame, fully_lit_frame
 from nir_render.camera.timing.exposure_control import Setting
 from nir_render.camera.timing.shutter import mid_exposure_s
-from nir_render.evaluate.match import match
+from nir_render.evaluate.match import match, on_a_lamp
 from nir_render.evaluate.metrics import source_limits
 from nir_render.randomness import RandomKey
 from nir_render.simulation.clock import frame_of
+from nir_render.simulation.lamps import lamp_truth
 from nir_render.simulation.truth import truth_of
 from nir_render.truth.sources import SourceTruth
 from perception import Calibration, Detection, RawFrame, detect
@@ -58,7 +59,7 @@ class Sighting:
     seen
         By stack.
     false_alarms
-        By stack: detections that are of no source.
+        By stack: detections that are of no source, no lamp, and no mirror image by their own account.
     """
 
     range_m: float
@@ -95,19 +96,21 @@ def sight(rates: Rates, known: Calibration, exposure_s: float, index: int, seed:
     frame = frame_of(mean.electrons, camera, Setting(exposure_s, 1.0), begin_s, key)
     (truth,) = (row for row in truth_of(mean, frame) if row.ghost_of is None)
     limit_m, _ = source_limits(truth, known)
+    lamps_px = [lamp.outline_px for lamp in lamp_truth(rates.snapshot, known.camera, index)]
     seen: dict[str, Seen | None] = {}
     false_alarms: dict[str, int] = {}
     for name in STACKS:
         found = detect(frame, known, estimator=name)
-        seen[name], false_alarms[name] = _of_source(found, truth, frame, known)
+        seen[name], others = _of_source(found, truth, frame, known)
+        false_alarms[name] = sum(not (one.ghost or on_a_lamp(one, lamps_px)) for one in others)
     return Sighting(truth.range_m, limit_m, truth.direct_e / exposure_s, exposure_s, seen, false_alarms)
 
 
 def _of_source(
     found: list[Detection], truth: SourceTruth, frame: RawFrame, known: Calibration
-) -> tuple[Seen | None, int]:
+) -> tuple[Seen | None, list[Detection]]:
     matched = match([truth], found, known)
-    others = len([number for number in matched.unmatched if not found[number].ghost])
+    others = [found[number] for number in matched.unmatched]
     if not matched.pairs:
         return None, others
     hit = found[matched.pairs[0][1]]
