@@ -46,6 +46,7 @@ for command in (
     *(runs.run, runs.render, runs.perceive, runs.evaluate, runs.calibrate, runs.report),
     explain,
     compare,
+    recordings.export,
     *(stress.stress, stress.experiment),
     *(scenes.new, scenes.validate, scenes.schema, scenes.look, scenes.goniometer, scenes.doctor),
 ):

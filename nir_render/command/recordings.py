@@ -1,12 +1,13 @@
-"""The commands of recordings of a real camera: new-recording, import."""
+"""The commands that lead in and out: new-recording and import of a real camera's frames, export of a run."""
 
 import shlex
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from nir_render.command.options import Json
+from nir_render.command.options import FolderArgument, Json
 
 
 def new_recording(
@@ -68,3 +69,43 @@ def import_recording(
                 "which was added to the read noise; record PNG or TIFF for fainter flares"
             )
     typer.echo(f"next: nir-render perceive {shlex.quote(str(folder))}")
+
+
+class Format(StrEnum):
+    """The formats that there are."""
+
+    MCAP = "mcap"
+
+
+def export(
+    folder: FolderArgument,
+    form: Annotated[
+        Format,
+        typer.Option(
+            "--format", help="mcap: frames, poses, detections, tracks and words for ROS 2 and Foxglove."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", help="Where it goes; DIR.mcap by default."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a run in another program's format; what its folder holds is written, whatever that is."""
+    from nir_render.command.console import print_json
+    from nir_render.command.progress import progress_bar
+    from nir_render.export.mcap_file import export_mcap
+
+    whole = folder.resolve()
+    file = output if output is not None else whole.with_name(f"{whole.name}.{form.value}")
+    with progress_bar("export") as progress:
+        done = export_mcap(folder, file, progress)
+    if as_json:
+        record = {"file": str(done.file), "ahead_s": done.ahead_s, "messages": done.messages}
+        print_json({"format": 1, **record})
+        return
+    for topic, count in done.messages.items():
+        typer.echo(f"{count:8d}  {topic}")
+    if done.ahead_s:
+        typer.echo(f"its clock is {done.ahead_s} s ahead of the run's: ROS has no time below 0")
+    typer.echo(f"open {done.file}")

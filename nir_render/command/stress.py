@@ -22,6 +22,8 @@ from nir_render.command.options import (
 from nir_render.errors import InputError
 
 if TYPE_CHECKING:
+    from nir_render.experiments.communication.loop import Communication
+    from nir_render.experiments.flocking.loop import Flocking
     from nir_render.scene.scene import Scene
     from nir_render.stress.campaign import Campaign
     from nir_render.stress.jobs import Job
@@ -92,6 +94,8 @@ def stress(
 class Experiment(StrEnum):
     """The paper's experiments that there are."""
 
+    CALIBRATION = "calibration"
+    DIFFUSER = "diffuser"
     FLOCKING = "flocking"
     COMMUNICATION = "communication"
 
@@ -112,7 +116,10 @@ class Level(StrEnum):
 
 
 def experiment(
-    name: Annotated[Experiment, typer.Argument(metavar="NAME", help="Which: flocking or communication.")],
+    name: Annotated[
+        Experiment,
+        typer.Argument(metavar="NAME", help="Which: calibration, diffuser, flocking or communication."),
+    ],
     output: Output = None,
     law: Annotated[
         Law, typer.Option("--law", help="Flocking: how robots steer, robust or as the paper says.")
@@ -137,6 +144,14 @@ def experiment(
     robots: Annotated[
         int, typer.Option("--robots", min=3, max=7, help="Communication: how many, the leader among them.")
     ] = 3,
+    keep_frames: Annotated[
+        str | None,
+        typer.Option(
+            "--keep-frames",
+            metavar="every:N",
+            help="With frames: keep those of every Nth look; none by default.",
+        ),
+    ] = None,
     scene: Annotated[
         Path | None,
         typer.Option(
@@ -150,22 +165,34 @@ def experiment(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run an experiment of the paper in closed loop: robots move by what they see."""
+    """Run an experiment of the paper: ranges, a source that turns, robots that move by what they see."""
     from nir_render.command.console import print_json
-    from nir_render.experiments.outcome import ARENA
+    from nir_render.experiments.communication.loop import Communication
+    from nir_render.experiments.flocking.loop import Flocking
+    from nir_render.experiments.flocking.outcome import ARENA
+    from nir_render.experiments.standing.rail import RAIL
+    from nir_render.experiments.standing.turntable import TURNTABLE
 
     if seconds is not None and not (math.isfinite(seconds) and seconds >= 1.0):
         raise InputError(f"--seconds {seconds:g}: wanted a second or more, such as 120")
     folder = output if output is not None else Path("outputs") / name.value
-    world = read_scene(ARENA if scene is None else scene, settings, None)
-    if name is Experiment.FLOCKING:
-        said, page, record = _flocking(
-            world, law.value, level.value, stack.value, seconds, seeds, folder, workers
+    every = _kept_every(keep_frames, level)
+    arena = {Experiment.CALIBRATION: RAIL, Experiment.DIFFUSER: TURNTABLE}.get(name, ARENA)
+    world = read_scene(arena if scene is None else scene, settings, None)
+    if name is Experiment.CALIBRATION:
+        said, page, record = _calibration(world, seeds, folder, workers)
+    elif name is Experiment.DIFFUSER:
+        said, page, record = _diffuser(world, seeds, folder, workers)
+    elif name is Experiment.FLOCKING:
+        flocking = Flocking(
+            law=law.value, level=level.value, stack=stack.value, lasts_s=seconds or 120.0, keep_frames=every
         )
+        said, page, record = _flocking(world, flocking, seeds, folder, workers)
     else:
-        said, page, record = _communication(
-            world, robots, level.value, stack.value, seconds, seeds, folder, workers
+        communication = Communication(
+            robots=robots, level=level.value, stack=stack.value, lasts_s=seconds or 65.0, keep_frames=every
         )
+        said, page, record = _communication(world, communication, seeds, folder, workers)
     if as_json:
         print_json({**record, "page": str(page)})
         return
@@ -173,35 +200,70 @@ def experiment(
     typer.echo(f"open {page}")
 
 
-def _flocking(
-    world: "Scene", law: str, level: str, stack: str, seconds: float | None, seeds: int, folder: Path,
-    workers: int | None,
-) -> tuple[str, Path, dict[str, Any]]:  # fmt: skip
+def _kept_every(text: str | None, level: Level) -> int:
+    """Return every how many looks frames are kept; 0 for none."""
+    if text is None:
+        return 0
+    number = text.removeprefix("every:")
+    if not (text.startswith("every:") and number.isdecimal() and int(number) > 0):
+        raise InputError(f"--keep-frames {text}: wanted every:N, such as every:50")
+    if level is not Level.FRAMES:
+        raise InputError(f"--keep-frames: there are no frames by {level.value}; add --level frames")
+    return int(number)
+
+
+def _calibration(
+    world: "Scene", seeds: int, folder: Path, workers: int | None
+) -> tuple[str, Path, dict[str, Any]]:
     from nir_render.command.progress import progress_bar
-    from nir_render.experiments.flocking import Flocking
-    from nir_render.experiments.outcome import outcome_of
-    from nir_render.experiments.page import sentence, write_outcome
+    from nir_render.experiments.standing.rail import Rail
+    from nir_render.experiments.standing.rail_outcome import outcome_of
+    from nir_render.experiments.standing.rail_page import sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
 
-    plan = Flocking(law=law, level=level, stack=stack, lasts_s=seconds or 120.0)
+    with progress_bar("calibration") as progress:
+        outcome = outcome_of(world, Rail(), range(seeds), folder, workers or usual_workers(), progress)
+    return sentence(outcome), write_outcome(outcome, folder), outcome.record()
+
+
+def _diffuser(
+    world: "Scene", seeds: int, folder: Path, workers: int | None
+) -> tuple[str, Path, dict[str, Any]]:
+    from nir_render.command.progress import progress_bar
+    from nir_render.experiments.standing.turntable import Turntable
+    from nir_render.experiments.standing.turntable_page import outcome_of, sentence, write_outcome
+    from nir_render.transport.backend.cores import usual_workers
+
+    with progress_bar("diffuser") as progress:
+        outcome = outcome_of(world, Turntable(), range(seeds), folder, workers or usual_workers(), progress)
+    return sentence(outcome), write_outcome(outcome, folder), outcome.record()
+
+
+def _flocking(
+    world: "Scene", plan: "Flocking", seeds: int, folder: Path, workers: int | None
+) -> tuple[str, Path, dict[str, Any]]:
+    from nir_render.command.progress import progress_bar
+    from nir_render.experiments.flocking.outcome import outcome_of
+    from nir_render.experiments.flocking.page import sentence, write_outcome
+    from nir_render.transport.backend.cores import usual_workers
+
     with progress_bar("flocking") as progress:
         outcome = outcome_of(world, plan, range(seeds), folder, workers or usual_workers(), progress)
     return sentence(outcome), write_outcome(outcome, folder), outcome.record()
 
 
 def _communication(
-    world: "Scene", robots: int, level: str, stack: str, seconds: float | None, seeds: int, folder: Path,
-    workers: int | None,
-) -> tuple[str, Path, dict[str, Any]]:  # fmt: skip
+    world: "Scene", plan: "Communication", seeds: int, folder: Path, workers: int | None
+) -> tuple[str, Path, dict[str, Any]]:
     from nir_render.command.progress import progress_bar
-    from nir_render.experiments.communication.loop import Communication
     from nir_render.experiments.communication.outcome import outcome_of
     from nir_render.experiments.communication.page import sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
 
-    if len(world.document.robots) < robots:
-        raise InputError(f"{world.path}: has {len(world.document.robots)} robots; --robots wants {robots}")
-    plan = Communication(robots=robots, level=level, stack=stack, lasts_s=seconds or 65.0)
+    if len(world.document.robots) < plan.robots:
+        raise InputError(
+            f"{world.path}: has {len(world.document.robots)} robots; --robots wants {plan.robots}"
+        )
     with progress_bar("communication") as progress:
         outcome = outcome_of(world, plan, range(seeds), folder, workers or usual_workers(), progress)
     return sentence(outcome), write_outcome(outcome, folder), outcome.record()

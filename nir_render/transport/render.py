@@ -1,8 +1,9 @@
 """From a scene to the light that reaches one camera."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.backend.variant import backend
 from nir_render.transport.cache import LightCache
 from nir_render.transport.cache_key import Sampled, Site, geometry_key, light_key, plan_key, versions
-from nir_render.transport.direct.table import direct_table
+from nir_render.transport.direct.table import bodies_of, direct_table
 from nir_render.transport.indirect import groups, sample_plan, stock
 from nir_render.transport.indirect.guide import group_power
 from nir_render.transport.indirect.kernel.tables import DeviceScene
@@ -53,6 +54,20 @@ def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
     return _rendering(snapshot, camera, seed, None).direct_light()
 
 
+def direct_lights(
+    snapshot: Snapshot, cameras: Sequence[str], seed: int, kept: dict[str, Any] | None = None
+) -> dict[str, Light]:
+    """Return the direct light alone that reaches each camera: the bits of `direct_light`, with less work.
+
+    In `kept`, which is the snapshot's, stays what further cameras of it need too.
+    """
+    kept = {} if kept is None else kept
+    if "bodies" not in kept:
+        kept["bodies"] = bodies_of(snapshot, specular=backend().vectorised)
+    renderings = {name: _rendering(snapshot, name, seed, None) for name in cameras}
+    return {name: replace(one, bodies=kept["bodies"]).direct_light() for name, one in renderings.items()}
+
+
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
     """Return how many samples a pixel of the film gets on average; all wavelengths share them.
 
@@ -70,12 +85,13 @@ def geometry_of(snapshot: Snapshot, camera: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Rendering:
-    """The light of one camera at one time, to be found or rendered."""
+    """The light of one camera at one time, to be found or rendered; `bodies` as of `direct_table`."""
 
     site: Site
     seed: int
     cache: LightCache
     wavelengths_m: tuple[float, ...]
+    bodies: Any = None
 
     def samples(self) -> tuple[Samples | None, int]:
         """Return the samples in each pixel of the film, None where there is no indirect light.
@@ -195,7 +211,8 @@ class _Rendering:
         what = f"the camera {site.name} at {snapshot.time_s:g} s"
         mitsuba_scene.check_meshes(snapshot, pose.position_m, what)
         specular = backend().vectorised
-        return direct_over_nodes([direct_table(world, pose, specular=specular) for world in self._worlds])
+        tables = [direct_table(world, pose, specular=specular, bodies=self.bodies) for world in self._worlds]
+        return direct_over_nodes(tables)
 
 
 def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None) -> _Rendering:

@@ -64,7 +64,12 @@ class Intrinsics:
     @property
     def corner_angle_rad(self) -> float:
         """Field angle of the farthest image corner; 90° where it lies outside the image circle."""
-        ends = [(-0.5, self.width_px - 0.5), (-0.5, self.height_px - 0.5)]
+        return self.corner_angle_rad_beyond(0.0)
+
+    def corner_angle_rad_beyond(self, margin_px: float) -> float:
+        """Field angle of the farthest corner of a frame that is larger by a margin on every side."""
+        low_px = -0.5 - margin_px
+        ends = [(low_px, self.width_px - 1.0 - low_px), (low_px, self.height_px - 1.0 - low_px)]
         corners = np.stack(np.meshgrid(*ends), axis=-1).astype(np.float64)
         direction = self.distortion.direction(self._point(corners))
         angle_rad = np.arctan2(np.hypot(direction[..., 0], direction[..., 1]), direction[..., 2])

@@ -25,6 +25,7 @@ from nir_render.geometry import cone_directions, cone_versine, legendre
 _TAIL_SIGMAS = 8.0
 _WAVES_PER_SIGMA = 0.84
 _MOST_RINGS = 128
+_BEYOND_PX = 64.0
 _SMALL_PX = 40.0  # a disc of which most would be edge
 
 
@@ -110,6 +111,8 @@ def source_window(
     directions, shares = directions[in_front], shares[in_front]
     power = shares * power_at(directions[:, 2])
     total = float(power.sum())
+    if _is_out_of_view(intrinsics, core, direction, angular_radius_rad):
+        return Window(np.empty((0, 0)), 0, 0, total)
     if is_large:
         disc = Disc(direction, angular_radius_rad, power_at, total, _finest_px(core))
         return Window(*image_of_large_disc(intrinsics, core, disc), total)
@@ -121,6 +124,19 @@ def source_window(
     u_shares, column = _pixel_shares(pixels[:, 0], sigma_px, intrinsics.width_px)
     v_shares, row = _pixel_shares(pixels[:, 1], sigma_px, intrinsics.height_px)
     return Window((v_shares * power[:, None]).T @ u_shares, row, column, total)
+
+
+def _is_out_of_view(
+    intrinsics: Intrinsics, core: Core, direction: NDArray[np.float64], angular_radius_rad: float
+) -> bool:
+    """Tell whether a cone lies so far beyond the frame's corners that nothing of it can fall on the sensor.
+
+    To one side of the lens its image is larger than the frame, and cost most where it shows nothing.
+    """
+    margin_px = core.reach_px + _BEYOND_PX
+    farthest_rad = intrinsics.corner_angle_rad_beyond(margin_px)
+    angle_rad = math.acos(min(max(float(direction[2]), -1.0), 1.0))
+    return farthest_rad < 0.5 * math.pi and angle_rad - angular_radius_rad > farthest_rad
 
 
 def _finest_px(core: Core) -> float:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.experiments.controllers import COMMANDED_M
+from nir_render.experiments.loop.controllers import COMMANDED_M
 from nir_render.truth.sent import SentTruth
 
 Array = NDArray[np.float64]

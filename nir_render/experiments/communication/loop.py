@@ -2,8 +2,8 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from nir_render.evaluate.messages import decided_bits
 from nir_render.experiments.communication.judge import Judged, judged
-from nir_render.experiments.controllers import COMMANDED_M, Formation
-from nir_render.experiments.frame_sight import FrameSight
-from nir_render.experiments.measurement_sight import MeasurementSight
-from nir_render.experiments.sight import Sight, TrueSight
-from nir_render.experiments.world import Base, World
+from nir_render.experiments.loop.closed import ClosedLoop, LoopPlan
+from nir_render.experiments.loop.controllers import COMMANDED_M, Formation
+from nir_render.experiments.loop.sight import Seen
 from nir_render.randomness import generator
 from nir_render.scene.scene import Scene
 from nir_render.simulation.sent import sent_packets
@@ -36,141 +34,88 @@ _ASIDE_M = 0.03  # of a start from its place, each axis, σ
 _FOLLOWED_M = 0.3  # a track so near to the leader is its
 
 
-@dataclass(frozen=True)
-class Communication:
-    """What a run of the experiment is.
+@dataclass(frozen=True, kw_only=True)
+class Communication(LoopPlan):
+    """What a run of the experiment is, beside what all closed loops are; robots look 30 times a second.
 
     Attributes
     ----------
     robots
         How many, the leader among them, 3 to 7.
-    level, stack, refresh_s
-        As of `Flocking`.
     timetable
         `ours`: a command every 20 s from 3 s on, and after each two packets that command nothing of the
         spacing, so that followers are also spoken to while they move. `paper`: sending begins at 5, 18, 24 s.
-    lasts_s, period_s
-        How long it goes, and how often robots look and decide: at 30 Hz, as one listens.
     """
 
     robots: int = 3
-    level: str = "measurements"
-    stack: str = "robust"
     timetable: str = "ours"
     lasts_s: float = 65.0
     period_s: float = 1.0 / 30.0
-    refresh_s: float = 5.0
-    base: Base = field(default_factory=Base)
 
     def loop(self, scene: Scene, seed: int) -> "Loop":
         """Return the beginning of a run."""
         return Loop(scene, self, seed)
 
 
-@dataclass(frozen=True, eq=False)
-class Instant:
-    """Where everybody is at a time, shape (2,) each, and each follower's track of the leader, if any."""
+class Loop(ClosedLoop):
+    """A run in the making: controllers, and what was heard, beside what all closed loops know.
 
-    time_s: float
-    places_m: dict[str, Array]
-    leaders_track: dict[str, int | None]
+    Attributes
+    ----------
+    told
+        Every word: to whom, when, what, by which track.
+    leaders_track
+        At each step the number of each follower's track of the leader, if any.
+    """
 
-
-class Loop:
-    """A run in the making: world, eyes, controllers, and what happened so far."""
+    listens = True
 
     def __init__(self, scene: Scene, plan: Communication, seed: int) -> None:
-        self.plan, self.seed = plan, seed
         scene = sending_scene(scene, plan, seed)
-        self.leader, *self.followers = scene.document.robots
-        self.sent = sent_packets(scene)
-        self.world = World(scene, starts_m([self.leader, *self.followers], seed), plan.base, seed)
-        self.sights = {name: _sight(scene, name, plan, seed, self.sent) for name in self.followers}
+        super().__init__(scene, plan, seed, starts_m(list(scene.document.robots), seed), sent_packets(scene))
+        self.plan = plan
         self.controllers = {name: Formation() for name in self.followers}
-        self.instants: list[Instant] = []
         self.told: list[dict[str, Any]] = []
+        self.leaders_track: list[dict[str, int | None]] = []
 
-    @property
-    def steps(self) -> int:
-        """How many steps the whole run has."""
-        return round(self.plan.lasts_s / self.plan.period_s)
-
-    @property
-    def done(self) -> int:
-        """How many of them are done."""
-        return len(self.instants)
-
-    def step(self) -> Instant:
-        """Look, listen, decide, go; return how it was when robots looked."""
-        plan, world = self.plan, self.world
+    def _wanted(self, seen: Mapping[str, Seen]) -> dict[str, Array]:
+        plan, now_s = self.plan, self.world.time_s
         wanted: dict[str, Array] = {}
-        leaders: dict[str, int | None] = {}
-        for name, sight in self.sights.items():
-            seen, controller = sight.look(world), self.controllers[name]
-            controller.hear(seen.messages, world.time_s)
+        for name, one in seen.items():
+            controller = self.controllers[name]
+            controller.hear(one.messages, now_s)
             self.told += [
-                {"robot": name, "told_s": world.time_s, "start_s": one.start_s, "end_s": one.end_s,
-                 "word": one.word, "command": one.command, "track": one.track}
-                for one in seen.messages
+                {"robot": name, "told_s": now_s, "start_s": word.start_s, "end_s": word.end_s,
+                 "word": word.word, "command": word.command, "track": word.track}
+                for word in one.messages
             ]  # fmt: skip
-            wanted[name] = controller.velocity(seen.neighbours, world.time_s, plan.base.speed_m_per_s)
-            leaders[name] = self._leaders_track(name, seen.tracks)
-        places_m = {name: mover.place_m for name, mover in world.movers.items()}
-        instant = Instant(world.time_s, places_m, leaders)
-        self.instants.append(instant)
-        world.step(wanted, plan.period_s)
-        return instant
+            wanted[name] = controller.velocity(one.neighbours, now_s, plan.base.speed_m_per_s)
+        self.leaders_track.append({name: self._leaders_track(name, one.tracks) for name, one in seen.items()})
+        return wanted
 
     def record(self) -> dict[str, Any]:
-        """Return a run as plain data: what was sent, told and obeyed, the verdict, all places over time."""
-        names = [self.leader, *self.followers]
+        """Return a run as plain data: what was sent, told, obeyed, the verdict, beside where all were."""
         sent = [packet for packet in self.sent if packet.end_s <= self.plan.lasts_s]
-        obeyed = {name: one.obeyed for name, one in self.controllers.items()}
-        verdict = self._judged(sent)
         bits, wrong_bits, levels = self._bits(sent)
-        held = [
-            share
-            for sight in self.sights.values()
-            if isinstance(sight, FrameSight)
-            for share in sight.held_shares
-        ]
-        return {
-            "format": 1,
-            "seed": self.seed,
-            "judged": asdict(verdict),
+        return super().record() | {
+            "judged": asdict(self._judged(sent)),
             "bits": bits,
             "wrong_bits": wrong_bits,
             "levels": levels,
             "sent": [packet.record() for packet in self.sent],
             "told": self.told,
-            "obeyed": {name: [list(each) for each in of_one] for name, of_one in obeyed.items()},
-            "robots": names,
-            "time_s": [round(instant.time_s, 9) for instant in self.instants],
-            "places_m": np.round([[at.places_m[name] for name in names] for at in self.instants], 6).tolist(),
-            "held_light_share": max(held) if held else None,
+            "obeyed": {name: [list(each) for each in one.obeyed] for name, one in self.controllers.items()},
         }
 
     def _judged(self, sent: Sequence[SentTruth]) -> Judged:
-        first = self.instants[0].places_m
-        names = [self.leader, *self.followers]
-        distances_m = {
-            (one, other): np.array(
-                [float(np.hypot(*(at.places_m[one] - at.places_m[other]))) for at in self.instants]
-            )
-            for number, one in enumerate(names)
-            for other in names[number + 1 :]
-        }
+        distances_m = self.distances_m()
         # Starts scatter about a lattice of 1 m, whose next but one are 1.73 m apart.
-        near = {
-            pair: d_m
-            for pair, d_m in distances_m.items()
-            if np.hypot(*(first[pair[0]] - first[pair[1]])) < 1.35
-        }
-        times_s = np.array([at.time_s for at in self.instants])
+        near = {pair: d_m for pair, d_m in distances_m.items() if d_m[0] < 1.35}
         said = [(one["robot"], one["told_s"], one["word"]) for one in self.told]
         obeyed = {name: one.obeyed for name, one in self.controllers.items()}
         nearest_m = min(float(d_m.min()) for d_m in distances_m.values())
-        return judged(times_s, near, sent, said, obeyed, nearest_m < self.plan.base.diameter_m)
+        touched = nearest_m < self.plan.base.diameter_m
+        return judged(np.array(self.times_s), near, sent, said, obeyed, touched)
 
     def _leaders_track(self, follower: str, tracks: Sequence[Track]) -> int | None:
         """Return the number of the track that follows the leader: the nearest to its true place."""
@@ -195,9 +140,9 @@ class Loop:
             signals = {signal.track: signal for signal in sight.signals()}
             for packet in sent:
                 during = Counter(
-                    at.leaders_track[name]
-                    for at in self.instants
-                    if packet.start_s <= at.time_s <= packet.end_s and at.leaders_track[name] is not None
+                    at[name]
+                    for time_s, at in zip(self.times_s, self.leaders_track, strict=True)
+                    if packet.start_s <= time_s <= packet.end_s and at[name] is not None
                 )
                 if not during or (signal := signals.get(during.most_common(1)[0][0] or 0)) is None:
                     continue
@@ -259,14 +204,6 @@ def starts_m(names: Sequence[str], seed: int) -> dict[str, Array]:
 def truth_of(plan: Communication, timetable: str) -> Communication:
     """Return the plan with the truth known, by a timetable."""
     return replace(plan, level="truth", timetable=timetable)
-
-
-def _sight(scene: Scene, robot: str, plan: Communication, seed: int, sent: Sequence[SentTruth]) -> Sight:
-    if plan.level == "truth":
-        return TrueSight(robot, sent)
-    if plan.level == "measurements":
-        return MeasurementSight(scene, robot, seed, keep_signals=True)
-    return FrameSight(scene, robot, seed, plan.stack, plan.refresh_s, keep_signals=True)
 
 
 def levels_in(signal: Signal, packet: SentTruth) -> tuple[list[float], list[float]]:

@@ -14,8 +14,9 @@ from nir_render.experiments.communication.loop import (
     Communication,
     truth_of,
 )
-from nir_render.experiments.controllers import COMMANDED_M
-from nir_render.experiments.runs import Progress, run_seeds
+from nir_render.experiments.loop.controllers import COMMANDED_M
+from nir_render.experiments.loop.ending import TRUTH
+from nir_render.experiments.loop.runs import Progress, run_seeds
 from nir_render.scene.scene import Scene
 
 _NO_ERROR_95 = 0.05
@@ -98,7 +99,7 @@ def outcome_of(
 ) -> Outcome:
     """Run it for each seed, once more with the truth known, and by the paper's timetable so."""
     known, timed = truth_of(plan, "ours"), truth_of(plan, "paper")
-    by_truth = run_seeds(scene, known, seeds, folder / "truth", workers, lambda *_: None)
+    by_truth = run_seeds(scene, known, seeds, folder / TRUTH, workers, lambda *_: None)
     by_timetable = run_seeds(scene, timed, seeds, folder / "timetable", workers, lambda *_: None)
     runs = by_truth if plan == known else run_seeds(scene, plan, seeds, folder, workers, progress)
     return Outcome(

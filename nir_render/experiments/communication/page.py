@@ -8,14 +8,12 @@ import numpy as np
 from nir_render.experiments.communication.judge import Command
 from nir_render.experiments.communication.loop import ORDER, PACKET_S, PAPERS_INTERVALS_S
 from nir_render.experiments.communication.outcome import Outcome, Run, off_by_timetable_m
-from nir_render.experiments.controllers import COMMANDED_M
+from nir_render.experiments.loop.controllers import COMMANDED_M
+from nir_render.experiments.loop.ending import LEVEL_RULE, base_rows, frame_rows, show_run, write_ending
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.parts import Table, render_page
 from nir_render.report.style import FAINT, INK, MATPLOTLIB
 from nir_render.report.wording import counted, metres, share
-from nir_render.run.folder import write_file, write_json
-
-PAGE, RECORD = "index.html", "outcome.json"
 
 _COLOURS = ("#ffd166", "#5e9bff", "#2ec27e", "#f72585", "#b392f0", "#ff9f1c", "#4cc9f0")
 
@@ -34,27 +32,17 @@ RULES = {
         "the same seeds, each robot knowing where the others are, and each word as its packet ends: what is "
         "left is the law's and the base's."
     ),
-    "level": (
-        "frames: every camera's frames are rendered, exposed and read by the whole stack, 30 a second. "
-        "measurements: detections are drawn about the truth with the σ of their Cramér–Rao bound, and "
-        "where a source is dark its pixels are drawn, with read noise and no other light; from there on it "
-        "is the stack. truth: nothing is seen."
-    ),
+    "level": LEVEL_RULE,
 }
 
 
 def write_outcome(outcome: Outcome, folder: Path) -> Path:
-    """Write the page and `outcome.json`; return the page's path."""
-    write_json(folder / RECORD, outcome.record())
-    write_file(folder / PAGE, outcome_html(outcome).encode())
-    return folder / PAGE
-
-
-def outcome_html(outcome: Outcome) -> str:
-    """Write the page."""
+    """Write the page, `outcome.json`, and the film of the slowest run; return the page's path."""
     plan = outcome.plan
     slowest = max(outcome.runs, key=lambda run: max(_reached(one) for one in run.judged.commands or [_NONE]))
-    return render_page(
+    title = f"communication, {plan.level}, seed {slowest.seed}"
+    shown = show_run(folder, slowest.seed, plan, title)
+    html = render_page(
         "experiments/communication/page.html",
         title=f"communication: {plan.robots} robots, {plan.level}",
         subtitle=[counted(len(outcome.runs), "seed"), f"{plan.lasts_s:g} s each", outcome.scene],
@@ -63,11 +51,13 @@ def outcome_html(outcome: Outcome) -> str:
         why=_WHY,
         timetable=_timetable(outcome),
         shown=slowest.seed,
+        files=shown,
         drawing=formation_plot(slowest),
         seeds=_seeds(outcome),
         conditions=_conditions(outcome),
         rules=RULES,
     )
+    return write_ending(folder, html, outcome.record())
 
 
 def sentence(outcome: Outcome) -> str:
@@ -171,16 +161,13 @@ def _seeds(outcome: Outcome) -> Table:
 
 def _conditions(outcome: Outcome) -> Table:
     plan, figures = outcome.plan, outcome.record()
-    base = plan.base
-    speed = f"{base.speed_m_per_s:g} m/s at most, {base.acceleration_m_per_s2:g} m/s² (assumed)"
     rows = [
         ("robots", f"{plan.robots}: a leader at rest, followers around it, 60° from each other"),
         ("sent", "a command every 20 s, and two packets after it that say nothing of the spacing"),
         ("the leader's clock", "off by up to 1 % (assumed)"),
         ("law", "springs to the commanded spacing, which goes there at 0.09 m/s; reach 1.3 times it"),
-        ("speed", speed),
         ("looks", f"{1.0 / plan.period_s:g} a second"),
-        ("bodies", f"{metres(base.diameter_m)} wide (assumed); they hide nothing"),
+        *base_rows(plan),
     ]
     for name, said in figures["levels"].items():
         if said is not None:
@@ -190,10 +177,7 @@ def _conditions(outcome: Outcome) -> Table:
                     f"{said[1]:.4f} of the lit level in the mean, σ {said[2]:.4f}; {said[0]:.0f}",
                 )
             )
-    if plan.level == "frames":
-        off = figures["held_light_share_largest"]
-        how = "" if off is None else f"; off by {share(off)} of the noise's variance before it is, at most"
-        rows += [("stack", plan.stack), ("indirect light", f"rendered every {plan.refresh_s:g} s{how}")]
+    rows += frame_rows(plan, figures["held_light_share_largest"])
     return Table((), rows)
 
 

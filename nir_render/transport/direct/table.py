@@ -10,6 +10,7 @@ about 1.5 / rays^(3/4), 0.8 % for 1024 rays; a fully hidden or free disc is exac
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ Mask = NDArray[np.bool_]
 _RAYS_AT_ONCE = 2**19
 
 
-def direct_table(snapshot: Snapshot, pose: Pose, *, specular: bool) -> DirectTable:
+def direct_table(snapshot: Snapshot, pose: Pose, *, specular: bool, bodies: Any = None) -> DirectTable:
     """Return the rows of all small sources in front of the lens, and of their ghosts.
 
     Parameters
@@ -39,6 +40,8 @@ def direct_table(snapshot: Snapshot, pose: Pose, *, specular: bool) -> DirectTab
     specular
         Whether ghosts and what is seen through panes belong to the table. Without, they are left to the
         indirect light, and panes hide what is behind them.
+    bodies
+        What `bodies_of` built of this world, for several cameras at once; built here where it is left out.
 
     Raises
     ------
@@ -46,7 +49,7 @@ def direct_table(snapshot: Snapshot, pose: Pose, *, specular: bool) -> DirectTab
         The camera is inside a source.
     """
     rays = snapshot.render.visibility_rays
-    bodies = mitsuba_scene.build(snapshot, panes=not specular)
+    bodies = bodies_of(snapshot, specular=specular) if bodies is None else bodies
     lights, surfaces = small_lights(snapshot), facets(snapshot) if specular else no_facets()
     around = Surroundings(bodies, mitsuba_scene.source_spheres(bodies), lights, surfaces, snapshot.fog)
     inside = source_around(lights, pose.position_m)
@@ -76,6 +79,11 @@ def direct_table(snapshot: Snapshot, pose: Pose, *, specular: bool) -> DirectTab
         irradiance_per_w=(per_unit * share.mean(axis=1))[:, None],
         visibility_rays=rays,
     )
+
+
+def bodies_of(snapshot: Snapshot, *, specular: bool) -> Any:
+    """Return what hides small sources from each other's view: the same for every camera."""
+    return mitsuba_scene.build(snapshot, panes=not specular)
 
 
 def _in_parts(

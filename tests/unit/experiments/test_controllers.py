@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nir_render.experiments.controllers import Neighbour, neighbours_of, reynolds, springs
+from nir_render.experiments.loop.controllers import Neighbour, neighbours_of, reynolds, springs
 from perception.types import Track
 
 FAST = 10.0  # m/s: nothing is clipped

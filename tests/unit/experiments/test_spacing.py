@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nir_render.experiments.spacing import spacing
+from nir_render.experiments.flocking.spacing import spacing
 
 TIMES_S = np.arange(0.0, 100.0, 10.0)  # the last minute: 40 to 90 s
 

@@ -1,5 +1,7 @@
 """Small sources on pixels: energy, place, and agreement with an independent model of the same image."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -112,3 +114,25 @@ def test_two_independent_models_of_the_image_agree(
     window = PixelBox(ours.row, ours.column, *ours.values.shape)
     theirs = flare_image(*place, angular_radius_rad, window, calibration)
     np.testing.assert_allclose(ours.values / ours.values.sum(), theirs.fraction, atol=1e-5)
+
+
+@pytest.mark.parametrize("beside_px", [40.0, 200.0])
+def test_what_is_far_beyond_a_corner_brings_nothing_and_keeps_its_total(beside_px: float) -> None:
+    """A point beyond the right edge by less and by more than the margin; and a disc across the lens's plane.
+
+    By less, the window is made and empty; by more, it is not made: light and total are the same.
+    """
+    lens = Intrinsics(1280, 960, 480.0, 480.0, 639.5, 479.5)
+    towards = np.array([(1279.5 + beside_px - 639.5) / 480.0, 0.0, 1.0])
+    core = Core(sigma_px=0.7)
+    window = source_window(lens, core, towards / np.linalg.norm(towards), 0.0, np.ones_like)
+    assert window.values.sum() == 0.0
+    assert window.total == 1.0
+    across = np.array([math.cos(0.01), 0.0, math.sin(0.01)])
+    disc = source_window(lens, core, across, 0.05, lambda cosine: cosine)
+    assert disc.values.size == 0
+    # Of a cap of 0.05 rad, whose middle is 0.01 rad before the plane, the part in front: its mean cosine is
+    # that of a flat disc cut by a line 0.2 radii from its middle.
+    h = 0.01 / 0.05
+    front = (h * (math.pi / 2 + math.asin(h)) + math.sqrt(1 - h * h) * (2 + h * h) / 3.0) / math.pi * 0.05
+    assert disc.total == pytest.approx(front, rel=2e-2)

@@ -5,14 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nir_render.experiments.flocking import Run
-from nir_render.experiments.outcome import Outcome
-from nir_render.experiments.plots import flock_plot
+from nir_render.experiments.flocking.loop import Run
+from nir_render.experiments.flocking.outcome import Outcome
+from nir_render.experiments.flocking.plots import flock_plot
+from nir_render.experiments.loop.ending import LEVEL_RULE, base_rows, frame_rows, show_run, write_ending
 from nir_render.report.parts import Table, render_page
-from nir_render.report.wording import counted, metres, share
-from nir_render.run.folder import write_file, write_json
-
-PAGE, RECORD = "index.html", "outcome.json"
+from nir_render.report.wording import counted, metres
 
 RULES = {
     "spacing error": (
@@ -25,11 +23,7 @@ RULES = {
         "the same seeds, each robot knowing where the others are and how they move: what is left is the "
         "law's."
     ),
-    "level": (
-        "frames: every camera's frames are rendered, exposed and read by the whole stack. measurements: "
-        "detections are drawn about the truth with the σ of their Cramér–Rao bound, and read by the stack "
-        "from there on; walls, lamps, false alarms and dark bits are left out. truth: nothing is seen."
-    ),
+    "level": LEVEL_RULE,
     "law": (
         "robust: springs at rest at the wished spacing. paper: separation, alignment and cohesion at the "
         "paper's ranges and weights, in the forms that come nearest to what it reports; it keeps neighbours "
@@ -43,29 +37,26 @@ RULES = {
 
 
 def write_outcome(outcome: Outcome, folder: Path) -> Path:
-    """Write the page and `outcome.json`; return the page's path."""
-    write_json(folder / RECORD, outcome.record())
-    write_file(folder / PAGE, outcome_html(outcome).encode())
-    return folder / PAGE
-
-
-def outcome_html(outcome: Outcome) -> str:
-    """Write the page."""
+    """Write the page, `outcome.json`, and the film of the run in the middle; return the page's path."""
     order = np.argsort(outcome.errors_m(), kind="stable")
     middle = outcome.runs[int(order[(len(order) - 1) // 2])]
     plan = outcome.plan
-    return render_page(
-        "experiments/page.html",
+    title = f"flocking, {plan.level}, law {plan.law}, seed {middle.seed}"
+    shown = show_run(folder, middle.seed, plan, title)
+    html = render_page(
+        "experiments/flocking/page.html",
         title=f"flocking: law {plan.law}, {plan.level}",
         subtitle=[counted(len(outcome.runs), "seed"), f"{plan.lasts_s:g} s each", outcome.scene],
         sentence=sentence(outcome),
         beside=_beside(outcome),
         shown=middle.seed,
+        files=shown,
         drawing=flock_plot(middle, plan),
         seeds=_seeds(outcome),
         conditions=_conditions(outcome),
         rules=RULES,
     )
+    return write_ending(folder, html, outcome.record())
 
 
 def sentence(outcome: Outcome) -> str:
@@ -114,20 +105,15 @@ def _seeds(outcome: Outcome) -> Table:
 
 
 def _conditions(outcome: Outcome) -> Table:
-    plan, held = outcome.plan, outcome.record()["held_light_share_largest"]
-    base = plan.base
-    speed = f"{base.speed_m_per_s:g} m/s at most, {base.acceleration_m_per_s2:g} m/s² (assumed)"
+    plan = outcome.plan
     rows = [
         ("robots", "a leader on a way of its own, and those that follow; starts within 1.8 m of it"),
-        ("speed", f"{speed}; the leader {plan.leader_m_per_s:g} m/s"),
+        ("the leader", f"goes {plan.leader_m_per_s:g} m/s"),
         ("wished spacing", metres(plan.spacing_m)),
         ("looks", f"every {plan.period_s:g} s"),
-        ("bodies", f"{metres(base.diameter_m)} wide (assumed); they hide nothing"),
+        *base_rows(plan),
+        *frame_rows(plan, outcome.record()["held_light_share_largest"]),
     ]
-    if plan.level == "frames":
-        how = f"rendered every {plan.refresh_s:g} s"
-        off = "" if held is None else f"; off by {share(held)} of the noise's variance before it is, at most"
-        rows += [("stack", plan.stack), ("indirect light", how + off)]
     return Table((), rows)
 
 

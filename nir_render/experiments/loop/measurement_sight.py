@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.timing.drive import drive_of, mean_level
-from nir_render.experiments.controllers import neighbours_of
-from nir_render.experiments.sight import Seen
-from nir_render.experiments.world import World
+from nir_render.experiments.loop.controllers import neighbours_of
+from nir_render.experiments.loop.sight import Seen
+from nir_render.experiments.loop.world import World
 from nir_render.randomness import generator
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot

@@ -4,20 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from nir_render.experiments.controllers import Neighbour
-from nir_render.experiments.world import World
+from nir_render.experiments.loop.controllers import Neighbour
+from nir_render.experiments.loop.world import World
 from nir_render.truth.sent import SentTruth
-from perception import Message, Signal, Track
+from perception import Message, RawFrame, Signal, Track
 from perception.messages.uart import REPEATS
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a robot knows now: its neighbours, what it has just been told, and whom it follows."""
+    """What a robot knows now: its neighbours, what it has just been told, whom it follows; its frames."""
 
     neighbours: list[Neighbour]
     messages: tuple[Message, ...] = ()
     tracks: tuple[Track, ...] = ()
+    frames: tuple[RawFrame, ...] = ()
 
 
 class Sight(Protocol):

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import pickle
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -12,11 +13,13 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from nir_render.errors import InputError
+from nir_render.experiments.loop.journal import Journal, Told, check_whole
 from nir_render.run.folder import locked, read_json, write_file, write_json
 from nir_render.run.manifest import versions
 from nir_render.run.render import run_digest
 from nir_render.scene.scene import Scene
 from nir_render.transport.backend.cores import thread_settings
+from perception import Calibration
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done, and of all."""
@@ -35,8 +38,11 @@ class Loop(Protocol):
     def done(self) -> int:
         """How many of them are done."""
 
-    def step(self) -> Any:
-        """Do the next one."""
+    def calibrations(self) -> list[Calibration]:
+        """Return what is known of the cameras that robots look by."""
+
+    def step(self) -> Told:
+        """Do the next one; return what there is to tell of it."""
 
     def record(self) -> dict[str, Any]:
         """Return a run that is done as plain data."""
@@ -101,14 +107,30 @@ def _ended(scene: Scene, plan: Plan, seeds: Sequence[int], folder: Path, workers
 def run_seed(scene: Scene, plan: Plan, seed: int, folder: Path) -> None:
     """Run one seed to its end, from where an earlier process left it, and write its record."""
     state = folder / "runs" / f"{seed:04d}.state"
-    # Written by `run_seed` itself, of the same plan, scene and code: the digest is checked before.
-    loop: Loop = pickle.loads(state.read_bytes()) if state.exists() else plan.loop(scene, seed)  # noqa: S301
+    loop: Loop
+    journal: Journal
+    if state.exists():
+        # Written by `run_seed` itself, of the same plan, scene and code: the digest is checked before.
+        loop, journal = pickle.loads(state.read_bytes())  # noqa: S301
+        journal = Journal(run_folder(folder, seed), journal.lengths)
+        check_whole(journal)
+    else:
+        loop = plan.loop(scene, seed)
+        shutil.rmtree(run_folder(folder, seed), ignore_errors=True)
+        journal = Journal.begin(run_folder(folder, seed), loop.calibrations())
     while loop.done < loop.steps:
-        loop.step()
+        journal.write(loop.step())
         if loop.done % _SAVED_STEPS == 0:
-            write_file(state, pickle.dumps(loop))
+            journal.sync()
+            write_file(state, pickle.dumps((loop, journal)))
+    journal.sync()
     write_json(_file(folder, seed), loop.record())
     state.unlink(missing_ok=True)
+
+
+def run_folder(folder: Path, seed: int) -> Path:
+    """Return the folder of a seed: what was told as it went, in the files of a run folder."""
+    return folder / "runs" / f"{seed:04d}"
 
 
 def _file(folder: Path, seed: int) -> Path:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.experiments.flocking import Flocking, Run, run_of
-from nir_render.experiments.runs import Progress, run_seeds
+from nir_render.experiments.flocking.loop import Flocking, Run, run_of
+from nir_render.experiments.loop.ending import TRUTH
+from nir_render.experiments.loop.runs import Progress, run_seeds
 from nir_render.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
-ARENA = Path(__file__).parents[1] / "data" / "experiments" / "arena.yaml"
+ARENA = Path(__file__).parents[2] / "data" / "experiments" / "arena.yaml"
 """The paper's arena."""
 
 WANTED_M = 0.05
@@ -75,7 +76,7 @@ def outcome_of(
 ) -> Outcome:
     """Run an experiment for each seed, and once more with the truth known; errors as `run_seeds`."""
     known = replace(plan, level="truth")
-    by_truth = run_seeds(scene, known, seeds, folder / "truth", workers, lambda *_: None)
+    by_truth = run_seeds(scene, known, seeds, folder / TRUTH, workers, lambda *_: None)
     runs = by_truth if plan == known else run_seeds(scene, plan, seeds, folder, workers, progress)
     return Outcome(plan, scene.document.name, [*map(run_of, runs)], [*map(run_of, by_truth)])
 

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.experiments.controllers import clipped
+from nir_render.experiments.loop.controllers import clipped
 from nir_render.scene.documents.times.clocks import OdometryNoise
 from nir_render.scene.pose import Pose
 from nir_render.scene.scene import Scene
@@ -48,6 +49,8 @@ class World:
         Now.
     movers
         Each robot, by name.
+    kept_of_snapshot
+        What whoever renders keeps of `snapshot` for the next camera; it goes with it.
     """
 
     def __init__(self, scene: Scene, places_m: Mapping[str, Array], base: Base, seed: int) -> None:
@@ -55,6 +58,7 @@ class World:
         self.movers = {name: Mover(np.array(place_m, dtype=float)) for name, place_m in places_m.items()}
         self._scene, self._base = scene, base
         self._snapshot: Snapshot | None = None  # all look at the same one
+        self.kept_of_snapshot: dict[str, Any] = {}
         self._reckoned = {
             name: DeadReckoning(name, scene.document.robots[name].rig.odometry or OdometryNoise(), seed)
             for name in places_m
@@ -87,7 +91,7 @@ class World:
             mover.velocity_m_per_s = mover.velocity_m_per_s + clipped(wanted - mover.velocity_m_per_s, most)
             mover.place_m = mover.place_m + lasts_s * mover.velocity_m_per_s
         self.time_s += lasts_s
-        self._snapshot = None
+        self._snapshot, self.kept_of_snapshot = None, {}
         self._note()
 
     def _note(self) -> None:

@@ -3,8 +3,8 @@
 import matplotlib as mpl
 import numpy as np
 
-from nir_render.experiments.flocking import Flocking, Run
-from nir_render.experiments.spacing import COUNTED_S, NEIGHBOURS
+from nir_render.experiments.flocking.loop import Flocking, Run
+from nir_render.experiments.flocking.spacing import COUNTED_S, NEIGHBOURS
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.style import FAINT, INK, MATPLOTLIB
 
