@@ -75,19 +75,27 @@ class Format(StrEnum):
     """The formats that there are."""
 
     MCAP = "mcap"
+    COCO = "coco"
+    MOT = "mot"
+    TUM = "tum"
+    OPENCV = "opencv"
+    HDF5 = "hdf5"
+
+
+_FORMATS_SAID = (
+    "mcap: frames, poses, detections, tracks and words for ROS 2 and Foxglove. coco: labels of all frames. "
+    "mot: truth and detections of each camera, as MOTChallenge. tum: trajectories. opencv: calibrations. "
+    "hdf5: raw frames and labels in one file."
+)
+_ENDINGS = {Format.COCO: "coco.json", Format.HDF5: "h5"}
 
 
 def export(
     folder: FolderArgument,
-    form: Annotated[
-        Format,
-        typer.Option(
-            "--format", help="mcap: frames, poses, detections, tracks and words for ROS 2 and Foxglove."
-        ),
-    ],
+    form: Annotated[Format, typer.Option("--format", help=_FORMATS_SAID)],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="Where it goes; DIR.mcap by default."),
+        typer.Option("-o", "--output", metavar="PATH", help="Where it goes; DIR.mcap by default, and so on."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -97,15 +105,45 @@ def export(
     from nir_render.export.mcap_file import export_mcap
 
     whole = folder.resolve()
-    file = output if output is not None else whole.with_name(f"{whole.name}.{form.value}")
-    with progress_bar("export") as progress:
-        done = export_mcap(folder, file, progress)
+    place = (
+        output if output is not None else whole.with_name(f"{whole.name}.{_ENDINGS.get(form, form.value)}")
+    )
+    ahead_s = None
+    if form is Format.MCAP:
+        with progress_bar("export") as progress:
+            done = export_mcap(folder, place, progress)
+        counts, ahead_s = done.messages, done.ahead_s
+    else:
+        counts = _exported(form, folder, place)
     if as_json:
-        record = {"file": str(done.file), "ahead_s": done.ahead_s, "messages": done.messages}
-        print_json({"format": 1, **record})
+        clock = {} if ahead_s is None else {"ahead_s": ahead_s}
+        print_json({"format": 1, "file": str(place), **clock, "messages": counts})
         return
-    for topic, count in done.messages.items():
-        typer.echo(f"{count:8d}  {topic}")
-    if done.ahead_s:
-        typer.echo(f"its clock is {done.ahead_s} s ahead of the run's: ROS has no time below 0")
-    typer.echo(f"open {done.file}")
+    for name, count in counts.items():
+        typer.echo(f"{count:8d}  {name}")
+    if ahead_s:
+        typer.echo(f"its clock is {ahead_s} s ahead of the run's: ROS has no time below 0")
+    typer.echo(f"{'open' if form is Format.MCAP else 'see'} {place}")
+
+
+def _exported(form: Format, folder: Path, place: Path) -> dict[str, int]:
+    """Write one of the formats that need no clock; return how much of what there is."""
+    from nir_render.errors import InputError
+    from nir_render.export.coco import export_coco
+    from nir_render.export.dataset import export_hdf5
+    from nir_render.export.mot import export_mot
+    from nir_render.export.opencv_file import export_opencv
+    from nir_render.export.trajectories import export_tum
+    from perception import RecordingError
+
+    write = {
+        Format.COCO: export_coco,
+        Format.MOT: export_mot,
+        Format.TUM: export_tum,
+        Format.OPENCV: export_opencv,
+        Format.HDF5: export_hdf5,
+    }[form]
+    try:
+        return write(folder, place)
+    except RecordingError as error:
+        raise InputError(*error.problems) from None
