@@ -36,7 +36,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Hold two runs, or two estimators of one, against each other: what is better or worse, and how sure."""
-    from nir_render.command.console import print_json, warn
+    from nir_render.command.terminal.console import print_json, warn
     from nir_render.compare.compare import compare_runs
     from nir_render.compare.page import PAGE, write_page
 
@@ -58,7 +58,7 @@ def _show(result: "Comparison") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from nir_render.command.tables import print_table
+    from nir_render.command.terminal.tables import print_table
     from nir_render.compare.words import counts_sentence, has_content, interval_text, row_of, sentence_of
 
     for pair in result.estimators:

@@ -42,8 +42,8 @@ def explain(
     from nir_render.budget.assumptions import assumptions_of
     from nir_render.budget.budget import photon_budget
     from nir_render.budget.page import check_free, write_budget
-    from nir_render.command.console import print_json
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.progress import progress_bar
 
     if not math.isfinite(time_s):
         raise InputError(f"--time {time_s:g}: wanted seconds, such as 2.5")
@@ -104,7 +104,7 @@ def _print(table: "Table", title: str) -> None:
     from rich.markup import escape
     from rich.table import Table as RichTable
 
-    from nir_render.command.tables import print_table
+    from nir_render.command.terminal.tables import print_table
 
     shown = RichTable(
         title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False

@@ -63,7 +63,7 @@ def main() -> None:
     try:
         app(prog_name="nir-render")
     except InputError as error:
-        from nir_render.command.console import print_error
+        from nir_render.command.terminal.console import print_error
 
         for problem in error.problems:
             print_error(problem)

@@ -109,7 +109,7 @@ def chosen_estimators(names: list[str] | None, time_limit_s: float) -> "dict[str
 
 def light_cache(folder: Path | None, limit_gib: float) -> "LightCache":
     """Return the cache that `--light-cache` and `--light-cache-gib` describe."""
-    from nir_render.command.console import warn
+    from nir_render.command.terminal.console import warn
     from nir_render.transport.cache import LightCache
 
     return LightCache(folder, limit_bytes=light_limit_bytes(limit_gib), say=warn)

@@ -15,7 +15,7 @@ def new_recording(
     as_json: Json = False,
 ) -> None:
     """Write a commented template for the frames of one's own camera: recording.yaml, to fill in."""
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.run.recording.make import FILE, new_recording
 
     pattern = new_recording(folder)
@@ -37,7 +37,7 @@ def import_recording(
     as_json: Json = False,
 ) -> None:
     """Make frames.jsonl and calibration.json of pictures and a recording.yaml; say what was assumed."""
-    from nir_render.command.console import note, print_json, warn
+    from nir_render.command.terminal.console import note, print_json, warn
     from nir_render.run.recording.make import import_recording
 
     done = import_recording(folder, overwrite=overwrite)
@@ -100,8 +100,8 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write a run in another program's format; what its folder holds is written, whatever that is."""
-    from nir_render.command.console import print_json
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.export.mcap_file import export_mcap
 
     whole = folder.resolve()

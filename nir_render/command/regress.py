@@ -31,8 +31,8 @@ _WORDS = {"pass": "[green]pass[/]", "fail": "[bold red]FAIL[/]", "skipped": "[ye
 def create(suite: Suite, refs: Refs = None, renders: Renders = 16, as_json: Json = False) -> None:
     """Make the references of a suite that has none."""
     from nir_render import regress
-    from nir_render.command.console import print_json
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.progress import progress_bar
 
     with progress_bar("create") as progress:
         scenes = regress.create(suite, refs, renders=renders, progress=progress)
@@ -57,8 +57,8 @@ def check(
 ) -> None:
     """Hold a suite against its references: 0 nothing drifted, 1 something did."""
     from nir_render import regress
-    from nir_render.command.console import print_json
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.progress import progress_bar
 
     with progress_bar("check") as progress:
         result = regress.check(suite, refs, seed=seed, progress=progress)
@@ -99,8 +99,8 @@ def update(
 ) -> None:
     """Make references anew where something has drifted or a scene has changed; show old and new."""
     from nir_render import regress
-    from nir_render.command.console import print_json
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.progress import progress_bar
 
     page = Path("outputs") / "regress" / f"{suite.resolve().name}.html" if page is None else page
     with progress_bar("update") as progress:

@@ -52,7 +52,7 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Render, perceive, evaluate and report a scene in one go."""
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.look.sheet import look_png
     from nir_render.run.evaluate import evaluate_run
     from nir_render.run.folder import LOOK, write_file
@@ -96,7 +96,7 @@ def render(
     as_json: Json = False,
 ) -> None:
     """Render the frames of a scene, with truth and calibration."""
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
 
     cache = light_cache(light_folder, light_gib)
     loaded = read_scene(scene, settings, seed)
@@ -125,8 +125,8 @@ def perceive(
     as_json: Json = False,
 ) -> None:
     """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
-    from nir_render.command.console import print_json, warn
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import print_json, warn
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.run.follow import OwnParts
     from nir_render.run.perceive import perceive_run
 
@@ -158,9 +158,9 @@ def evaluate(folder: FolderArgument, as_json: Json = False) -> None:
 
 def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
     """Learn cameras from frames of darkness, an even surface, known ranges, and shared flares."""
-    from nir_render.command.console import note, print_error, print_json
-    from nir_render.command.progress import progress_bar
-    from nir_render.command.tables import calibration_tables, extrinsics_table, print_table
+    from nir_render.command.terminal.console import note, print_error, print_json
+    from nir_render.command.terminal.progress import progress_bar
+    from nir_render.command.terminal.tables import calibration_tables, extrinsics_table, print_table
     from nir_render.run.calibrate import FITTED_FILE, calibrate_run
 
     with progress_bar("calibrate") as progress:
@@ -191,7 +191,7 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
 
 def report(folder: FolderArgument, as_json: Json = False) -> None:
     """Evaluate a run, and show it on a page that opens from disk: report.html; also one without truth."""
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.run.evaluate import evaluate_run
     from nir_render.run.recording.report import report_recording
     from nir_render.run.report import report_run
@@ -212,8 +212,8 @@ def _render(
     keep_light: bool,
     cache: "LightCache",
 ) -> Path:
-    from nir_render.command.console import warn
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import warn
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.run.folder import check_free
     from nir_render.run.render import calibrations_of, render_run
 
@@ -242,7 +242,7 @@ def _say_what_is_lowered(scene: "Scene") -> None:
     """Tell, on standard error, where this machine renders with fewer samples than the scene asks for."""
     if not scene.document.has_indirect_light():
         return
-    from nir_render.command.console import note
+    from nir_render.command.terminal.console import note
     from nir_render.transport.backend.variant import backend
     from nir_render.transport.indirect.stock import samples_of
 
@@ -261,7 +261,7 @@ def _show_estimate(
 ) -> None:
     import dataclasses
 
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.run.folder import check_free
     from nir_render.run.time_estimate import time_estimate
 
@@ -279,8 +279,8 @@ def _show_estimate(
 
 
 def _show_evaluation(result: "Evaluation", folder: Path, as_json: bool) -> None:
-    from nir_render.command.console import print_json
-    from nir_render.command.tables import print_table, range_table, summary_table, time_tables
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.tables import print_table, range_table, summary_table, time_tables
 
     if as_json:
         print_json(result.summary)

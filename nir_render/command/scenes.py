@@ -23,7 +23,7 @@ def new(
     as_json: Json = False,
 ) -> None:
     """Make a folder with commented example scenes to change, and an estimator of one's own."""
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.run.examples import FIRST_SCENE, new_examples
 
     files = new_examples(folder)
@@ -39,7 +39,7 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Check scene and campaign files: every error names file, line, field and what was wanted."""
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.stress.campaign import is_campaign, load_campaign
 
     valid: list[str] = []
@@ -128,7 +128,7 @@ def look(
     as_json: Json = False,
 ) -> None:
     """Draw a scene from outside and from above, in seconds: to check it by before it is rendered."""
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.look.sheet import look_png
     from nir_render.run.folder import write_file
 
@@ -169,8 +169,8 @@ def goniometer(
     as_json: Json = False,
 ) -> None:
     """Measure a source as it is built over the sphere: an emission pattern that scenes use, and its flux."""
-    from nir_render.command.console import print_json
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.run.goniometer.measure_into import SOURCE, measure_into
     from nir_render.transport.goniometer.measure import Settings
 
@@ -195,7 +195,7 @@ def _steps(step_deg: float) -> int:
 def _show_goniometer(figures: "dict[str, Any]") -> None:
     from rich.table import Table
 
-    from nir_render.command.tables import print_table
+    from nir_render.command.terminal.tables import print_table
 
     table = Table(title=f"{figures['source']}, at {figures['distance_m']:g} m", title_justify="left")
     table.add_column("")
@@ -226,8 +226,8 @@ def _show_goniometer(figures: "dict[str, Any]") -> None:
 
 def doctor(as_json: Json = False) -> None:
     """Say what this machine renders with, and hold a tiny render against its closed form."""
-    from nir_render.command.console import print_json
-    from nir_render.command.tables import facts_table, print_table
+    from nir_render.command.terminal.console import print_json
+    from nir_render.command.terminal.tables import facts_table, print_table
     from nir_render.run.doctor import examine
 
     facts = examine()

@@ -55,8 +55,8 @@ def stress(
     as_json: Json = False,
 ) -> None:
     """Sweep a scene along axes, and show where estimators fail; goes on where it was stopped."""
-    from nir_render.command.console import note
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.console import note
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.stress.campaign import load_campaign
     from nir_render.stress.jobs import plan
     from nir_render.stress.refine import sweep_refined
@@ -166,7 +166,7 @@ def experiment(
     as_json: Json = False,
 ) -> None:
     """Run an experiment of the paper: ranges, a source that turns, robots that move by what they see."""
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.experiments.communication.loop import Communication
     from nir_render.experiments.flocking.loop import Flocking
     from nir_render.experiments.flocking.outcome import ARENA
@@ -215,7 +215,7 @@ def _kept_every(text: str | None, level: Level) -> int:
 def _calibration(
     world: "Scene", seeds: int, folder: Path, workers: int | None
 ) -> tuple[str, Path, dict[str, Any]]:
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.experiments.standing.rail import Rail
     from nir_render.experiments.standing.rail_outcome import outcome_of
     from nir_render.experiments.standing.rail_page import sentence, write_outcome
@@ -229,7 +229,7 @@ def _calibration(
 def _diffuser(
     world: "Scene", seeds: int, folder: Path, workers: int | None
 ) -> tuple[str, Path, dict[str, Any]]:
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.experiments.standing.turntable import Turntable
     from nir_render.experiments.standing.turntable_page import outcome_of, sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
@@ -242,7 +242,7 @@ def _diffuser(
 def _flocking(
     world: "Scene", plan: "Flocking", seeds: int, folder: Path, workers: int | None
 ) -> tuple[str, Path, dict[str, Any]]:
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.experiments.flocking.outcome import outcome_of
     from nir_render.experiments.flocking.page import sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
@@ -255,7 +255,7 @@ def _flocking(
 def _communication(
     world: "Scene", plan: "Communication", seeds: int, folder: Path, workers: int | None
 ) -> tuple[str, Path, dict[str, Any]]:
-    from nir_render.command.progress import progress_bar
+    from nir_render.command.terminal.progress import progress_bar
     from nir_render.experiments.communication.outcome import outcome_of
     from nir_render.experiments.communication.page import sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
@@ -270,7 +270,7 @@ def _communication(
 
 
 def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: bool) -> None:
-    from nir_render.command.console import print_json
+    from nir_render.command.terminal.console import print_json
     from nir_render.stress.sweep import plan_record
 
     record = plan_record(campaign, jobs, folder)
@@ -284,7 +284,7 @@ def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: b
 
 
 def _show(result: "Sweep", as_json: bool) -> None:
-    from nir_render.command.console import note, print_error, print_json, warn
+    from nir_render.command.terminal.console import note, print_error, print_json, warn
     from nir_render.stress.page.words import reach_lines
     from nir_render.stress.sweep import sweep_record, write_report
 

@@ -13,7 +13,7 @@ from tests.paths import ROOT
 # Top to bottom. A room imports from the rooms below it, never from one above. Where a room has rooms of its
 # own, these stand behind it in their order. Files that lie loose in a room are held by having no circle.
 FLOORS: dict[str, tuple[str, ...]] = {
-    "nir_render.command": (),
+    "nir_render.command": ("terminal",),
     "nir_render.experiments": ("communication", "flocking", "standing", "loop"),
     "nir_render.export": (),
     "nir_render.stress": ("page", "workers", "job", "design"),

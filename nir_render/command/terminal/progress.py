@@ -15,7 +15,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from nir_render.command.console import note, standard_error
+from nir_render.command.terminal.console import note, standard_error
 
 _LINE_EVERY_S = 30.0
 _AVERAGED_OVER_S = 600.0  # of the rate: some work takes minutes each
