@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.rig.moving import OneTime
-from perception.rig.pose.gates import GATE_CHI2, Places, fitting
+from perception.rig.pose.gates import GATE_CHI2, HEADINGS, Places, fitting
 from perception.rig.pose.partings import Candidate, told_apart
 from perception.rig.pose.posterior import LEAST_ODDS, evidence_alone, posterior
 from perception.rig.pose.sights import Sights, carried
@@ -166,15 +166,16 @@ def _candidates(seen: _Seen, layouts: Sequence[Layout]) -> list[Candidate]:
     return candidates
 
 
-Pairs = dict[tuple[int, int], set[tuple[int, int]]]
-"""By two flares, the smaller number first: which two sources of a layout they may be."""
+Pairs = dict[tuple[int, int], dict[tuple[int, int], NDArray[np.bool_]]]
+"""By two flares, the smaller number first: which two sources of a layout they may be, at which headings."""
 
 
 def _fitting_pairs(seen: _Seen, layout: Layout) -> Pairs:
     """Tell which two flares may be which two sources, by how they stand apart."""
+    headings = fitting(seen.places, seen.sights, carried(layout))
     fits: Pairs = {}
-    for i, j, a, b in np.argwhere(fitting(seen.places, seen.sights, carried(layout))).tolist():
-        fits.setdefault((i, j), set()).add((a, b))
+    for i, j, a, b in np.argwhere(headings.any(axis=-1)).tolist():
+        fits.setdefault((i, j), {})[a, b] = headings[i, j, a, b]
     return fits
 
 
@@ -202,10 +203,9 @@ def _candidate(members: tuple[int, ...], seen: _Seen, layout: Layout, fits: Pair
         return None
     counts = [len(seen.rows[k]) for k in members]
     body, ways = carried(layout), []
-    for way in _ways(members, sources, fits):
-        found = posterior(
-            seen.sights, rows, body, np.repeat(np.array(way), counts), GATE_CHI2 + 3 * len(rows)
-        )
+    for way, headings in _ways(members, sources, fits):
+        shown = np.repeat(np.array(way), counts)
+        found = posterior(seen.sights, rows, body, shown, headings, GATE_CHI2 + 3 * len(rows))
         if found is not None:
             log_prior = len(members) * math.log(SEEN) + hidden * math.log(1.0 - SEEN)
             ways.append((way, found, found.log_evidence + log_prior + math.log(PER_M3)))
@@ -215,16 +215,24 @@ def _candidate(members: tuple[int, ...], seen: _Seen, layout: Layout, fits: Pair
     return Candidate(members, layout, tuple(ways), float(np.logaddexp.reduce(logs)))
 
 
-def _ways(members: tuple[int, ...], sources: int, fits: Pairs) -> list[tuple[int, ...]]:
-    """Return which source each flare may be, of every two one that fits."""
-    ways: list[tuple[int, ...]] = [()]
-    for n, k in enumerate(members):
-        ways = [
-            (*way, source)
-            for way in ways
-            for source in range(sources)
-            if source not in way and all((way[m], source) in fits[members[m], k] for m in range(n))
-        ][:MOST_TRIED]
+def _ways(
+    members: tuple[int, ...], sources: int, fits: Pairs
+) -> list[tuple[tuple[int, ...], NDArray[np.bool_]]]:
+    """Return which source each flare may be, with the headings at which every two fit."""
+    ways: list[tuple[tuple[int, ...], NDArray[np.bool_]]] = [
+        ((source,), np.ones(HEADINGS, dtype=np.bool_)) for source in range(sources)
+    ]
+    for n, k in enumerate(members[1:], 1):
+        longer = []
+        for way, headings in ways:
+            for source in range(sources):
+                pairs = [fits[members[m], k].get((way[m], source)) for m in range(n)]
+                if source in way or any(each is None for each in pairs):
+                    continue
+                left = np.logical_and.reduce([headings, *(each for each in pairs if each is not None)])
+                if left.any():
+                    longer.append(((*way, source), left))
+        ways = longer[:MOST_TRIED]
     return ways
 
 

@@ -1,4 +1,4 @@
-"""Which two flares may be which two sources, by how they stand apart: a compiled loop of `robots`."""
+"""Which two flares may be which two sources, and how turned, by how they stand apart: a compiled loop."""
 
 import math
 from typing import NamedTuple
@@ -17,7 +17,7 @@ GATE_CHI2 = 30.0
 
 HEADINGS = 72
 SLACK = 0.05  # of the distance between two sources: half a step of the headings above
-STRETCH, NOISES, MOST_NOISE_M = 1.5, 6.0, 0.1
+STRETCH, NOISES, MOST_NOISE_M, NEAREST_M = 1.5, 6.0, 0.1, 0.05
 
 
 class Places(NamedTuple):
@@ -40,9 +40,9 @@ class Places(NamedTuple):
 
 @compiled
 def fitting(places: Places, sights: Sights, layout: Carried) -> NDArray[np.bool_]:
-    """Tell whether flares i < j may be sources a and b, shape (f, f, s, s)."""
+    """Tell whether flares i < j may be sources a and b of a robot at some heading, shape (f, f, s, s, 72)."""
     flares, sources = len(places.row), len(layout.log_flux)
-    fits = np.zeros((flares, flares, sources, sources), dtype=np.bool_)
+    fits = np.zeros((flares, flares, sources, sources, HEADINGS), dtype=np.bool_)
     cosine, sine = np.empty(HEADINGS), np.empty(HEADINGS)
     for k in range(HEADINGS):
         cosine[k], sine[k] = math.cos(k * 2.0 * math.pi / HEADINGS), math.sin(k * 2.0 * math.pi / HEADINGS)
@@ -52,10 +52,14 @@ def fitting(places: Places, sights: Sights, layout: Carried) -> NDArray[np.bool_
             longest_m = max(longest_m, _distance_m(layout.place_m[a], layout.place_m[b]))
     # A source of less flux seems farther off by the root of it, and so farther from others.
     longest_m *= STRETCH * math.exp(0.5 * (layout.log_flux.max() - layout.log_flux.min()))
+    stand_m, noise_m2 = np.empty((2, 3)), np.empty((2, 3, 3))
     apart_m, covariance = np.empty(3), np.empty((3, 3))
     for i in range(flares):
         for j in range(i + 1, flares):
-            if not _near(places, i, j, longest_m):
+            if not _stand(places, sights, i, j, stand_m, noise_m2):
+                fits[i, j] = True  # bearings alone tell nothing apart
+                continue
+            if not _near(stand_m, noise_m2, longest_m):
                 continue
             for a in range(sources):
                 for b in range(sources):
@@ -63,10 +67,8 @@ def fitting(places: Places, sights: Sights, layout: Carried) -> NDArray[np.bool_
                         continue
                     arm_m = layout.place_m[b] - layout.place_m[a]
                     slack_m = SLACK * math.sqrt(arm_m[0] ** 2 + arm_m[1] ** 2 + arm_m[2] ** 2)
-                    _apart(places, sights, layout, i, j, a, b, apart_m, covariance)
-                    if not math.isfinite(apart_m[0] + apart_m[1] + apart_m[2]):
-                        fits[i, j, a, b] = True
-                        continue
+                    rows = places.row[i], places.row[j]
+                    _apart(stand_m, noise_m2, sights, rows, layout, (a, b), apart_m, covariance)
                     for k in range(3):
                         covariance[k, k] += slack_m**2
                     _invert(covariance)
@@ -78,44 +80,73 @@ def fitting(places: Places, sights: Sights, layout: Carried) -> NDArray[np.bool_
                         chi2 += 2.0 * (
                             covariance[0, 1] * x * y + (covariance[0, 2] * x + covariance[1, 2] * y) * z
                         )
-                        if chi2 < GATE_CHI2:
-                            fits[i, j, a, b] = True
-                            break
+                        if chi2 < GATE_CHI2:  # at a heading in between it may be less than at either
+                            fits[i, j, a, b, k - 1] = fits[i, j, a, b, k] = True
+                            fits[i, j, a, b, (k + 1) % HEADINGS] = True
     return fits
 
 
 @compiled
+def _stand(places: Places, sights: Sights, i: int, j: int, stand_m: Array, noise_m2: Array) -> bool:
+    """Write where two flares stand, shape (2, 3), and its noise, (2, 3, 3); False where no range is known.
+
+    One of unknown range is put where its ray comes nearest to the other.
+    """
+    for flare, other, number in ((i, j, 0), (j, i, 1)):
+        stand_m[number] = places.place_m[flare]
+        noise_m2[number] = places.noise_m2[flare]
+        if not math.isnan(stand_m[number, 0]):
+            continue
+        if math.isnan(places.place_m[other, 0]):
+            return False
+        row, range_m = places.row[flare], 0.0
+        axes = sights.axes[row]
+        for k in range(3):
+            range_m += axes[2, k] * (places.place_m[other, k] - sights.origin_m[row, k])
+        range_m = max(range_m, NEAREST_M)
+        for k in range(3):
+            stand_m[number, k] = sights.origin_m[row, k] + range_m * axes[2, k]
+            for m in range(3):
+                noise_m2[number, k, m] = 0.0
+                for c in range(3):
+                    for d in range(3):
+                        noise_m2[number, k, m] += range_m**2 * axes[c, k] * sights.own[row, c, d] * axes[d, m]
+    return True
+
+
+@compiled
 def _apart(
-    places: Places,
+    stand_m: Array,
+    noise_m2: Array,
     sights: Sights,
+    rows: tuple[int, int],
     layout: Carried,
-    i: int,
-    j: int,
-    a: int,
-    b: int,
+    sources: tuple[int, int],
     apart_m: Array,
     covariance: Array,
 ) -> None:
-    """Write how flare j stands from flare i, if they are sources b and a, and its covariance.
+    """Write how the second of two flares stands from the first, as these sources, and its covariance.
 
     The range constant's error may be anything here; fluxes count as the layout has them.
     """
     covariance[:] = 0.0
     apart_m[:] = 0.0
     towards, from_m, turned_m = np.zeros(3), np.empty(3), np.empty(3)
-    for sign, flare, source in ((-1.0, i, a), (1.0, j, b)):
-        row = places.row[flare]
-        factor = math.exp(0.5 * sights.by_flux[row] * layout.log_flux[source])
-        range2 = 0.0
+    own2 = (0.5 * layout.flux_sigma_own) ** 2
+    for number in range(2):
+        row, sign = rows[number], 2.0 * number - 1.0
+        factor = math.exp(0.5 * sights.by_flux[row] * layout.log_flux[sources[number]])
+        constant, range2 = sights.constant[row], 0.0
+        if not math.isnan(layout.flux_sigma_common):
+            constant = 0.5 * layout.flux_sigma_common * sights.by_flux[row]
         for k in range(3):
-            from_m[k] = places.place_m[flare, k] - sights.origin_m[row, k]
+            from_m[k] = stand_m[number, k] - sights.origin_m[row, k]
             apart_m[k] += sign * (sights.origin_m[row, k] + factor * from_m[k])
-            towards[k] += sign * sights.constant[row] * factor * from_m[k]
+            towards[k] += sign * constant * factor * from_m[k]
             range2 += from_m[k] ** 2
-        own = (0.5 * layout.flux_sigma_own) ** 2
         for k in range(3):
             for m in range(3):
-                covariance[k, m] += factor**2 * places.noise_m2[flare, k, m] + own * from_m[k] * from_m[m]
+                covariance[k, m] += factor**2 * noise_m2[number, k, m] + own2 * from_m[k] * from_m[m]
         for error in range(sights.shared.shape[2]):
             for k in range(3):
                 turned_m[k] = 0.0
@@ -130,22 +161,21 @@ def _apart(
 
 
 @compiled
-def _near(places: Places, i: int, j: int, longest_m: float) -> bool:
+def _near(stand_m: Array, noise_m2: Array, longest_m: float) -> bool:
     """Tell whether two flares are not too far apart across the line of sight to be of one robot."""
     middle2, along_m, apart2, noise2_i, noise2_j = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
-        apart_m = places.place_m[i, k] - places.place_m[j, k]
-        middle_m = 0.5 * (places.place_m[i, k] + places.place_m[j, k])
+        off_m = stand_m[0, k] - stand_m[1, k]
+        middle_m = 0.5 * (stand_m[0, k] + stand_m[1, k])
         middle2 += middle_m**2
-        along_m += apart_m * middle_m
-        apart2 += apart_m**2
-        noise2_i += places.noise_m2[i, k, k]
-        noise2_j += places.noise_m2[j, k, k]
+        along_m += off_m * middle_m
+        apart2 += off_m**2
+        noise2_i += noise_m2[0, k, k]
+        noise2_j += noise_m2[1, k, k]
     across2 = apart2 - along_m**2 / max(middle2, 1e-18)
     # In sight's axes angles' noise is the least of the three, and K's error stretches all alike.
     noise_m = math.sqrt(max(noise2_i, 0.0)) + math.sqrt(max(noise2_j, 0.0))
-    reach_m = longest_m + NOISES * min(noise_m, MOST_NOISE_M)
-    return not across2 > reach_m**2  # what has no range is not told apart
+    return across2 <= (longest_m + NOISES * min(noise_m, MOST_NOISE_M)) ** 2
 
 
 @compiled

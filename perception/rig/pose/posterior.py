@@ -48,15 +48,20 @@ class Posterior:
 
 
 def posterior(
-    sights: Sights, rows: Indices, layout: Carried, source: Indices, worth_chi2: float
+    sights: Sights,
+    rows: Indices,
+    layout: Carried,
+    source: Indices,
+    headings: NDArray[np.bool_],
+    worth_chi2: float,
 ) -> Posterior | None:
     """Return the posterior of the pose, all headings and places alike beforehand.
 
-    `source`, shape (n,), says which source of the layout each of the rows of sightings shows. None where no
-    pose has a χ² of less than `worth_chi2`.
+    `source`, shape (n,), says which source of the layout each of the rows of sightings shows, `headings` at
+    which of a turn's the robot may head (`gates`). None where no pose has a χ² of less than `worth_chi2`.
     """
     problem = problem_of(sights, rows, layout, source)
-    nodes = nodes_of(problem, worth_chi2)
+    nodes = nodes_of(problem, headings, worth_chi2)
     if not len(nodes):
         return None
     found, log_mass = modes_of(nodes)

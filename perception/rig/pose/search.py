@@ -23,7 +23,7 @@ LEAST_COSINE = 0.5
 """A source more than 60 degrees off its bearing is not what is seen."""
 
 TURN = 2.0 * math.pi
-STEPS, STEPS_NEAR = 2, 3
+STEPS = 2
 WITHIN, PER_SIGMA = 12, 2
 WORTH_CHI2, FINEST_CHI2 = 30.0, 6.0
 BISECTIONS, REFINING = 4, 8
@@ -271,8 +271,8 @@ def place_node(problem: Problem) -> Array:
 def _gone_down(problem: Problem, coarse: Array) -> tuple[Array, Array]:
     """Return the poses at the feet of all valleys, shape (valleys, 4); χ² and σ of heading, (valleys, 2).
 
-    On a coarse grid a narrow valley may lie between two headings, beside another: each low one's neighbours
-    are gone down too.
+    The grid's poses and χ² are in `coarse`, shape (headings, 5), of what is no heading infinite. A narrow
+    valley may lie between two headings, beside another: each low one's neighbours are gone down too.
     """
     count = len(coarse)
     begin = np.zeros(count, dtype=np.bool_)
@@ -280,7 +280,9 @@ def _gone_down(problem: Problem, coarse: Array) -> tuple[Array, Array]:
     for k in range(count):
         before, after = coarse[k - 1, 4], coarse[(k + 1) % count, 4]
         if coarse[k, 4] <= before and coarse[k, 4] < after:
-            begin[k] = begin[k - 1] = begin[(k + 1) % count] = True
+            begin[k] = True
+            begin[k - 1] |= math.isfinite(before)
+            begin[(k + 1) % count] |= math.isfinite(after)
             none = False
     if none:  # all alike: nothing tells the heading
         begin[np.argmin(coarse[:, 4])] = True
@@ -291,8 +293,7 @@ def _gone_down(problem: Problem, coarse: Array) -> tuple[Array, Array]:
         if not begin[k]:
             continue
         pose, sigma = poses[valleys], 0.1
-        pose[:3] = coarse[k, 1:4]
-        pose[3] = coarse[k, 0]
+        pose[:] = coarse[k, :4]
         for _ in range(REFINING):
             chi2_at(problem, pose, information, score)
             for c in range(4):
@@ -324,26 +325,41 @@ def _gone_down(problem: Problem, coarse: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def nodes_of(problem: Problem, worth_chi2: float) -> Array:
-    """Return nodes over a turn that resolve the posterior, by heading, (nodes, 12); 0 if not worth it."""
-    coarse = np.empty((COARSE, COLUMNS))
+def nodes_of(problem: Problem, headings: NDArray[np.bool_], worth_chi2: float) -> Array:
+    """Return nodes over a turn that resolve the posterior, by heading, (nodes, 12); 0 if not worth it.
+
+    `headings`, shape (72,), says at which the robot may head at all, the first along x.
+    """
+    coarse = np.empty((COARSE, 5))
     pose, middle = np.empty(4), np.empty(4)
+    information, score, root, step = np.empty((4, 4)), np.empty(4), np.empty((4, 4)), np.empty(4)
     _seen_middle(problem, middle)
     for k in range(COARSE):
+        if not headings[k]:
+            coarse[k, 4] = np.inf
+            continue
         pose[:3] = middle[:3]
         pose[3] = k * (TURN / COARSE)
         _middle(problem, pose, -1.0)
-        _placed(problem, pose, STEPS, coarse[k])
+        for _ in range(STEPS):
+            chi2 = chi2_at(problem, pose, information, score)
+            _solved(information, score, 3, root, step)
+            for c in range(3):
+                pose[c] += step[c]
+                chi2 -= step[c] * score[c]
+        coarse[k, :4] = pose
+        coarse[k, 4] = chi2  # as the slopes foretell it, which will do to begin from
     poses, valleys = _gone_down(problem, coarse)
     least = valleys[:, 0].min()
     if least > worth_chi2:
-        return coarse[:0]
+        return np.empty((0, COLUMNS))
     deep = np.flatnonzero(valleys[:, 0] < least + WORTH_CHI2)
+    grid, count = np.empty((COARSE, COLUMNS)), 0
     for k in range(COARSE):
-        if coarse[k, 4] < least + 2.0 * WORTH_CHI2:
-            pose[:3] = coarse[k, 1:4]
-            pose[3] = coarse[k, 0]
-            _placed(problem, pose, STEPS, coarse[k])
+        if headings[k]:
+            pose[:] = coarse[k, :4]
+            _placed(problem, pose, STEPS if coarse[k, 4] < least + 2.0 * WORTH_CHI2 else 0, grid[count])
+            count += 1
     near = np.empty((len(deep) * (2 * WITHIN + 1), COLUMNS))
     for number in range(len(near)):
         valley = deep[number // (2 * WITHIN + 1)]
@@ -353,8 +369,8 @@ def nodes_of(problem: Problem, worth_chi2: float) -> Array:
         off = (number % (2 * WITHIN + 1) - WITHIN) / PER_SIGMA
         pose[3] = (pose[3] + off * sigma) % TURN
         _middle(problem, pose, -1.0)
-        _placed(problem, pose, STEPS_NEAR, near[number])
-    nodes = _by_heading(coarse, near)
+        _placed(problem, pose, STEPS, near[number])
+    nodes = _by_heading(grid[:count], near)
     for _ in range(BISECTIONS):
         count = len(nodes)
         between = np.empty((count, COLUMNS))
@@ -364,12 +380,11 @@ def nodes_of(problem: Problem, worth_chi2: float) -> Array:
             gap = after[0] - nodes[k, 0] + (TURN if k == count - 1 else 0.0)
             worth = min(nodes[k, 4], after[4]) < lowest + WORTH_CHI2
             if worth and abs(after[4] - nodes[k, 4]) > FINEST_CHI2 and gap > FINEST_RAD:
-                pose[:3] = nodes[k, 1:4]
-                pose[3] = nodes[k, 0]
+                pose[:3], pose[3] = nodes[k, 1:4], nodes[k, 0]
                 _middle(problem, pose, 1.0)
                 pose[3] = (nodes[k, 0] + 0.5 * gap) % TURN
                 _middle(problem, pose, -1.0)
-                _placed(problem, pose, STEPS_NEAR, between[more])
+                _placed(problem, pose, STEPS, between[more])
                 more += 1
         if more == 0:
             break
