@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.rig.pose.search import nodes_of, place_node, problem_of
+from perception.rig.pose.problem import problem_of
+from perception.rig.pose.search import nodes_of, place_node
 from perception.rig.pose.sights import Carried, Sights
 
 Array = NDArray[np.float64]
