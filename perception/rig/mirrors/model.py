@@ -1,7 +1,7 @@
 """What a flat mirror shows of a robot: compiled loops of the search for mirrors and of their fit.
 
-A plane n·x = c, n a unit vector away from the observer, shows p at p' = p − 2 (n·p − c) n. Light comes
-along |p' − o|, o the camera's centre, times the reflectance R: by flux alone it seems as far as |p' − o| / √R.
+A plane n·x = c, n a unit vector away from the observer, shows p at p' = p − 2 (n·p − c) n. Its light
+comes along |p' − o| to a camera at o, times the reflectance R: by flux it seems as far as |p' − o| / √R.
 """
 
 import math
@@ -18,8 +18,7 @@ Indices = NDArray[np.int64]
 CONSTANT, SURFACE, PANE = 0, 1, 2
 """Kinds of reflectance: a constant, of one side of a dielectric, of both sides of a sheet of it."""
 
-NEAREST_MIRROR_M = 0.05
-GATE_CHI2, SEED_GATE_CHI2 = 25.0, 200.0
+NEAREST_MIRROR_M, GATE_CHI2, SEED_GATE_CHI2 = 0.05, 25.0, 200.0
 SEED_LOG_RANGE, SEED_RAD = 0.3, 0.1
 SEED_COSINE2 = 1.0 - 2.0 * SEED_RAD**2
 FIT_STEPS, HOPELESS_CHI2, MOST_MATCHES = 8, 25.0, 4
@@ -136,8 +135,8 @@ def fit_plane(
 
     Parameters
     ----------
-    flares, parents, images
-        Whom each image shows, indices of shape (pairs,).
+    parents, images
+        Whom each image shows, shape (pairs,).
     plane
         n, c and the parameter, of a `kind` of reflectance, to start from; the fitted ones afterwards.
     prior, precision
@@ -151,8 +150,8 @@ def fit_plane(
     """
     information, score = np.empty((4, 4)), np.empty(4)
     covariance, slope, turned = np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 3))
-    chi2, log_peak = 0.0, 0.0
-    trial, axes, settled = np.empty(5), np.empty((2, 3)), False
+    chi2, log_peak, settled = 0.0, 0.0, False
+    trial, axes = np.empty(5), np.empty((2, 3))
     for step in range(FIT_STEPS):
         across_m = math.hypot(plane[0], plane[1])
         axes[0, 0], axes[0, 1], axes[0, 2] = 0.0, 1.0, 0.0
