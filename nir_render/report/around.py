@@ -126,7 +126,7 @@ def _picture(around: SetEvaluation) -> Drawing | None:
 
 
 def _page(position_body_m: Any) -> tuple[float, float]:
-    """Return where a place stands on the page: ahead is up, left is left."""
+    """Return where a place stands on the page, or a direction points: ahead is up, left is left."""
     return -float(position_body_m[1]), float(position_body_m[0])
 
 
@@ -169,14 +169,13 @@ def _draw_headings(axes: Axes, stands: Sequence[Stand], reach_m: float, colour: 
         shown = [one for one in each.told.hypotheses if one.odds >= _ODDS_SHOWN]
         for one in shown:
             x, y = _page(one.position_body_m)
-            # Ahead of the observer is up the page.
-            angle_deg = 90.0 + math.degrees(one.heading_rad)
+            ahead = _page((math.cos(one.heading_rad), math.sin(one.heading_rad)))
+            angle_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
             wide_deg = min(_SIGMAS * math.degrees(math.sqrt(one.covariance[3, 3])), 180.0)
             alpha = 0.25 + 0.75 * one.odds
             wedge = Wedge((x, y), length_m, angle_deg - wide_deg, angle_deg + wide_deg)
             wedge.set(facecolor=colour, alpha=0.4 * alpha, linewidth=0.0)
             axes.add_patch(wedge)
-            ahead = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
             tip = x + length_m * ahead[0], y + length_m * ahead[1]
             axes.plot(
                 *zip((x, y), tip, strict=True), "-", color=colour, linewidth=1.2, alpha=alpha, label=label
@@ -198,8 +197,8 @@ def _draw_true_headings(axes: Axes, around: SetEvaluation, number: int, reach_m:
     }
     for k, (place_m, heading_rad) in enumerate(true.values()):
         x, y = _page(place_m)
-        length_m = _TRUE_POINTER * reach_m
-        tip = x - length_m * math.sin(heading_rad), y + length_m * math.cos(heading_rad)
+        ahead = _page((math.cos(heading_rad), math.sin(heading_rad)))
+        tip = x + _TRUE_POINTER * reach_m * ahead[0], y + _TRUE_POINTER * reach_m * ahead[1]
         axes.plot(
             *zip((x, y), tip, strict=True), ":", color=TRUTH, linewidth=1.3,
             label="truth: heading" if k == 0 else None,

@@ -61,6 +61,26 @@ def test_two_robots_beside_each_other_are_told_apart_with_a_source_hidden() -> N
             assert any(is_at(each, own[3]) for each in robot.hypotheses)
 
 
+def test_of_two_narrow_valleys_beside_each_other_both_are_found() -> None:
+    """Near broadside, 1 m away: the true heading is 8° from another that suits, and each is 0.3° wide."""
+    found = figures(UNLIKE, 97, seed=2)
+    assert (found.named > 0.0).all()
+
+
+def test_a_flare_without_a_range_is_of_the_robot_whose_flares_are_beside_its_ray() -> None:
+    """Of three and three LEDs each robot has one that was not ranged; both are whole, and head as they do."""
+    cameras = {name: replace(camera, layouts=(THREE,)) for name, camera in rig().items()}
+    poses = [np.array([1.5, 0.2, 0.0, 0.4]), np.array([2.5, -0.9, 0.0, -2.0])]
+    seen = sighted(cameras, [(THREE, pose) for pose in poses], np.random.default_rng(15))
+    unranged = {"range_m": math.nan, "range_sigma_m": math.nan, "range_sigma_common_m": math.nan}
+    seen = [[replace(hit, **unranged) if k % 3 == 1 else hit for k, hit in enumerate(each)] for each in seen]
+    robots = told(cameras, seen)
+    assert [len(robot.flares) for robot in robots] == [3, 3]
+    for robot in robots:
+        own = min(poses, key=lambda pose: np.linalg.norm(pose[:3] - robot.hypotheses[0].position_body_m))
+        assert any(is_at(each, own[3]) for each in robot.hypotheses)
+
+
 def test_one_led_alone_is_no_robot() -> None:
     cameras = {name: replace(camera, layouts=(ALIKE,)) for name, camera in rig().items()}
     pose = np.array([2.0, 0.3, 0.0, 1.0])
