@@ -212,7 +212,7 @@ def calibrate_run(folder: Path, progress: Progress) -> RunCalibration:
 
 
 def _write_page(folder: Path, told: RunCalibration) -> None:
-    from nir_render.report.calibration_page import LearnedCamera, calibration_html
+    from nir_render.report.calibration.page import LearnedCamera, calibration_html
 
     page = calibration_html(
         cameras={

@@ -88,7 +88,7 @@ def calibration_html(
     subtitle = [counted(len(cameras), "camera")] if cameras else []
     subtitle += [f"how the cameras of {robot} stand" for robot in rigs]
     return render_page(
-        "report/calibration_page.html",
+        "report/calibration/page.html",
         title=f"Calibration: {folder_name}",
         subtitle=[*subtitle, "holds" if not faults else f"{counted(len(faults), 'check')} failed"],
         faults=list(faults),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nir_render.report.calibration_page import LearnedCamera, _with_sigma, calibration_html
+from nir_render.report.calibration.page import LearnedCamera, _with_sigma, calibration_html
 from perception.calibration.camera import CalibratedCamera
 from perception.extrinsics.calibrate import CameraPose, Extrinsics
 from tests.unit.report.cases import calibration
