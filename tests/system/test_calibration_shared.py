@@ -26,7 +26,9 @@ def test_cameras_of_a_rendered_rig_are_set_right_within_their_sigma(tmp_path: Pa
     χ² of six: within its 99.9 %, and not by σ that are too wide. The first camera is where it was said.
     """
     folder = tmp_path / "shared"
-    render_run(nr.load_scene(SCENES / "calibration_shared.yaml"), folder, progress=lambda *_: None)
+    render_run(
+        nr.load_scene(SCENES / "calibration_shared.yaml"), folder, overwrite=False, progress=lambda *_: None
+    )
     path = folder / "calibration.json"
     true = parse_calibration_document(json.loads(path.read_text()))
     draw = np.random.Generator(np.random.Philox(1510))

@@ -72,9 +72,16 @@ def test_a_flare_without_a_range_is_of_the_robot_whose_flares_are_beside_its_ray
     cameras = {name: replace(camera, layouts=(THREE,)) for name, camera in rig().items()}
     poses = [np.array([1.5, 0.2, 0.0, 0.4]), np.array([2.5, -0.9, 0.0, -2.0])]
     seen = sighted(cameras, [(THREE, pose) for pose in poses], np.random.default_rng(15))
-    unranged = {"range_m": math.nan, "range_sigma_m": math.nan, "range_sigma_common_m": math.nan}
-    seen = [[replace(hit, **unranged) if k % 3 == 1 else hit for k, hit in enumerate(each)] for each in seen]
-    robots = told(cameras, seen)
+    unranged = [
+        [
+            replace(hit, range_m=math.nan, range_sigma_m=math.nan, range_sigma_common_m=math.nan)
+            if k % 3 == 1
+            else hit
+            for k, hit in enumerate(each)
+        ]
+        for each in seen
+    ]
+    robots = told(cameras, unranged)
     assert [len(robot.flares) for robot in robots] == [3, 3]
     for robot in robots:
         own = min(poses, key=lambda pose: np.linalg.norm(pose[:3] - robot.hypotheses[0].position_body_m))
