@@ -12,7 +12,7 @@ from perception.model.fisher import flare_limit
 from perception.model.flare import PixelBox, flare_image
 from perception.rig.measure_set import measure_set
 from perception.robust.detect import detect_robust
-from perception.types import Calibration, Detection, RawFrame, Signal
+from perception.types import Calibration, Detection, Layout, RawFrame, Signal
 
 _ROWS, _COLUMNS = 256, 320
 
@@ -44,9 +44,11 @@ def _decode_sample() -> None:
 
 
 def _measure_sample_set(calibration: Calibration) -> None:
-    """Measure a set of two cameras side by side, before which three robots and their mirror images stand."""
+    """Measure a set of two cameras: three robots, one with two sources, and their images in a mirror."""
+    pair = Layout("pair", ((0.05, 0.0, 0.0), (-0.05, 0.0, 0.0)), (1.0, 1.0))
+    calibration = replace(calibration, layouts=(pair,))
     side = replace(calibration, camera="side", position_body_m=np.array([0.1, 0.0, 0.0]))
-    robots = np.array([[-0.5, 0.3, 2.0], [0.4, -0.2, 3.0], [0.1, 0.5, 4.0]])
+    robots = np.array([[-0.5, 0.3, 2.0], [-0.4, 0.3, 2.0], [0.4, -0.2, 3.0], [0.1, 0.5, 4.0]])
     images = robots * [1.0, 1.0, -1.0] + [
         0.0,
         0.0,

@@ -161,7 +161,7 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
     from nir_render.command.terminal.console import note, print_error, print_json
     from nir_render.command.terminal.progress import progress_bar
     from nir_render.command.terminal.tables import calibration_tables, extrinsics_table, print_table
-    from nir_render.run.calibrate import FITTED_FILE, calibrate_run
+    from nir_render.run.calibrate import FITTED_FILE, PAGE, calibrate_run
 
     with progress_bar("calibrate") as progress:
         told = calibrate_run(folder, progress)
@@ -182,6 +182,7 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
             print_table(extrinsics_table(rig))
         if holds:
             typer.echo(f"{folder / FITTED_FILE}: written")
+        typer.echo(f"open {folder / PAGE}")
     if not holds:
         for fault in told.faults:
             print_error(fault, label="check failed")

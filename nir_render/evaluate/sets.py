@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from nir_render.evaluate.match import GATE_PX, by_frame, countable, image_radius_px, on_a_lamp
 from nir_render.truth.lamps import LampTruth
 from nir_render.truth.sources import SourceTruth
-from perception.types import Calibration, Detection, FrameKey, Measurement, MirrorPlane
+from perception.types import Calibration, Detection, FrameKey, Measurement, MirrorPlane, RobotPose
 
 Values = NDArray[np.float64]
 
@@ -45,10 +45,24 @@ class SetScore:
 
 
 @dataclass(frozen=True, eq=False)
+class Stand:
+    """How a robot of several sources is said to stand in a set, and how it does.
+
+    `true` is the origin's place, shape (3,), and the heading (rad) in the observer's body axes, None where
+    they are not known; `mixed`: its flares are of several robots.
+    """
+
+    number: int
+    told: RobotPose
+    true: tuple[Values, float] | None
+    mixed: bool
+
+
+@dataclass(frozen=True, eq=False)
 class SetEvaluation:
     """All scores; by estimator what it measured where nothing is, its numbers in `summary.json`, its mirrors.
 
-    False alarms and mirrors stand with the number of their set.
+    False alarms and mirrors stand with the number of their set; `stands` has the robots of several sources.
     """
 
     sets: Sequence[Sequence[FrameKey]]
@@ -56,6 +70,7 @@ class SetEvaluation:
     false_alarms: Mapping[str, tuple[tuple[int, Measurement], ...]]
     summary: Mapping[str, Mapping[str, Any]]
     mirrors: Mapping[str, Sequence[tuple[int, MirrorPlane]]]
+    stands: Mapping[str, Sequence[Stand]] = field(default_factory=dict)
 
 
 def evaluate_sets(

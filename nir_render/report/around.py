@@ -8,10 +8,10 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Ellipse, Wedge
 from matplotlib.ticker import MaxNLocator
 
-from nir_render.evaluate.sets import SetEvaluation, SetScore
+from nir_render.evaluate.sets import SetEvaluation, SetScore, Stand
 from nir_render.report.drawing import Drawing, legend, sheet, svg_of
 from nir_render.report.parts import Table
 from nir_render.report.style import INK, LIMIT, MATPLOTLIB, TRUTH, look
@@ -21,6 +21,9 @@ from perception.types import Measurement, MirrorPlane
 
 _SIGMAS = 3.0
 _MARGIN = 1.15
+_POINTER, _TRUE_POINTER = 0.11, 0.2  # lengths of headings, of the picture's half
+_ODDS_SHOWN = 0.01
+_ONE_ROBOT_M = 0.4
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Around:
 
     sentence: str
     numbers: Table
+    headings: Table | None
     picture: Drawing | None
 
 
@@ -41,7 +45,7 @@ def around_section(around: SetEvaluation | None) -> Around | None:
         f"{counted(len(around.sets), 'set')} of frames, of up to {counted(cameras, 'camera')} of one robot "
         "at once: every source counts once, and a mirror image is to be told from a robot."
     )
-    return Around(sentence, _numbers(around.summary), _picture(around))
+    return Around(sentence, _numbers(around.summary), _headings(around.summary), _picture(around))
 
 
 def _numbers(summary: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -60,6 +64,28 @@ def _numbers(summary: Mapping[str, Mapping[str, Any]]) -> Table:
             metres(numbers["set_range_rmse_m"]), "–" if nees is None else f"{nees:.2f}",
         ])  # fmt: skip
     return Table(headings, rows)
+
+
+def _headings(summary: Mapping[str, Mapping[str, Any]]) -> Table | None:
+    """Return how well robots of several sources were told; None where no layout was known."""
+    rows = [
+        [
+            name, str(numbers["set_robots_told"]), str(numbers["set_robots_mixed"]),
+            _or_dash(numbers["set_heading_rms_deg"], "°"), _or_dash(numbers["set_heading_nees"], ""),
+            str(numbers["set_heading_wrong"]), str(numbers["set_heading_unsaid"]),
+        ]
+        for name, numbers in summary.items()
+        if "set_robots_told" in numbers
+    ]  # fmt: skip
+    headings = [
+        "estimator", "robots told", "of flares of several", "heading RMS", "NEES (1 is honest)",
+        "best heading wrong", "true one not named",
+    ]  # fmt: skip
+    return Table(headings, rows) if rows else None
+
+
+def _or_dash(value: float | None, unit: str) -> str:
+    return "–" if value is None else f"{value:.2f}{unit}"
 
 
 def _picture(around: SetEvaluation) -> Drawing | None:
@@ -81,6 +107,9 @@ def _picture(around: SetEvaluation) -> Drawing | None:
             said = [score.measurements[name] for score in scores if name in score.measurements]
             said += [alarm for at, alarm in around.false_alarms[name] if at == number]
             _draw_measured(axes, said, name, names)
+            stands = [each for each in around.stands.get(name, ()) if each.number == number]
+            _draw_headings(axes, stands, reach_m, look(name, names).colour, name)
+        _draw_true_headings(axes, around, number, reach_m)
         _draw_truth(axes, scores)
         axes.plot(0.0, 0.0, "^", color=INK, markersize=9, label=f"{robot}, looking up the page")
         axes.set_xlim(-reach_m, reach_m)
@@ -97,7 +126,7 @@ def _picture(around: SetEvaluation) -> Drawing | None:
 
 
 def _page(position_body_m: Any) -> tuple[float, float]:
-    """Return where a place stands on the page: ahead is up, left is left."""
+    """Return where a place stands on the page, or a direction points: ahead is up, left is left."""
     return -float(position_body_m[1]), float(position_body_m[0])
 
 
@@ -111,8 +140,11 @@ def _draw_truth(axes: Axes, scores: Sequence[SetScore]) -> None:
                 markeredgewidth=0.9 if is_ghost else 1.3, alpha=0.7 if is_ghost else 1.0,
                 label=label if k == 0 else None,
             )  # fmt: skip
-            text = score.truth.robot + ("'" if is_ghost else "")
-            axes.annotate(text, (x, y), (9, 9), textcoords="offset points", fontsize=8, color=TRUTH)
+            # Of a robot's several sources the first has its name.
+            first = next(one for one in shown if one.truth.robot == score.truth.robot)
+            if score is first or np.linalg.norm(score.position_body_m - first.position_body_m) > _ONE_ROBOT_M:
+                text = score.truth.robot + ("'" if is_ghost else "")
+                axes.annotate(text, (x, y), (9, 9), textcoords="offset points", fontsize=8, color=TRUTH)
 
 
 def _draw_measured(axes: Axes, said: Sequence[Measurement], name: str, names: Sequence[str]) -> None:
@@ -128,6 +160,49 @@ def _draw_measured(axes: Axes, said: Sequence[Measurement], name: str, names: Se
         )  # fmt: skip
         for each in shown:
             _draw_ellipse(axes, each, colour)
+
+
+def _draw_headings(axes: Axes, stands: Sequence[Stand], reach_m: float, colour: str, name: str) -> None:
+    """Draw each heading that is said as a wedge of 3 σ, the fainter the less probable."""
+    length_m, label = _POINTER * reach_m, f"{name}: heading, with its odds where there are several"
+    for each in stands:
+        shown = [one for one in each.told.hypotheses if one.odds >= _ODDS_SHOWN]
+        for one in shown:
+            x, y = _page(one.position_body_m)
+            ahead = _page((math.cos(one.heading_rad), math.sin(one.heading_rad)))
+            angle_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
+            wide_deg = min(_SIGMAS * math.degrees(math.sqrt(one.covariance[3, 3])), 180.0)
+            alpha = 0.25 + 0.75 * one.odds
+            wedge = Wedge((x, y), length_m, angle_deg - wide_deg, angle_deg + wide_deg)
+            wedge.set(facecolor=colour, alpha=0.4 * alpha, linewidth=0.0)
+            axes.add_patch(wedge)
+            tip = x + length_m * ahead[0], y + length_m * ahead[1]
+            axes.plot(
+                *zip((x, y), tip, strict=True), "-", color=colour, linewidth=1.2, alpha=alpha, label=label
+            )
+            label = "_"  # one in the legend
+            if len(shown) > 1:
+                axes.annotate(
+                    f"{100.0 * one.odds:.0f} %", tip, (14.0 * ahead[1], -14.0 * ahead[0]), fontsize=7,
+                    color=colour, textcoords="offset points", ha="center", va="center",
+                )  # fmt: skip
+
+
+def _draw_true_headings(axes: Axes, around: SetEvaluation, number: int, reach_m: float) -> None:
+    true = {
+        each.told.flares: each.true
+        for stands in around.stands.values()
+        for each in stands
+        if each.number == number and each.true is not None
+    }
+    for k, (place_m, heading_rad) in enumerate(true.values()):
+        x, y = _page(place_m)
+        ahead = _page((math.cos(heading_rad), math.sin(heading_rad)))
+        tip = x + _TRUE_POINTER * reach_m * ahead[0], y + _TRUE_POINTER * reach_m * ahead[1]
+        axes.plot(
+            *zip((x, y), tip, strict=True), ":", color=TRUTH, linewidth=1.3,
+            label="truth: heading" if k == 0 else None,
+        )  # fmt: skip
 
 
 def _draw_ellipse(axes: Axes, measurement: Measurement, colour: str) -> None:

@@ -39,6 +39,7 @@ from perception.files.ranges import RANGES_FILE
 from perception.rig.frame_sets import robot_of
 
 FITTED_FILE = "calibration.fitted.json"
+PAGE = "calibration.html"
 _OFFSETS = "calibration.fitted.{}.offsets.png"
 _NO_RAIL = ("dark", "flat", "shared")
 
@@ -170,7 +171,7 @@ def calibrate_run(folder: Path, progress: Progress) -> RunCalibration:
     What a frame is of says its `kind`: darkness, an even surface, a source at a known range, sources that two
     cameras share. Known ranges stand in `ranges.csv`; where a rendered run has none, it is written from the
     truth. Where nothing speaks against the result, `calibration.fitted.json` is written: the calibration with
-    what was learned. Otherwise there is none, also none of an earlier call.
+    what was learned. Otherwise there is none, also none of an earlier call. `calibration.html` shows either.
 
     Raises
     ------
@@ -178,7 +179,7 @@ def calibrate_run(folder: Path, progress: Progress) -> RunCalibration:
         The folder is no recording, there is nothing to learn from, or frames do not tell what they are for.
     """
     started = time.perf_counter()
-    for old in (folder / FITTED_FILE, *folder.glob(_OFFSETS.format("*"))):
+    for old in (folder / FITTED_FILE, folder / PAGE, *folder.glob(_OFFSETS.format("*"))):
         old.unlink(missing_ok=True)
     try:
         recording = read_recording(folder)
@@ -205,8 +206,25 @@ def calibrate_run(folder: Path, progress: Progress) -> RunCalibration:
             known |= {pose.camera: rig.calibrations[pose.camera] for pose in rig.poses}
         known |= {name: _with_offsets(folder, known[name]) for name, one in done.items() if one.result.dark}
         run_folder.write_json(folder / FITTED_FILE, calibration_document(known.values()))
+    _write_page(folder, told)
     note_seconds(folder, "calibrate", started)
     return told
+
+
+def _write_page(folder: Path, told: RunCalibration) -> None:
+    from nir_render.report.calibration.page import LearnedCamera, calibration_html
+
+    page = calibration_html(
+        cameras={
+            LearnedCamera(name, one.before, one.result, one.kept): one.learned()
+            for name, one in told.cameras.items()
+        },
+        rigs=told.rigs,
+        faults=told.faults,
+        folder_name=folder.resolve().name,
+        files=run_folder.files_beside(folder / PAGE),
+    )
+    run_folder.write_file(folder / PAGE, page.encode())
 
 
 def _rigs(

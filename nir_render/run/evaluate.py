@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from nir_render.errors import InputError
-from nir_render.evaluate.headings import heading_numbers
+from nir_render.evaluate.headings import heading_numbers, stands_of
 from nir_render.evaluate.messages import MessageEvaluation, evaluate_messages, parse_told
 from nir_render.evaluate.metrics import Evaluation, evaluate
 from nir_render.evaluate.sets import SetEvaluation, evaluate_sets
@@ -165,13 +165,16 @@ def _with_headings(folder: Path, around: SetEvaluation) -> SetEvaluation:
     if not robots or not (folder / run_folder.POSES).is_file():
         return around
     poses = parse_lines(folder / run_folder.POSES, parse_pose)
-    summary = {
-        name: {**numbers, **heading_numbers(robots[name], around.scores, name, poses)}
+    stands = {
+        name: stands_of(robots[name], around.sets, around.scores, name, poses)
+        for name in around.summary
         if name in robots
-        else numbers
+    }
+    summary = {
+        name: {**numbers, **heading_numbers(stands[name])} if name in stands else numbers
         for name, numbers in around.summary.items()
     }
-    return replace(around, summary=summary)
+    return replace(around, summary=summary, stands=stands)
 
 
 def _with_tracks(

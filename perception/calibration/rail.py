@@ -17,6 +17,7 @@ from perception.calibration.range_constant import (
     regress_with_spread,
 )
 from perception.calibration.result import CONVERGED_CHANGE, HeldOut, RailCalibration
+from perception.causes import detection_causes
 from perception.estimators import detect
 from perception.files.fields import RecordingError
 from perception.model.fisher import fixed_influence, flare_limit, range_causes
@@ -160,6 +161,13 @@ def calibrate_rail(
         share_spread=converged.share_spread,
         range_limit_m=_mean([_range_limit_m(s, s.detection, known) for s in robust if s.detection]),
         robust=_held_out_errors(claimed),
+        judged_m=_judged_m(claimed),
+        causes=tuple(
+            cause
+            for s in claimed
+            if s.detection
+            for cause in detection_causes([s.detection], known, s.gain, s.black_level_dn)
+        ),
         paper_held_out=_held_out_errors(find(to_judge, known, "paper")),
     )
 
@@ -340,10 +348,19 @@ def _with_constants(
     return replace(fitted, range_constant_paper_dn_m2_per_s=paper.slope_dn_m2_per_s)
 
 
+def _judged_m(sightings: Sequence[_Sighting]) -> NDArray[np.float64]:
+    """Return true range, error and claimed σ of what was ranged, shape (n, 3)."""
+    hits = [(s.range_m, s.detection) for s in sightings if s.detection]
+    rows = [
+        (true_m, hit.range_m - true_m, hit.range_sigma_m)
+        for true_m, hit in hits
+        if math.isfinite(hit.range_m)
+    ]
+    return np.array(rows).reshape(-1, 3)
+
+
 def _held_out_errors(sightings: Sequence[_Sighting]) -> HeldOut:
-    rows = [(s.detection.range_m, s.detection.range_sigma_m, s.range_m) for s in sightings if s.detection]
-    range_m, sigma_m, true_m = np.array([row for row in rows if math.isfinite(row[0])]).reshape(-1, 3).T
-    errors_m = range_m - true_m
+    _, errors_m, sigma_m = _judged_m(sightings).T
     return HeldOut(
         found=errors_m.size,
         range_mae_m=_mean(np.abs(errors_m)),

@@ -3,7 +3,11 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from perception.calibration.range_constant import RangeConstantFit
+from perception.causes import DetectionCauses
 from perception.paper import PaperRegression
 from perception.types import Calibration
 
@@ -65,6 +69,10 @@ class RailCalibration:
         error of an ideal estimator.
     robust, paper_held_out
         Errors of both estimators with the new constants.
+    judged_m
+        True range, error and claimed σ of each frame held out, shape (n, 3).
+    causes
+        What each of these σ is made of.
     """
 
     calibration: Calibration
@@ -81,6 +89,8 @@ class RailCalibration:
     range_limit_m: float
     robust: HeldOut
     paper_held_out: HeldOut
+    judged_m: NDArray[np.float64]
+    causes: tuple[DetectionCauses, ...]
 
 
 def faults(result: RailCalibration) -> list[str]:

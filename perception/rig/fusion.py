@@ -101,29 +101,56 @@ def fused(sightings: Sightings, groups: Sequence[Group]) -> list[Joined]:
     only where nothing does. Where ranges do not agree with where the rays meet, the most precise sighting
     alone says where it seems to be.
     """
-    alone = _alone(sightings.rays)
-    return [_fused(sightings, group, alone) for group in groups]
+    rays = sightings.rays
+    known = _Known(
+        _alone(rays),
+        rays.noise.tolist(),
+        rays.common.tolist(),
+        rays.time_s.tolist(),
+        sightings.claimed.tolist(),
+        sightings.saturated.tolist(),
+        sightings.merged.tolist(),
+        sightings.ghost.tolist(),
+    )
+    return [_fused(sightings, group, known) for group in groups]
 
 
-def _fused(sightings: Sightings, group: Group, alone: Sequence["_Place"]) -> Joined:
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What each sighting says by itself, in Python's own numbers: it is asked for one by one."""
+
+    alone: Sequence["_Place"]
+    noise: list[float]
+    common: list[float]
+    time_s: list[float]
+    claimed: list[bool]
+    saturated: list[bool]
+    merged: list[bool]
+    ghost: list[bool]
+
+
+def _fused(sightings: Sightings, group: Group, known: _Known) -> Joined:
     rays, members = sightings.rays, group.members
-    used = [k for k in members if sightings.claimed[k]] or list(members)
-    best = Group(tuple(used)).best(rays.noise)
+    used = [k for k in members if known.claimed[k]] or list(members)
+    best = min(used, key=known.noise.__getitem__)
     by_camera: dict[str, int] = {}
-    for k in sorted(used, key=rays.noise.__getitem__):
+    for k in sorted(used, key=known.noise.__getitem__):
         by_camera.setdefault(sightings.keys[k][0], k)
     if len(by_camera) == 1 or not group.ranges_agree:
         used = [best]
-        place = alone[best]
-        time_s = float(rays.time_s[best])
+        place = known.alone[best]
+        time_s = known.time_s[best]
+        seems_m = known.alone[best].range_m
     else:
         used = list(by_camera.values())
         rows = np.array(used)
         weight = 1.0 / np.trace(sightings.together.angular_rad2[rows], axis1=1, axis2=2)
         time_s = float(weight @ rays.time_s[rows] / weight.sum())
         place = _together(sightings.together, rows, time_s)
-    flagged = all(sightings.ghost[k] for k in members)
-    claimed = bool(sightings.claimed[best])
+        at_origin_m = rays.origin_m[best] + rays.range_m[best] * rays.axes[best, 2] - place.origin_m
+        seems_m = math.hypot(*at_origin_m.tolist())
+    flagged = all(known.ghost[k] for k in members)
+    claimed = known.claimed[best]
     measurement = Measurement(
         robot=robot_of(sightings.keys[members[0]][0]),
         time_s=time_s,
@@ -134,17 +161,16 @@ def _fused(sightings: Sightings, group: Group, alone: Sequence["_Place"]) -> Joi
         range_m=place.range_m,
         covariance=place.covariance if claimed else np.full((3, 3), math.nan),
         range_sigma_common_m=abs(float(place.moved_m @ place.bearing)) if claimed else math.nan,
-        saturated=all(sightings.saturated[k] for k in used),
-        merged=any(sightings.merged[k] for k in used),
+        saturated=all(known.saturated[k] for k in used),
+        merged=any(known.merged[k] for k in used),
         ghost="yes" if flagged else "no",
         ghost_probability=float(flagged),
     )
-    at_origin_m = rays.origin_m[best] + rays.range_m[best] * rays.axes[best, 2] - place.origin_m
     return Joined(
         measurement=measurement,
-        seems_m=math.hypot(*at_origin_m.tolist()),
-        noise=float(rays.noise[best]),
-        common=float(rays.common[best]),
+        seems_m=seems_m,
+        noise=known.noise[best],
+        common=known.common[best],
         moved_m=place.moved_m,
         noise_m2=place.noise_m2,
     )

@@ -8,8 +8,9 @@ of its own, in which nothing is a ghost.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +22,22 @@ from perception.rig.mirrors.model import (
     GATE_CHI2,
     PANE,
     SURFACE,
-    best_seeds,
-    fit_matched,
+    fit_all,
     fit_plane,
     matched,
     seeds_of_kind,
 )
+from perception.rig.mirrors.odds import (
+    INDEX_PRIOR,
+    INDEX_SIGMA,
+    log_chances,
+    log_parameter_prior,
+    log_seen,
+    log_share,
+    log_symmetry,
+)
 from perception.rig.mirrors.planes import KINDS, mirror_plane, prior_of
-from perception.rig.mirrors.seeds import seeds_of_constant
+from perception.rig.mirrors.seeds import best_seeds, seeds_of_constant
 from perception.types import Ghost, Measurement, MirrorPlane, bearing_axes
 
 Array = NDArray[np.float64]
@@ -37,21 +46,10 @@ Indices = NDArray[np.int64]
 MIRROR_PROBABILITY = 0.1
 """That a set shows a flat mirror at all, before it is looked at."""
 
-SYMMETRY_PROBABILITY = 0.03
-"""That robots stand in a formation that is its own mirror image, …"""
-
-FORMATION_SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.04)
-"""… to one of these."""
-
 YES, POSSIBLE = 0.98, 0.005
 """Probabilities of a ghost from which a measurement is called one, or possibly one."""
 
 MOST_PLANE_DISTANCE_M = 20.0
-LOSS_PRIOR, LOSS_SIGMA = math.log(0.15), 1.2
-"""−½ ln R of a mirror of constant reflectance is log-normal: 0.15 is R = 0.74, 0.05 and 0.5 lie in 1 σ."""
-
-INDEX_PRIOR, INDEX_SIGMA = 1.5, 0.08
-
 _MOST_FLARES = 40
 _MOST_SEEDS, _MOST_TRIED = 4000, 12
 _CLEAR = 10.0
@@ -64,9 +62,6 @@ _MOST_PAIRS_OF_PAIRS = 40_000
 _MOST_PLANES = 4
 _SEED_INDICES = (1.4, 1.45, 1.5, 1.55, 1.6)
 _DIM_RATIO = 1.5
-_HEIGHT_SIGMA_M = 0.02
-_SAME_HEIGHT = 0.8
-_LOG_RANGE_SPAN = math.log(100.0)
 _OWN_SIGMA_M = 2e-3
 _ONE_ROBOT_M = 0.25
 
@@ -81,6 +76,16 @@ class _Found:
     images: Indices
     covariance: Array
     log_odds: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A plane and its kind to begin from, and what is known beforehand, as for `fit_plane`."""
+
+    start: Array
+    kind: int
+    prior: Array
+    precision: Array
 
 
 def told_ghosts(
@@ -110,7 +115,7 @@ def told_ghosts(
     if not usable or len(usable) + len(own_sources_body_m) < 2:
         return tuple(measurements), ()
     flares = _flares_of([joined[k] for k in usable], own_sources_body_m)
-    log_chance = _log_chance(flares, len(usable))
+    log_chance = log_chances(flares, len(usable))
     # The search is among the nearest; what it finds tells the others, too.
     searched = min(len(usable), _MOST_FLARES)
     own = np.arange(len(usable), len(flares.place_m))
@@ -176,26 +181,6 @@ def _flares_of(joined: Sequence[Joined], own_sources_body_m: Array) -> Flares:
     )
 
 
-def _log_chance(flares: Flares, count: int) -> Array:
-    """Return ln of the density of robots where each flare is, per rad² and unit of ln range, shape (count,).
-
-    As many as there are flares, in any direction about the vertical and at any range alike; four of five as
-    high as the others, as on a floor.
-    """
-    range_m = flares.seems_m[:count]
-    apart_m = range_m[:, None] * flares.axes[:count, 2]
-    height_m = flares.origin_m[:count, 2] + apart_m[:, 2]
-    of_all_m = np.concatenate([height_m, flares.place_m[count:, 2]])
-    middle_m = float(np.median(of_all_m))
-    spread_m = max(_HEIGHT_SIGMA_M, 1.5 * float(np.median(abs(of_all_m - middle_m))))
-    sigma_rad = np.hypot(spread_m / range_m, np.sqrt(flares.angular_rad2[:count, 1, 1]))
-    off = (height_m - middle_m) / range_m / sigma_rad
-    level = np.exp(-0.5 * off**2) / (math.sqrt(2.0 * math.pi) * sigma_rad)
-    cosine = np.sqrt(np.maximum(1.0 - (apart_m[:, 2] / range_m) ** 2, 1e-6))
-    elevation = _SAME_HEIGHT * level + (1.0 - _SAME_HEIGHT) * 0.5 * cosine
-    return np.asarray(np.log(count * elevation / (2.0 * math.pi * cosine) / _LOG_RANGE_SPAN))
-
-
 def _best_plane(
     flares: Flares, robots: Indices, images: Indices, log_chance: Array, known: list[MirrorPlane]
 ) -> _Found | None:
@@ -203,25 +188,35 @@ def _best_plane(
     for plane in list(known):
         known.remove(plane)
         prior, kind, precision = prior_of(plane)
-        one = _fitted(flares, robots, images, log_chance, prior, kind, prior, precision)
-        if one is not None and one.log_odds > _LOG_YES:
-            return one
+        for one in _fitted(flares, robots, images, log_chance, [_Trial(prior, kind, prior, precision)]):
+            if one is not None and one.log_odds > _LOG_YES:
+                return one
     parents, shown = _plausible_pairs(flares, robots, images)
-    trials = []
+    trials: list[tuple[int, _Trial]] = []
     for kind, seeds in _seeds(flares, parents, shown):
         chosen, explained = best_seeds(flares, robots, images, seeds, kind, _MOST_TRIED)
-        trials += [(count, kind, seed) for count, seed in zip(explained.tolist(), chosen, strict=True)]
+        trials += [
+            (count, _trial_of(seed, kind)) for count, seed in zip(explained.tolist(), chosen, strict=True)
+        ]
     best: _Found | None = None
-    for count, kind, seed in sorted(trials, key=lambda each: -each[0]):
+    trials.sort(key=lambda each: -each[0])
+    for count, alike in groupby(trials, key=lambda each: each[0]):
         if count < 2 or (best is not None and best.log_odds > _CLEAR and count < len(best.images)):
             break
-        prior, precision = seed.copy(), np.zeros((4, 4))
-        prior[4] = INDEX_PRIOR if kind != CONSTANT else seed[4]
-        precision[3, 3] = 1.0 / INDEX_SIGMA**2 if kind != CONSTANT else 0.0
-        one = _fitted(flares, robots, images, log_chance, seed, kind, prior, precision)
-        if one is not None and (best is None or one.log_odds > best.log_odds):
-            best = one
+        for one in _fitted(flares, robots, images, log_chance, [trial for _, trial in alike]):
+            if best is not None and best.log_odds > _CLEAR and count < len(best.images):
+                break
+            if one is not None and (best is None or one.log_odds > best.log_odds):
+                best = one
     return best
+
+
+def _trial_of(seed: Array, kind: int) -> _Trial:
+    prior, precision = seed.copy(), np.zeros((4, 4))
+    if kind != CONSTANT:
+        prior[4] = INDEX_PRIOR
+        precision[3, 3] = 1.0 / INDEX_SIGMA**2
+    return _Trial(seed, kind, prior, precision)
 
 
 def _plausible_pairs(flares: Flares, robots: Indices, images: Indices) -> tuple[Indices, Indices]:
@@ -246,23 +241,38 @@ def _seeds(flares: Flares, parents: Indices, images: Indices) -> list[tuple[int,
 
 
 def _fitted(
+    flares: Flares, robots: Indices, images: Indices, log_chance: Array, trials: Sequence[_Trial]
+) -> Iterator[_Found | None]:
+    """Fit planes to the pairs that they explain, and weigh each; None where it explains too few."""
+    planes = np.array([each.start for each in trials])
+    kinds = np.array([each.kind for each in trials])
+    priors = np.array([each.prior for each in trials])
+    precisions = np.array([each.precision for each in trials])
+    pairs, counts, found, covariances = fit_all(flares, robots, images, planes, kinds, priors, precisions)
+    for n, (trial, count) in enumerate(zip(trials, counts.tolist(), strict=True)):
+        if not count:
+            yield None
+            continue
+        chi2, log_peak = found[n].tolist()
+        shown = pairs[n, 0, :count], pairs[n, 1, :count]
+        yield _weighed(flares, robots, log_chance, trial, planes[n], *shown, chi2, log_peak, covariances[n])
+
+
+def _weighed(
     flares: Flares,
     robots: Indices,
-    images: Indices,
     log_chance: Array,
-    start: Array,
-    kind: int,
-    prior: Array,
-    precision: Array,
+    trial: _Trial,
+    plane: Array,
+    parents: Indices,
+    shown: Indices,
+    chi2: float,
+    log_peak: float,
+    covariance: Array,
 ) -> _Found | None:
-    """Fit a plane to the pairs that it explains, and weigh it; None where it explains too few."""
-    plane = start.copy()
+    """Weigh a plane that has been fitted to the pairs that it explains; None where it explains too few."""
+    kind, prior, precision = trial.kind, trial.prior, trial.precision
     is_known = bool(precision[0, 0] > 0.0)
-    parents, shown, chi2, log_peak, covariance = fit_matched(
-        flares, robots, images, plane, kind, prior, precision
-    )
-    if not len(parents):
-        return None
     of_all = parents, shown, covariance
     robot = _one_of_each(flares, parents, shown)
     if len(robot) < len(parents):
@@ -271,17 +281,17 @@ def _fitted(
         if len(parents) < (1 if is_known else 2) or not (np.diagonal(covariance) > 0.0).all():
             return None
     log_gain = log_peak - 0.5 * chi2 - float(log_chance[shown].sum())
-    log_gain += _log_seen(flares, robots, parents, plane, kind, len(log_chance))
+    log_gain += log_seen(flares, robots, parents, plane, kind, len(log_chance))
     log_volume = 0.5 * (np.linalg.slogdet(2.0 * math.pi * covariance)[1])
     if is_known:
         log_prior = 0.5 * (np.linalg.slogdet(precision / (2.0 * math.pi))[1])
         return _Found(plane, kind, *of_all, log_gain + log_volume + log_prior)
     log_prior = -math.log(4.0 * math.pi) - math.log(MOST_PLANE_DISTANCE_M)
     log_odds = math.log(MIRROR_PROBABILITY / len(KINDS)) + log_gain + log_volume + log_prior
-    log_odds += _log_parameter_prior(plane[4], math.sqrt(covariance[3, 3]), kind)
+    log_odds += log_parameter_prior(plane[4], math.sqrt(covariance[3, 3]), kind)
     if log_odds < _LOG_NEVER:
         return _Found(plane, kind, *of_all, log_odds)
-    by_symmetry = _log_symmetry(flares, parents, shown, plane, log_gain + 0.5 * chi2 - log_peak, log_prior)
+    by_symmetry = log_symmetry(flares, parents, shown, plane, log_gain + 0.5 * chi2 - log_peak, log_prior)
     # Against there being neither a mirror nor a formation.
     against = math.log1p(math.exp(min(by_symmetry, 700.0)))
     return _Found(plane, kind, *of_all, log_odds - against)
@@ -312,70 +322,11 @@ def _of_one_robot(flares: Flares, i: int, j: int) -> bool:
     return across_m < _ONE_ROBOT_M and along_m < _ONE_ROBOT_M + unsure_m
 
 
-def _log_parameter_prior(parameter: float, sigma: float, kind: int) -> float:
-    if kind != CONSTANT:  # the fit has counted its χ²
-        return -math.log(INDEX_SIGMA * math.sqrt(2.0 * math.pi))
-    loss = max(parameter, 0.5 * sigma, 1e-3)
-    off = (math.log(loss) - LOSS_PRIOR) / LOSS_SIGMA
-    return -0.5 * off**2 - math.log(loss * LOSS_SIGMA * math.sqrt(2.0 * math.pi))
-
-
-def _log_symmetry(
-    flares: Flares, parents: Indices, images: Indices, plane: Array, log_others: float, log_prior: float
-) -> float:
-    """Return ln of the odds of robots that stand as images would, with all of their light."""
-    precision = np.zeros((4, 4))
-    precision[3, 3] = 1e10
-    log_odds = -math.inf
-    # Two robots have two fluxes, each with an error of its own.
-    each_own = flares.moved_m[:, :, None] * flares.moved_m[:, None, :]
-    apart = flares._replace(
-        noise=np.hypot(flares.noise, flares.common),
-        common=np.zeros_like(flares.common),
-        moved_m=np.zeros_like(flares.moved_m),
-    )
-    for off_m in FORMATION_SIGMAS_M:
-        whole = plane.copy()
-        whole[4] = 0.0
-        loose = apart._replace(noise_m2=flares.noise_m2 + each_own + off_m**2 * np.eye(3))
-        chi2, log_peak, covariance = fit_plane(
-            loose, parents, images, whole, CONSTANT, whole.copy(), precision
-        )
-        if (np.diagonal(covariance)[:3] > 0.0).all():
-            log_volume = 0.5 * float(np.linalg.slogdet(2.0 * math.pi * covariance[:3, :3])[1])
-            log_odds = np.logaddexp(log_odds, log_peak - 0.5 * chi2 + log_volume)
-    log_share = math.log(SYMMETRY_PROBABILITY / len(FORMATION_SIGMAS_M))
-    return float(log_odds) + log_share + log_others + log_prior
-
-
-def _log_seen(
-    flares: Flares, robots: Indices, parents: Indices, plane: Array, kind: int, count: int
-) -> float:
-    """Return ln of the probability that these have images and the others none that is bright enough.
-
-    What share of robots a mirror shows depends on how large it is: any share is as probable beforehand.
-    """
-    farthest_m = float(flares.seems_m[:count].max())
-    # Whoever has an image lies before the plane.
-    beyond_m = plane[3] - flares.place_m[robots] @ plane[:3]
-    image_m = flares.place_m[robots] + 2.0 * beyond_m[:, None] * plane[:3]
-    seems_m = np.sqrt((image_m**2).sum(axis=1)) * math.exp(plane[4] if kind == CONSTANT else 1.3)
-    shown = (beyond_m > 0.0) & (seems_m < farthest_m)
-    seen = set(parents.tolist())
-    unseen = sum(robot not in seen for robot in robots[shown].tolist())
-    return _log_share(len(parents), unseen)
-
-
-def _log_share(seen: int, unseen: int) -> float:
-    """Return ln of the probability of just these, of a share between 0 and 1: ∫ s^k (1 − s)^(n−k) ds."""
-    return math.lgamma(seen + 1.0) + math.lgamma(unseen + 1.0) - math.lgamma(seen + unseen + 2.0)
-
-
 def _lone_probability(count: int, own: int, has_mirror: bool) -> list[float]:
     """Return of each flare, the nearest first, the probability that it is the lone image of a nearer one.
 
     Nothing speaks for or against it but that other robots before that mirror have no image.
     """
-    share = math.exp(_log_share(1, max(count + own - 2, 0)))
+    share = math.exp(log_share(1, max(count + own - 2, 0)))
     odds = 0.0 if has_mirror else MIRROR_PROBABILITY * share / count
     return [min(odds * (nearer + own), 0.5) for nearer in range(count)]

@@ -11,7 +11,7 @@ from perception.rig.frame_sets import Exposed, robot_of
 from perception.rig.fusion import associated, fused
 from perception.rig.ghosts import told_ghosts
 from perception.rig.mirrors.planes import check_planes
-from perception.rig.moving import at_one_time
+from perception.rig.moving import OneTime, at_one_time
 from perception.rig.robots import told_robots
 from perception.rig.sightings import sightings_of
 from perception.types import (
@@ -91,7 +91,7 @@ def measure_set(
     if unknown := sorted({frame.camera for frame in frames} - set(calibrations)):
         raise ValueError(f"no calibration for {', '.join(unknown)}")
     check_planes(planes)
-    measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
+    known, measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
     extinction: Extinction | None = None
     as_found = detections
     images: set[tuple[str, int, int]] | None = None
@@ -105,14 +105,15 @@ def measure_set(
         if extinction is None:
             break
         detections = corrected(frames, as_found, calibrations, extinction)
-        measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
+        known, measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
     seen = SetMeasurements(
         measurements,
         tuple(map(tuple, detections)),
         mirrors,
         *((extinction.per_m, extinction.sigma_per_m) if extinction is not None else ()),
     )
-    return replace(seen, robots=told_robots(frames, detections, calibrations, measurements, odometry))
+    cameras = tuple(dict.fromkeys(frame.camera for frame in frames))
+    return replace(seen, robots=told_robots(known, detections, calibrations, measurements, cameras))
 
 
 def _measured(
@@ -121,10 +122,10 @@ def _measured(
     calibrations: Mapping[str, Calibration],
     planes: Sequence[MirrorPlane],
     odometry: Sequence[Odometry],
-) -> tuple[tuple[Measurement, ...], tuple[MirrorPlane, ...]]:
+) -> tuple[OneTime, tuple[Measurement, ...], tuple[MirrorPlane, ...]]:
     """Join detections to measurements, and tell mirror images from robots."""
     known = at_one_time(sightings_of(frames, detections, calibrations), odometry)
     found = known.sightings
     own_sources_body_m = calibrations[frames[0].camera].own_sources_body_m if frames else np.empty((0, 3))
     measurements, mirrors = told_ghosts(fused(found, associated(found)), own_sources_body_m, planes)
-    return known.back(measurements), mirrors
+    return known, known.back(measurements), mirrors

@@ -44,6 +44,8 @@ class Sightings:
         What they say of the source's place.
     together
         The same for sightings of several cameras: less sure where the observer moved between (`moving`).
+    mounting_rad2
+        Of the angular variances what comes of the cameras' mounting, shape (n,).
     claimed
         Whether the estimator claims the standard deviations, shape (n,).
     saturated, merged, ghost
@@ -54,6 +56,7 @@ class Sightings:
     frame: NDArray[np.int64]
     rays: Rays
     together: Rays
+    mounting_rad2: Array
     claimed: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
     merged: NDArray[np.bool_]
@@ -110,7 +113,7 @@ def sightings_of(
     )
     sigmas_px = np.column_stack([u_sigma_px, v_sigma_px])
     sigmas_px = np.maximum(np.where(np.isfinite(sigmas_px), sigmas_px, UNCLAIMED_PX), LEAST_PX)
-    end = 0
+    end, mounting_rad2 = 0, np.empty(len(hits))
     for taken, found in zip(frames, detections, strict=True):
         these = slice(end, end := end + len(found))
         if not found:
@@ -122,7 +125,8 @@ def sightings_of(
         angular_rad2[these] = _angular_rad2(places_px, sigmas_px[these], axes[these], calibration)
         turned_rad = calibration.sigma.get("rotation_body_camera", 0.0)
         moved_rad = calibration.sigma.get("position_body_m", 0.0) / at_m[these]
-        angular_rad2[these] += (turned_rad**2 + moved_rad**2)[:, None, None] * np.eye(2)
+        mounting_rad2[these] = turned_rad**2 + moved_rad**2
+        angular_rad2[these] += mounting_rad2[these, None, None] * np.eye(2)
     rays = Rays(
         origin_m,
         axes,
@@ -139,6 +143,7 @@ def sightings_of(
         frame=frame,
         rays=rays,
         together=rays,
+        mounting_rad2=mounting_rad2,
         claimed=np.isfinite(u_sigma_px + v_sigma_px) & (claimed | ~known),
         saturated=saturated,
         merged=merged,

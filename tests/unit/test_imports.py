@@ -22,7 +22,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.budget": (),
     "nir_render.run": ("goniometer", "recording"),
     "nir_render.look": (),
-    "nir_render.report": ("time",),
+    "nir_render.report": ("calibration", "time"),
     "nir_render.evaluate": (),
     "nir_render.simulation": (),
     "nir_render.transport": ("goniometer", "indirect", "direct", "world", "backend"),

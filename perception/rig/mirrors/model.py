@@ -1,8 +1,7 @@
 """What a flat mirror shows of a robot: compiled loops of the search for mirrors and of their fit.
 
-A plane n·x = c, n a unit vector away from the observer, shows p at p' = p − 2 (n·p − c) n. The image's
-bearing is that of p', and its light comes along |p' − o|, o the camera's centre, times the reflectance R: by
-flux alone it seems as far as |p' − o| / √R.
+A plane n·x = c, n a unit vector away from the observer, shows p at p' = p − 2 (n·p − c) n. Its light
+comes along |p' − o| to a camera at o, times the reflectance R: by flux it seems as far as |p' − o| / √R.
 """
 
 import math
@@ -19,8 +18,7 @@ Indices = NDArray[np.int64]
 CONSTANT, SURFACE, PANE = 0, 1, 2
 """Kinds of reflectance: a constant, of one side of a dielectric, of both sides of a sheet of it."""
 
-NEAREST_MIRROR_M, SAME_PLANE = 0.05, 0.02
-GATE_CHI2, SEED_GATE_CHI2 = 25.0, 200.0
+NEAREST_MIRROR_M, GATE_CHI2, SEED_GATE_CHI2 = 0.05, 25.0, 200.0
 SEED_LOG_RANGE, SEED_RAD = 0.3, 0.1
 SEED_COSINE2 = 1.0 - 2.0 * SEED_RAD**2
 FIT_STEPS, HOPELESS_CHI2, MOST_MATCHES = 8, 25.0, 4
@@ -29,14 +27,19 @@ STEP, SETTLED2 = 1e-4, 1e-4
 
 @compiled
 def log_root_reflectance(kind: int, parameter: float, cosine: float) -> float:
-    """Return ½ ln R at an angle of incidence: of a constant one −parameter; Fresnel for unpolarised light.
-
-    The `parameter` of a constant reflectance is −½ ln R, of the others the refractive index. A sheet reflects
-    2 R / (1 + R), all orders summed, without absorption.
-    """
+    """Return ½ ln R at an angle of incidence; the parameter is −½ ln R of a constant one, else the index."""
     if kind == CONSTANT:
         return -parameter
-    index = max(parameter, 1.0001)
+    return 0.5 * math.log(of_dielectric(kind, parameter, cosine))
+
+
+@compiled
+def of_dielectric(kind: int, index: float, cosine: float) -> float:
+    """Return the reflectance of a dielectric, by Fresnel for unpolarised light.
+
+    A sheet reflects 2 R / (1 + R), all orders summed, without absorption.
+    """
+    index = max(index, 1.0001)
     cosine = min(max(cosine, 1e-6), 1.0)
     inside = math.sqrt(1.0 - (1.0 - cosine**2) / index**2)
     across = ((cosine - index * inside) / (cosine + index * inside)) ** 2
@@ -44,64 +47,65 @@ def log_root_reflectance(kind: int, parameter: float, cosine: float) -> float:
     reflectance = 0.5 * (across + within)
     if kind == PANE:
         reflectance = 2.0 * reflectance / (1.0 + reflectance)
-    return 0.5 * math.log(max(reflectance, 1e-12))
+    return max(reflectance, 1e-12)
 
 
 @compiled
-def residual(flares: Flares, image: int, plane: Array, kind: int, place_m: Array, off: Array) -> None:
-    """Write how far an image lies from where a plane shows a place: left, up, and in ln range.
+def residual(
+    flares: Flares, image: int, plane: Array, kind: int, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """Return how far an image lies from where a plane shows a place: left, up, and in ln range.
 
     `plane` holds n (3), c and the parameter of the reflectance.
     """
-    beyond_m = plane[3]
-    for k in range(3):
-        beyond_m -= plane[k] * place_m[k]
-    path2, cosine = 0.0, 0.0
-    for k in range(3):
-        off[k] = place_m[k] + 2.0 * beyond_m * plane[k] - flares.origin_m[image, k]
-        path2 += off[k] ** 2
-        cosine += off[k] * plane[k]
-    path_m = math.sqrt(path2)
-    left, up, along = 0.0, 0.0, 0.0
-    for k in range(3):
-        left += flares.axes[image, 0, k] * off[k]
-        up += flares.axes[image, 1, k] * off[k]
-        along += flares.axes[image, 2, k] * off[k]
+    n_x, n_y, n_z = plane[0], plane[1], plane[2]
+    twice_m = 2.0 * (((plane[3] - n_x * x) - n_y * y) - n_z * z)
+    off_x = x + twice_m * n_x - flares.origin_m[image, 0]
+    off_y = y + twice_m * n_y - flares.origin_m[image, 1]
+    off_z = z + twice_m * n_z - flares.origin_m[image, 2]
+    axes = flares.axes[image]
+    path_m = math.sqrt(off_x**2 + off_y**2 + off_z**2)
+    cosine = off_x * n_x + off_y * n_y + off_z * n_z
+    left = axes[0, 0] * off_x + axes[0, 1] * off_y + axes[0, 2] * off_z
+    up = axes[1, 0] * off_x + axes[1, 1] * off_y + axes[1, 2] * off_z
+    along = axes[2, 0] * off_x + axes[2, 1] * off_y + axes[2, 2] * off_z
     by_reflectance = log_root_reflectance(kind, plane[4], abs(cosine) / path_m)
-    off[0] = -math.atan2(left, along)
-    off[1] = -math.atan2(up, along)
-    off[2] = math.log(flares.seems_m[image] / path_m) + by_reflectance
+    off = math.log(flares.seems_m[image] / path_m) + by_reflectance
+    return -math.atan2(left, along), -math.atan2(up, along), off
 
 
 @compiled
 def pair_covariance(
-    flares: Flares, parent: int, image: int, plane: Array, kind: int, off: Array, covariance: Array
-) -> None:
-    """Write the residual of a pair, and its covariance: the image's, and the parent's by the mirror."""
-    place_m = flares.place_m[parent].copy()
-    residual(flares, image, plane, kind, place_m, off)
-    slope, moved = np.empty((3, 3)), np.empty(3)
+    flares: Flares, parent: int, image: int, plane: Array, kind: int, slope: Array, covariance: Array
+) -> tuple[float, float, float]:
+    """Return the residual of a pair, and write its covariance: the image's, and the parent's by the mirror.
+
+    `slope`, shape (3, 3), is written too: what the parent's place does to the residual.
+    """
+    x, y, z = flares.place_m[parent, 0], flares.place_m[parent, 1], flares.place_m[parent, 2]
+    off = residual(flares, image, plane, kind, x, y, z)
     for k in range(3):
-        place_m[k] += STEP
-        residual(flares, image, plane, kind, place_m, moved)
-        place_m[k] -= STEP
+        d_x, d_y, d_z = STEP * (k == 0), STEP * (k == 1), STEP * (k == 2)
+        moved = residual(flares, image, plane, kind, x + d_x, y + d_y, z + d_z)
         for m in range(3):
             slope[m, k] = (moved[m] - off[m]) / STEP
-    shared = np.zeros(3)  # the parent's flux is also the image's
-    for m in range(3):
-        for k in range(3):
-            shared[m] += slope[m, k] * flares.moved_m[parent, k]
-    shared[2] += flares.common[image]
     for a in range(3):
-        for b in range(3):
-            covariance[a, b] = shared[a] * shared[b]
+        shared_a = flares.common[image] if a == 2 else 0.0  # the parent's flux is also the image's
+        for k in range(3):
+            shared_a += slope[a, k] * flares.moved_m[parent, k]
+        for b in range(a + 1):
+            shared_b = flares.common[image] if b == 2 else 0.0
+            for k in range(3):
+                shared_b += slope[b, k] * flares.moved_m[parent, k]
+            total = shared_a * shared_b
             for k in range(3):
                 for m in range(3):
-                    covariance[a, b] += slope[a, k] * flares.noise_m2[parent, k, m] * slope[b, m]
-    for a in range(2):
-        for b in range(2):
-            covariance[a, b] += flares.angular_rad2[image, a, b]
+                    total += slope[a, k] * flares.noise_m2[parent, k, m] * slope[b, m]
+            if a < 2:
+                total += flares.angular_rad2[image, a, b]
+            covariance[a, b] = covariance[b, a] = total
     covariance[2, 2] += flares.noise[image] ** 2
+    return off
 
 
 @compiled
@@ -131,8 +135,8 @@ def fit_plane(
 
     Parameters
     ----------
-    flares, parents, images
-        Whom each image shows, indices of shape (pairs,).
+    parents, images
+        Whom each image shows, shape (pairs,).
     plane
         n, c and the parameter, of a `kind` of reflectance, to start from; the fitted ones afterwards.
     prior, precision
@@ -145,9 +149,9 @@ def fit_plane(
     shape (4, 4), which is NaN where the fit fails.
     """
     information, score = np.empty((4, 4)), np.empty(4)
-    off, moved, covariance, slope = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 4))
-    chi2, log_peak = 0.0, 0.0
-    trial, axes, settled = np.empty(5), np.empty((2, 3)), False
+    covariance, slope, turned = np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 3))
+    chi2, log_peak, settled = 0.0, 0.0, False
+    trial, axes = np.empty(5), np.empty((2, 3))
     for step in range(FIT_STEPS):
         across_m = math.hypot(plane[0], plane[1])
         axes[0, 0], axes[0, 1], axes[0, 2] = 0.0, 1.0, 0.0
@@ -170,7 +174,8 @@ def fit_plane(
                 chi2 += from_prior[a] * precision[a, b] * from_prior[b]
         for pair in range(len(parents)):
             i, j = parents[pair], images[pair]
-            pair_covariance(flares, i, j, plane, kind, off, covariance)
+            x, y, z = flares.place_m[i, 0], flares.place_m[i, 1], flares.place_m[i, 2]
+            off = pair_covariance(flares, i, j, plane, kind, turned, covariance)
             for unknown in range(4):
                 trial[:] = plane
                 if unknown < 2:
@@ -178,7 +183,7 @@ def fit_plane(
                         trial[k] += STEP * axes[unknown, k]
                 else:
                     trial[unknown + 1] += STEP
-                residual(flares, j, trial, kind, flares.place_m[i], moved)
+                moved = residual(flares, j, trial, kind, x, y, z)
                 for m in range(3):
                     slope[m, unknown] = (moved[m] - off[m]) / STEP
             log_peak -= 0.5 * (invert(covariance) + 3.0 * math.log(2.0 * math.pi))
@@ -224,31 +229,35 @@ def seeds_of_kind(
     found = np.empty((len(parents) * len(parameters), 5))
     count = 0
     normal = np.empty(3)
-    for number in range(len(found)):
-        parameter = parameters[number // len(parents)]
-        i, j = parents[number % len(parents)], images[number % len(parents)]
-        cosine, c, s, near = 0.8, 0.0, 0.0, 0.0
-        for _ in range(5):
-            s = math.exp(log_root_reflectance(kind, parameter, cosine))
-            length, c, along, path2, near = 0.0, 0.0, 0.0, 0.0, 0.0
+    for parameter in parameters:
+        for pair in range(len(parents)):
+            i, j = parents[pair], images[pair]
+            # The normal is s h + e, h the image as seen, e from the parent to the camera: h², e h, e².
+            seems2, mixed, apart2 = flares.seems_m[j] ** 2, 0.0, 0.0
+            for k in range(3):
+                apart_m = flares.origin_m[j, k] - flares.place_m[i, k]
+                mixed += flares.seems_m[j] * flares.axes[j, 2, k] * apart_m
+                apart2 += apart_m**2
+            cosine, s = 0.8, 0.0
+            for _ in range(5):
+                s = math.sqrt(of_dielectric(kind, parameter, cosine))
+                length2 = s**2 * seems2 + 2.0 * s * mixed + apart2
+                cosine = (s * seems2 + mixed) / math.sqrt(length2 * seems2)
+            length, c, near, far = 0.0, 0.0, 0.0, 0.0
             for k in range(3):
                 seen = s * flares.seems_m[j] * flares.axes[j, 2, k]
                 normal[k] = seen + flares.origin_m[j, k] - flares.place_m[i, k]
                 length += normal[k] ** 2
-                along += normal[k] * seen
-                path2 += seen**2
                 c += normal[k] * (flares.place_m[i, k] + 0.5 * normal[k])
                 near += normal[k] * flares.origin_m[j, k]
+                far += normal[k] * flares.place_m[i, k]
             length = math.sqrt(length)
-            cosine, c, near = along / (length * math.sqrt(path2)), c / length, near / length
-        far = 0.0
-        for k in range(3):
-            far += normal[k] * flares.place_m[i, k] / length
-        if c - near > NEAREST_MIRROR_M and far < c and cosine > 0.0:
-            for k in range(3):
-                found[count, k] = normal[k] / length
-            found[count, 3], found[count, 4] = c, parameter
-            count += 1
+            c = c / length
+            if c - near / length > NEAREST_MIRROR_M and far / length < c and cosine > 0.0:
+                for k in range(3):
+                    found[count, k] = normal[k] / length
+                found[count, 3], found[count, 4] = c, parameter
+                count += 1
     return found[:count]
 
 
@@ -264,45 +273,53 @@ def matched(
     -------
     Pairs of parents and images, same shape, and how well they agree in all, the less the better.
     """
-    most = min(len(parents), len(images))
+    columns = len(images)
+    most = min(len(parents), columns)
     who, whom = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
     # Those that lie within the gate are few: each with its row and column, and how badly it agrees.
-    found, misfit = 0, np.empty(len(parents) * len(images))
-    rows, columns = np.empty(len(misfit), dtype=np.int64), np.empty(len(misfit), dtype=np.int64)
-    off, covariance, shown_m = np.empty(3), np.empty((3, 3)), np.empty(3)
+    found, misfit = 0, np.empty(len(parents) * columns)
+    at_row, at_column = np.empty(len(misfit), dtype=np.int64), np.empty(len(misfit), dtype=np.int64)
+    seen, near = np.empty((6, columns)), np.empty(columns, dtype=np.bool_)
+    for column in range(columns):
+        for k in range(3):
+            seen[k, column] = flares.axes[images[column], 2, k]
+            seen[3 + k, column] = flares.origin_m[images[column], k]
+    slope, covariance = np.empty((3, 3)), np.empty((3, 3))
     for row in range(len(parents)):
         i = parents[row]
-        before_m = plane[3]
-        for k in range(3):
-            before_m -= plane[k] * flares.place_m[i, k]
+        x, y, z = flares.place_m[i, 0], flares.place_m[i, 1], flares.place_m[i, 2]
+        before_m = plane[3] - plane[0] * x - plane[1] * y - plane[2] * z
         if before_m <= 0.0:
             continue
-        for k in range(3):
-            shown_m[k] = flares.place_m[i, k] + 2.0 * before_m * plane[k]
-        for column in range(len(images)):
-            j = images[column]
-            # Most images are far from where they would have to be: that is seen without a root or an angle.
-            along, length2 = 0.0, 0.0
-            for k in range(3):
-                out_m = shown_m[k] - flares.origin_m[j, k]
-                along += flares.axes[j, 2, k] * out_m
-                length2 += out_m**2
-            if i == j or along <= 0.0 or along**2 < SEED_COSINE2 * length2:
+        # Most images are far from where they would have to be: that is seen without a root or an angle.
+        shown_x = x + 2.0 * before_m * plane[0]
+        shown_y = y + 2.0 * before_m * plane[1]
+        shown_z = z + 2.0 * before_m * plane[2]
+        for column in range(columns):
+            out_x = shown_x - seen[3, column]
+            out_y = shown_y - seen[4, column]
+            out_z = shown_z - seen[5, column]
+            along = seen[0, column] * out_x + seen[1, column] * out_y + seen[2, column] * out_z
+            length2 = out_x**2 + out_y**2 + out_z**2
+            near[column] = (along > 0.0) & (along**2 >= SEED_COSINE2 * length2)
+        for column in range(columns):
+            if not near[column] or images[column] == i:
                 continue
-            residual(flares, j, plane, kind, flares.place_m[i], off)
+            j = images[column]
+            off = residual(flares, j, plane, kind, x, y, z)
             if abs(off[0]) > SEED_RAD or abs(off[1]) > SEED_RAD or abs(off[2]) > SEED_LOG_RANGE:
                 continue
             if gate_chi2 == 0.0:
                 chi2 = (off[0] ** 2 + off[1] ** 2) / SEED_RAD**2 + (off[2] / SEED_LOG_RANGE) ** 2
             else:
-                pair_covariance(flares, i, j, plane, kind, off, covariance)
+                pair_covariance(flares, i, j, plane, kind, slope, covariance)
                 invert(covariance)
                 chi2 = 0.0
                 for a in range(3):
                     for b in range(3):
                         chi2 += off[a] * covariance[a, b] * off[b]
             if gate_chi2 == 0.0 or chi2 < gate_chi2:
-                misfit[found], rows[found], columns[found] = chi2, row, column
+                misfit[found], at_row[found], at_column[found] = chi2, row, column
                 found += 1
     count, total = 0, 0.0
     while count < most:
@@ -312,10 +329,10 @@ def matched(
                 best, at = misfit[one], one
         if at < 0:
             break
-        who[count], whom[count] = parents[rows[at]], images[columns[at]]
-        row, column = rows[at], columns[at]
+        row, column = at_row[at], at_column[at]
+        who[count], whom[count] = parents[row], images[column]
         for one in range(found):
-            if rows[one] == row or columns[one] == column:
+            if at_row[one] == row or at_column[one] == column:
                 misfit[one] = np.inf
         total += best
         count += 1
@@ -323,47 +340,53 @@ def matched(
 
 
 @compiled
-def fit_matched(
-    flares: Flares, robots: Indices, images: Indices, plane: Array, kind: int, prior: Array, precision: Array
-) -> tuple[Indices, Indices, float, float, Array]:
-    """Fit a plane in place to the pairs that it explains, at first by the coarse gate, until they settle.
+def fit_all(
+    flares: Flares, robots: Indices, images: Indices, planes: Array, kinds: Indices, priors: Array,
+    precisions: Array,
+) -> tuple[Indices, Indices, Array, Array]:  # fmt: skip
+    """Fit planes in place to the pairs that each explains, at first by the coarse gate, until they settle.
 
-    Returns the pairs, none if fewer than two (one of a known plane) or none make a plane; and as `fit_plane`.
+    Returns
+    -------
+    Pairs, shape (planes, 2, most), and how many, (planes,), 0 where fewer than two (one of a known plane) or
+    none make a plane; χ² and ln of density, (planes, 2), and covariances, as of `fit_plane`.
     """
-    least = 1 if precision[0, 0] > 0.0 else 2
-    parents, shown, _ = matched(flares, robots, images, plane, kind, 0.0)
-    none = parents[:0]
-    chi2, log_peak, covariance = 0.0, 0.0, np.empty((4, 4))
-    for _ in range(MOST_MATCHES):
-        if len(parents) < least:
-            break
-        chi2, log_peak, covariance = fit_plane(flares, parents, shown, plane, kind, prior, precision)
-        holds = np.diag(covariance).min() > 0.0
-        for j in shown:
-            before_m = plane[3]
-            for k in range(3):
-                before_m -= plane[k] * flares.origin_m[j, k]
-            holds &= before_m > NEAREST_MIRROR_M
-        if not holds:
-            break
-        again, whom, _ = matched(flares, robots, images, plane, kind, GATE_CHI2)
-        same = len(again) == len(parents)
-        for one in range(len(again)):
-            known = False
-            for other in range(len(parents)):
-                known |= again[one] == parents[other] and whom[one] == shown[other]
-            same &= known
-        if same:
-            return parents, shown, chi2, log_peak, covariance
-        parents, shown = again, whom
-    return none, none, chi2, log_peak, covariance
+    pairs = np.empty((len(planes), 2, min(len(robots), len(images))), dtype=np.int64)
+    count, found = np.zeros(len(planes), dtype=np.int64), np.zeros((len(planes), 2))
+    covariances = np.empty((len(planes), 4, 4))
+    for n in range(len(planes)):
+        plane, kind, prior, precision = planes[n], kinds[n], priors[n], precisions[n]
+        least = 1 if precision[0, 0] > 0.0 else 2
+        parents, shown, _ = matched(flares, robots, images, plane, kind, 0.0)
+        for _ in range(MOST_MATCHES):
+            if len(parents) < least:
+                break
+            fitted = fit_plane(flares, parents, shown, plane, kind, prior, precision)
+            found[n, 0], found[n, 1], covariance = fitted
+            holds = np.diag(covariance).min() > 0.0
+            for j in shown:
+                o = flares.origin_m[j]
+                holds &= plane[3] - plane[0] * o[0] - plane[1] * o[1] - plane[2] * o[2] > NEAREST_MIRROR_M
+            if not holds:
+                break
+            again, whom, _ = matched(flares, robots, images, plane, kind, GATE_CHI2)
+            same = len(again) == len(parents)
+            for one in range(len(again)):
+                same &= ((parents == again[one]) & (shown == whom[one])).any()
+            if same:
+                count[n] = len(parents)
+                pairs[n, 0, : count[n]], pairs[n, 1, : count[n]] = parents, shown
+                covariances[n] = covariance
+                break
+            parents, shown = again, whom
+    return pairs, count, found, covariances
 
 
 @compiled
-def best_seeds(
-    flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int, most: int
-) -> tuple[Array, Indices]:
-    """Return the planes that explain most images, shape (most, 5) or less, and how many each does.
+def explained_by(
+    flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int
+) -> tuple[Indices, Array, Indices]:
+    """Return how many images each plane explains, how badly, and a mark of which pairs; shapes (seeds,).
 
     A seed has the noise of one or two pairs, and that of a dielectric a guessed index, so gates are wide.
     """
@@ -374,27 +397,4 @@ def best_seeds(
         who, whom, misfit[seed] = matched(flares, parents, images, seeds[seed], kind, gate_chi2)
         count[seed] = len(who)
         mark[seed] = ((who + 1) * (whom + 31) ** 4).sum()  # of which pairs, in whatever order
-    taken = np.zeros(len(seeds), dtype=np.bool_)
-    chosen = np.empty(min(most, len(seeds)), dtype=np.int64)
-    ranks = 0
-    while ranks < len(chosen):
-        best = -1
-        for seed in range(len(seeds)):
-            if not taken[seed] and (
-                best < 0
-                or count[seed] > count[best]
-                or (count[seed] == count[best] and misfit[seed] < misfit[best])
-            ):
-                best = seed
-        if best < 0:
-            break
-        chosen[ranks] = best
-        ranks += 1
-        # Planes close by would be the same one again, and those of the same pairs are fitted to it.
-        for seed in range(len(seeds)):
-            apart = abs(seeds[seed, 3] - seeds[best, 3])
-            for k in range(3):
-                apart += abs(seeds[seed, k] - seeds[best, k])
-            same_pairs = count[seed] == count[best] and mark[seed] == mark[best]
-            taken[seed] |= apart < SAME_PLANE or same_pairs
-    return seeds[chosen[:ranks]], count[chosen[:ranks]]
+    return count, misfit, mark

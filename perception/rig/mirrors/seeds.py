@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.rig.mirrors.flares import Flares
-from perception.rig.mirrors.model import NEAREST_MIRROR_M
+from perception.rig.mirrors.model import NEAREST_MIRROR_M, explained_by
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -16,6 +16,7 @@ LEAST_ROOT, MOST_ROOT = 0.1, 1.03
 """√R of a mirror worth looking for, and a margin for noise."""
 
 PARALLEL_RAD = 0.08
+SAME_PLANE = 0.02
 
 
 @compiled
@@ -27,63 +28,119 @@ def seeds_of_constant(flares: Flares, parents: Indices, images: Indices, stride:
     """
     found = np.empty((most, 5))
     count = 0
-    one, other, bend = np.empty(3), np.empty(3), np.empty((3, 3))
+    one, other = np.empty(3), np.empty(3)
     total = len(parents)
-    seems_m, apart_m = np.empty((total, 3)), np.empty((total, 3))
+    # By axis first: roots are then found for many pairs at a time.
+    seems_m, apart_m, roots = np.empty((3, total)), np.empty((3, total)), np.empty((2, total))
     for a in range(total):
         i, j = parents[a], images[a]
         for x in range(3):
-            seems_m[a, x] = flares.seems_m[j] * flares.axes[j, 2, x]
-            apart_m[a, x] = flares.origin_m[j, x] - flares.place_m[i, x]
-    for number in range(0, total * (total - 1) // 2, stride):
-        # The numbered pair of pairs, a < b.
-        b = int((1.0 + math.sqrt(1.0 + 8.0 * number)) / 2.0)
-        if b * (b - 1) // 2 > number:
-            b -= 1
-        a = number - b * (b - 1) // 2
-        i, j, k, m = parents[a], images[a], parents[b], images[b]
-        if i in (k, m) or j in (k, m):
-            continue
-        for x in range(3):
-            y, z = (x + 1) % 3, (x + 2) % 3
-            a_y, a_z, b_y, b_z = seems_m[a, y], seems_m[a, z], apart_m[a, y], apart_m[a, z]
-            c_y, c_z, d_y, d_z = seems_m[b, y], seems_m[b, z], apart_m[b, y], apart_m[b, z]
-            bend[2, x] = a_y * c_z - a_z * c_y
-            bend[1, x] = a_y * d_z - a_z * d_y + b_y * c_z - b_z * c_y
-            bend[0, x] = b_y * d_z - b_z * d_y
-        x = 0
-        for y in range(1, 3):
-            if abs(bend[1, y]) > abs(bend[1, x]):
-                x = y
-        root2 = bend[1, x] ** 2 - 4.0 * bend[2, x] * bend[0, x]
-        if root2 < 0.0 or bend[2, x] == 0.0:
-            continue
-        for sign in (-1.0, 1.0):
-            s = (-bend[1, x] + sign * math.sqrt(root2)) / (2.0 * bend[2, x])
-            if not LEAST_ROOT < s < MOST_ROOT:
+            seems_m[x, a] = flares.seems_m[j] * flares.axes[j, 2, x]
+            apart_m[x, a] = flares.origin_m[j, x] - flares.place_m[i, x]
+    number = 0
+    for b in range(1, total):
+        # Pairs of pairs are numbered, a < b, and every so many of them looked at.
+        begin = (stride - number % stride) % stride
+        number += b
+        _roots(seems_m, apart_m, b, roots)
+        k, m = parents[b], images[b]
+        for a in range(begin, b, stride):
+            i, j = parents[a], images[a]
+            if i in (k, m) or j in (k, m):
                 continue
-            length1, length2, dot, c1, c2, near1, far1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for y in range(3):
-                seen1 = s * flares.seems_m[j] * flares.axes[j, 2, y]
-                seen2 = s * flares.seems_m[m] * flares.axes[m, 2, y]
-                one[y] = seen1 + flares.origin_m[j, y] - flares.place_m[i, y]
-                other[y] = seen2 + flares.origin_m[m, y] - flares.place_m[k, y]
-                length1 += one[y] ** 2
-                length2 += other[y] ** 2
-                dot += one[y] * other[y]
-                c1 += one[y] * (flares.place_m[i, y] + 0.5 * one[y])
-                c2 += other[y] * (flares.place_m[k, y] + 0.5 * other[y])
-                near1 += one[y] * flares.origin_m[j, y]
-                far1 += one[y] * flares.place_m[i, y]
-            length1, length2 = math.sqrt(length1), math.sqrt(length2)
-            c1, c2 = c1 / length1, c2 / length2
-            aligned = dot / (length1 * length2) > 1.0 - 0.5 * PARALLEL_RAD**2
-            agree = abs(c1 - c2) < 0.05 + 0.05 * c1
-            before = c1 - near1 / length1 > NEAREST_MIRROR_M and far1 / length1 < c1
-            if aligned and agree and before and count < most:
+            for way in range(2):
+                s = roots[way, a]
+                if not LEAST_ROOT < s < MOST_ROOT:
+                    continue
+                length1, length2, dot, c1, c2, near1, far1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for y in range(3):
-                    found[count, y] = one[y] / length1
-                found[count, 3] = c1
-                found[count, 4] = -math.log(min(s, 1.0))
-                count += 1
+                    one[y] = s * seems_m[y, a] + flares.origin_m[j, y] - flares.place_m[i, y]
+                    other[y] = s * seems_m[y, b] + flares.origin_m[m, y] - flares.place_m[k, y]
+                    length1 += one[y] ** 2
+                    length2 += other[y] ** 2
+                    dot += one[y] * other[y]
+                    c1 += one[y] * (flares.place_m[i, y] + 0.5 * one[y])
+                    c2 += other[y] * (flares.place_m[k, y] + 0.5 * other[y])
+                    near1 += one[y] * flares.origin_m[j, y]
+                    far1 += one[y] * flares.place_m[i, y]
+                length1, length2 = math.sqrt(length1), math.sqrt(length2)
+                c1, c2 = c1 / length1, c2 / length2
+                aligned = dot / (length1 * length2) > 1.0 - 0.5 * PARALLEL_RAD**2
+                agree = abs(c1 - c2) < 0.05 + 0.05 * c1
+                before = c1 - near1 / length1 > NEAREST_MIRROR_M and far1 / length1 < c1
+                if aligned and agree and before and count < most:
+                    for y in range(3):
+                        found[count, y] = one[y] / length1
+                    found[count, 3] = c1
+                    found[count, 4] = -math.log(min(s, 1.0))
+                    count += 1
     return found[:count]
+
+
+@compiled
+def _roots(seems_m: Array, apart_m: Array, b: int, roots: Array) -> None:
+    """Write both s at which the normals of a pair and of all before it are parallel, NaN where there is none.
+
+    Of the three components of their cross product the one counts whose middle term is the largest.
+    """
+    c_x, c_y, c_z = seems_m[0, b], seems_m[1, b], seems_m[2, b]
+    d_x, d_y, d_z = apart_m[0, b], apart_m[1, b], apart_m[2, b]
+    for a in range(b):
+        a_x, a_y, a_z = seems_m[0, a], seems_m[1, a], seems_m[2, a]
+        b_x, b_y, b_z = apart_m[0, a], apart_m[1, a], apart_m[2, a]
+        middle = a_y * d_z - a_z * d_y + b_y * c_z - b_z * c_y
+        bend, last = a_y * c_z - a_z * c_y, b_y * d_z - b_z * d_y
+        middle_y = a_z * d_x - a_x * d_z + b_z * c_x - b_x * c_z
+        bend_y, last_y = a_z * c_x - a_x * c_z, b_z * d_x - b_x * d_z
+        middle_z = a_x * d_y - a_y * d_x + b_x * c_y - b_y * c_x
+        bend_z, last_z = a_x * c_y - a_y * c_x, b_x * d_y - b_y * d_x
+        larger = abs(middle_y) > abs(middle)
+        middle = middle_y if larger else middle
+        bend = bend_y if larger else bend
+        last = last_y if larger else last
+        larger = abs(middle_z) > abs(middle)
+        middle = middle_z if larger else middle
+        bend = bend_z if larger else bend
+        last = last_z if larger else last
+        # The root of less than 0 is NaN, and so is 0 over 0: neither is between any bounds.
+        root = math.sqrt(middle**2 - 4.0 * bend * last)
+        roots[0, a] = (-middle - root) / (2.0 * bend)
+        roots[1, a] = (-middle + root) / (2.0 * bend)
+
+
+def best_seeds(
+    flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int, most: int
+) -> tuple[Array, Indices]:
+    """Return the planes that explain most images, shape (most, 5) or less, and how many each does."""
+    count, misfit, mark = explained_by(flares, parents, images, seeds, kind)
+    chosen = _chosen(seeds, count, misfit, mark, most)
+    return seeds[chosen], count[chosen]
+
+
+@compiled
+def _chosen(seeds: Array, count: Indices, misfit: Array, mark: Indices, most: int) -> Indices:
+    """Return which planes to try, the best first."""
+    taken = np.zeros(len(seeds), dtype=np.bool_)
+    chosen = np.empty(min(most, len(seeds)), dtype=np.int64)
+    ranks = 0
+    while ranks < len(chosen):
+        best = -1
+        for seed in range(len(seeds)):
+            if not taken[seed] and (
+                best < 0
+                or count[seed] > count[best]
+                or (count[seed] == count[best] and misfit[seed] < misfit[best])
+            ):
+                best = seed
+        if best < 0:
+            break
+        chosen[ranks] = best
+        ranks += 1
+        # Planes close by would be the same one again, and those of the same pairs are fitted to it.
+        for seed in range(len(seeds)):
+            apart = abs(seeds[seed, 3] - seeds[best, 3])
+            for k in range(3):
+                apart += abs(seeds[seed, k] - seeds[best, k])
+            same_pairs = count[seed] == count[best] and mark[seed] == mark[best]
+            taken[seed] |= apart < SAME_PLANE or same_pairs
+    return chosen[:ranks]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perception.rig.pose.layout import Posterior
+from perception.rig.pose.posterior import Posterior
 from perception.types import Layout
 
 MOST_TOGETHER = 10

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nir_render.evaluate.headings import heading_numbers
+from nir_render.evaluate.headings import heading_numbers, stands_of
 from nir_render.truth.poses import PoseTruth
 from perception import PoseHypothesis, RobotPose
 
@@ -39,7 +39,8 @@ def _numbers(*hypotheses: PoseHypothesis, owners: tuple[str, str] = ("r2", "r2")
         )
         for owner, flare in zip(owners, flares, strict=True)
     ]
-    return heading_numbers([RobotPose("r1", 0.5, "two", flares, 1.0, hypotheses)], scores, "robust", POSES)
+    told = [RobotPose("r1", 0.5, "two", flares, 1.0, hypotheses)]
+    return heading_numbers(stands_of(told, [[("r1.front", 0)]], scores, "robust", POSES))
 
 
 def test_the_error_and_its_nees() -> None:

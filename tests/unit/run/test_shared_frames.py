@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nir_render.errors import InputError
-from nir_render.run.calibrate import FITTED_FILE, calibrate_run
+from nir_render.run.calibrate import FITTED_FILE, PAGE, calibrate_run
 from nir_render.run.perceive import chosen_estimators, perceive_run
 from perception import calibration_document, encode_png16, frame_record, parse_calibration_document
 from perception.files.detections import parse_causes
@@ -92,6 +92,8 @@ def test_a_camera_that_stands_otherwise_is_set_right(recording: Path) -> None:
     record = rig.record()
     assert record["cameras"]["r1.left"]["turned_sigma_rad"] == pytest.approx(sigma)
     json.dumps(record)
+    page = (recording / PAGE).read_text()
+    assert f"{rig.flares} flares that two cameras share tell the others" in page
 
 
 def test_shared_frames_of_one_camera_or_with_ranges_are_refused(recording: Path) -> None:
