@@ -213,22 +213,32 @@ class SceneDocument(Document):
     @model_validator(mode="before")
     @classmethod
     def _expand_materials(cls, data: Any, info: ValidationInfo) -> Any:
-        """Let shapes name a preset of `data/materials` that the scene itself does not define."""
-        if not isinstance(data, dict) or not isinstance(data.get("shapes"), dict):
+        """Let materials stand on a preset of `data/materials`, and shapes name one that the scene does not.
+
+        `wall: concrete`, `wall: {preset: concrete, deviation: 1}`; what is called as a preset and is of no
+        type of its own is that one, changed: `concrete: {deviation: 1}`.
+        """
+        if not isinstance(data, dict) or not isinstance(data.get("materials") or {}, dict):
             return data
-        if not isinstance(data.get("materials") or {}, dict):
-            return data
+        folder = info.context["folder"] if info.context else Path()
+        known = set(preset_names("materials"))
         materials = dict(data.get("materials") or {})
+        for name, written in materials.items():
+            if isinstance(written, dict) and not written.keys() & {"type", "preset"} and name in known:
+                written = {"preset": name, **written}
+            try:
+                materials[name] = expand_preset(written, "materials", folder)
+            except ValueError as error:
+                raise ValueError(f"materials.{name}: {error}") from None
         named: set[str] = set()
-        for shape in data["shapes"].values():
+        for shape in data["shapes"].values() if isinstance(data.get("shapes"), dict) else ():
             if isinstance(shape, dict):
                 of_slots = shape.get("materials")
                 named |= {str(shape.get("material"))}
                 named |= set(map(str, of_slots.values())) if isinstance(of_slots, dict) else set()
-        for name in sorted(named & set(preset_names("materials")) - set(materials)):
-            folder = info.context["folder"] if info.context else Path()
+        for name in sorted(named & known - set(materials)):
             materials[name] = expand_preset(name, "materials", folder)
-        return {**data, "materials": materials}
+        return {**data, "materials": materials} if materials else data
 
     @model_validator(mode="after")
     def _expand_materials_of_bodies(self, info: ValidationInfo) -> Self:
