@@ -243,7 +243,7 @@ def at_wavelength(material: MaterialDocument, wavelength_m: float) -> MaterialDo
     return material.model_copy(update=numbers) if numbers else material
 
 
-def number(share: float | CurveDocument) -> float:
+def number(share: float | CurveDocument | TextureDocument) -> float:
     """Return a value of a material that is known at one wavelength (`at_wavelength`)."""
     assert isinstance(share, float)
     return share

@@ -51,7 +51,7 @@ def _read(file: str, _changed_ns: int, _size: int) -> NDArray[np.float64]:
     values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None or values.ndim != 2:
         raise ValueError(f"{file}: cannot be read as a grey picture; {_REMEDY}")
-    grey = values.astype(np.float64) / (2**bits - 1)
+    grey: NDArray[np.float64] = values.astype(np.float64) / (2**bits - 1)
     grey.setflags(write=False)
     return grey
 

@@ -47,7 +47,7 @@ class Coefficients:
         """The observation angle beyond which nothing goes back."""
         if len(self.observation_rad) == 1:
             return min(2.0 * float(self.observation_rad[0]), _MOST_ANGLE_RAD)
-        steepness = -self._last_slopes().max()
+        steepness = -float(self._last_slopes().max())
         reach = -math.log(_FAINT) / max(steepness, 1e-9)
         return min(float(self.observation_rad[-1]) + reach, _MOST_ANGLE_RAD)
 
@@ -139,6 +139,11 @@ def check_coefficients(
             raise ValueError(f"{name}: wanted increasing angles, such as '[0.2, 1] deg'")
         if not 0.0 <= angles[0] <= angles[-1] <= math.radians(most):
             raise ValueError(f"{name}: wanted angles from 0 to {most:g} deg")
+    if entrance_rad[0] < observation_rad[-1]:
+        raise ValueError(
+            "entrance: the observer of ASTM E810 is between light and normal: wanted angles of at least "
+            f"{math.degrees(observation_rad[-1]):g} deg, the largest of 'observation'; 5 deg is usual"
+        )
     if observation_rad[0] <= 0.0 and len(observation_rad) == 1:
         raise ValueError("observation: one angle alone must be above 0; write such as '[0.2, 1] deg'")
     if len(rows) != len(observation_rad) or {len(row) for row in rows} != {len(entrance_rad)}:
