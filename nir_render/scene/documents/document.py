@@ -1,5 +1,6 @@
 """The model of a whole scene file."""
 
+import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -257,10 +258,10 @@ class SceneDocument(Document):
     def _names_exist(self) -> Self:
         for place, shape in self.all_shapes().items():
             if shape.material not in self.materials:
-                known = ", ".join([*self.materials, *preset_names("materials")]) or "none"
-                raise ValueError(
-                    f"{place}.material: there is no material {shown(shape.material)}; known: {known}"
-                )
+                known = list(dict.fromkeys([*self.materials, *preset_names("materials")]))
+                near = difflib.get_close_matches(shape.material, known, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+                raise ValueError(f"{place}.material: there is no material {shown(shape.material)}; {hint}")
         for name in self.observe:
             if not self.cameras_of(name):
                 known = ", ".join(

@@ -47,7 +47,7 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"shapes.w": _wall(colour=[1, 0, 0])}, "shapes.w: 'colour': RGB colours have no meaning at 940 nm"),
     ({"shapes.w": _wall(size="[-1, 1] m")}, "shapes.w.size: each extent must be greater than 0"),
     ({"shapes.w": _wall(normal=[0, 0, 0])}, "shapes.w.normal: a direction must not be [0, 0, 0]"),
-    ({"shapes.w": _wall(material="blakc")}, "shapes.w.material: there is no material 'blakc'; known: black"),
+    ({"shapes.w": _wall(material="blakc")}, "shapes.w.material: there is no material 'blakc'; did you mean 'black'?"),
     ({"shapes.w": _wall(type="rectangel")}, "shapes.w: there is no type 'rectangel'; did you mean 'rectangle'?"),
     ({"materials.m": {"type": "diffuse", "reflectance": [0.8, 0.1, 0.1]}}, "RGB colours have no meaning at 940 nm"),
     ({"materials.m": {"type": "diffuse", "reflectance": "#ff0000"}}, "RGB colours have no meaning at 940 nm"),

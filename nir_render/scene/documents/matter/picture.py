@@ -78,7 +78,7 @@ def _checked(data: bytes) -> int:
             width, height, bits, colours = struct.unpack_from(">IIBB", body)
             if colours != 0:
                 raise ValueError(
-                    f"holds {_KINDS.get(colours, 'an unknown kind of colours')}, which mean nothing at 940 nm; "
+                    f"holds {_KINDS.get(colours, 'unknown colours')}, which mean nothing at 940 nm; "
                     "wanted a grey PNG of reflectance in the band"
                 )
             if bits not in (8, 16):
