@@ -67,8 +67,12 @@ def _form(value: Any) -> str:
 
 
 def _share(curve: CurveDocument) -> CurveDocument:
-    if curve.points is None or max(value for _, value in curve.points) > 1.0:
-        raise ValueError("wanted 'points' or 'file': values from 0 to 1 over wavelength, or one number")
+    wanted = "wanted 'points' or 'file': values from 0 to 1 over wavelength, or one number"
+    if curve.points is None:
+        raise ValueError(wanted)
+    above = [(place_m, value) for place_m, value in curve.points if value > 1.0]
+    if above:
+        raise ValueError(f"{above[0][1]:g} at {1e9 * above[0][0]:g} nm is above 1; {wanted}")
     return curve
 
 

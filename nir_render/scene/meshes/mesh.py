@@ -49,12 +49,14 @@ def checked(part: MeshPart) -> MeshPart:
     named = f" of the slot {part.slot!r}" if part.slot else ""
     off = np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))
     if len(off):
-        raise ValueError(f"vertex {off[0] + 1}{named} is not finite: {_row(part.vertices[off[0]])}")
+        raise ValueError(
+            f"vertex {off[0] + 1}{named} is not finite: {_row(part.vertices[off[0]])}; export the mesh again"
+        )
     beyond = np.flatnonzero((part.faces >= len(part.vertices)).any(axis=1))
     if len(beyond):
         raise ValueError(
             f"triangle {beyond[0] + 1}{named} wants vertex {int(part.faces[beyond[0]].max()) + 1}, but there "
-            f"are {len(part.vertices)}"
+            f"are {len(part.vertices)}; export the mesh again"
         )
     normals = part.normals
     if normals is not None:

@@ -47,7 +47,7 @@ def read_obj(text: str) -> list[MeshPart]:
                 corners = [_corner(one, len(vertices), len(normals), len(uvs)) for one in rest.split()]
                 slots.setdefault(slot, []).extend(_triangles(corners, vertices))
         except ValueError as error:
-            raise ValueError(f"line {number}: {line[:60]!r}: {error}") from None
+            raise ValueError(f"line {number}: {line[:60]!r}: {error}; export the mesh again") from None
     return [_part(name, found, vertices, normals, uvs) for name, found in slots.items()]
 
 
@@ -68,12 +68,20 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _numbers(rest: str, count: int = 3) -> tuple[float, ...]:
-    values = tuple(float(one) for one in rest.split()[:count])
+    values = tuple(_number(one, float) for one in rest.split()[:count])
     if len(values) < count:
         raise ValueError(f"{'three' if count == 3 else 'two'} numbers are wanted")
     if not np.isfinite(values).all():
         raise ValueError("the numbers must be finite")
     return values
+
+
+def _number(written: str, kind: type[float]) -> float:
+    try:
+        return kind(written)
+    except (ValueError, OverflowError):
+        what = "whole number" if kind is int else "number"
+        raise ValueError(f"{written[:20]!r} is no {what}") from None
 
 
 def _corner(written: str, vertices: int, normals: int, uvs: int) -> _Corner:
@@ -86,7 +94,7 @@ def _corner(written: str, vertices: int, normals: int, uvs: int) -> _Corner:
 
 def _index(written: str, count: int, one: str, many: str) -> int:
     """Return an index from 0: a file counts from 1, and back from the last where it is negative."""
-    index = int(written)
+    index = int(_number(written, int))
     if not 1 <= abs(index) <= count:
         raise ValueError(f"there is no {one} {index}: {count} {many} stand above this line")
     return index - 1 if index > 0 else count + index

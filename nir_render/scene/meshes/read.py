@@ -74,10 +74,12 @@ def _parts(data: bytes, kind: str) -> list[MeshPart]:
             raise ValueError(
                 f"cannot be read as {kind}: it claims to hold more than fits; export it again"
             ) from None
-        except Exception as error:  # of any kind: what is damaged meets trimesh's parsers anywhere
-            told = " ".join(str(error).split())[:120] or type(error).__name__
+        except Exception:  # of any kind: what is damaged meets trimesh's parsers anywhere
             other = "; with buffers in files beside it, export as .glb" if kind == "gltf" else ""
-            raise ValueError(f"cannot be read as {kind} ({told}); export the mesh again{other}") from None
+            raise ValueError(
+                f"cannot be read as {kind}: this is another kind of file, or is damaged; export the mesh "
+                f"again{other}"
+            ) from None
 
 
 def _read_by_trimesh(data: bytes, kind: str) -> list[MeshPart]:
