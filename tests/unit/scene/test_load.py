@@ -350,3 +350,10 @@ def test_cameras_are_selected_by_robot_or_by_name(scene: Scene) -> None:
     ]  # fmt: skip
     with pytest.raises(InputError, match=r"there is no camera 'r1\.fornt'; known: r1\.front"):
         scene.camera("r1.fornt")
+
+
+def test_the_largest_scene_loads_again_when_all_is_written_out(tmp_path: Path) -> None:
+    """Thirty robots with all that presets stand for: 17 000 lines, which a run keeps as scene.yaml."""
+    scene = load_scene(SCENES / "swarm_30.yaml")
+    (tmp_path / "scene.yaml").write_text(scene.resolved_yaml(), encoding="utf-8")
+    assert load_scene(tmp_path / "scene.yaml").document == scene.document
