@@ -69,7 +69,7 @@ def _metal(written: dict[str, Any]) -> float:
     facets = width / (math.pi * (1.0 + (width - 1.0) * cosine**2) ** 2)
     seen = 2.0 / (1.0 + np.sqrt(1.0 + width * np.tan(2.0 * theta) ** 2))
     value = 0.5 * (s_part + p_part) * facets * seen * cosine * np.sin(theta)
-    return float(2.0 * math.pi * np.trapezoid(value, theta)) * written.get("share", 1.0)
+    return float(2.0 * math.pi * np.trapezoid(value, theta)) * float(written.get("share", 1.0))
 
 
 def _figure(name: str, wavelength_nm: float) -> float:

@@ -30,7 +30,7 @@ def _radiance(folder: Path, shape: dict[str, Any], reflectance: Any) -> Array:
     placed = world.camera("eye.c")
     light = indirect(world, rays_of(placed.camera, placed.pose), 1, np.ones(1))
     assert light is not None
-    return light.radiance_per_w[0, 0].astype(np.float64)
+    return np.asarray(light.radiance_per_w[0, 0], dtype=np.float64)
 
 
 def _bilinear(wrap: str) -> Array:

@@ -52,7 +52,9 @@ def table() -> str:
 
 def test_the_table_of_materials_is_that_of_the_files() -> None:
     text = (ROOT / "docs" / "scene_files.md").read_text(encoding="utf-8")
-    assert table() in text, "run: python -m tests.unit.test_material_table, and put it into docs/scene_files.md"
+    assert table() in text, (
+        "run: python -m tests.unit.test_material_table, and put it into docs/scene_files.md"
+    )
 
 
 if __name__ == "__main__":

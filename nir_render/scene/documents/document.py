@@ -258,9 +258,9 @@ class SceneDocument(Document):
     def _names_exist(self) -> Self:
         for place, shape in self.all_shapes().items():
             if shape.material not in self.materials:
-                known = list(dict.fromkeys([*self.materials, *preset_names("materials")]))
-                near = difflib.get_close_matches(shape.material, known, n=1)
-                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+                names = list(dict.fromkeys([*self.materials, *preset_names("materials")]))
+                near = difflib.get_close_matches(shape.material, names, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names)}"
                 raise ValueError(f"{place}.material: there is no material {shown(shape.material)}; {hint}")
         for name in self.observe:
             if not self.cameras_of(name):
