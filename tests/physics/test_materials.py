@@ -241,6 +241,36 @@ def test_tape_shows_a_robot_its_own_source(beside_m: float) -> None:
     assert float((radiance * solid).sum()) == pytest.approx(expected, rel=0.004)
 
 
+def test_the_ground_of_tape_varies_with_the_wavelength_and_its_lobe_does_not() -> None:
+    """Two nodes, ground 0.1 and 0.4: radiances differ by 0.3/π E alone, a thousandth of the lobe: to 2 %."""
+    tape = {**_written(TAPE), "reflectance": {"points": [["900 nm", 0.1], ["1000 nm", 0.4]]}}
+    document = {**_tape_document((0.0, 0.03, 0.0)), "materials": {TAPE: tape}}
+    world = parse_scene(document).at(0.0)
+    placed = world.camera("eye.c")
+    rays = rays_of(placed.camera, placed.pose)
+    light = indirect(world, rays, 1, np.ones(1), wavelengths_m=(900e-9, 1000e-9))
+    assert light is not None
+    low, high = (light.radiance_per_w[0, node, 6:10, 6:10].astype(np.float64).mean() for node in (0, 1))
+    irradiance = 1.0 / (4.0 * math.pi * 9.0)
+    assert high - low == pytest.approx(0.3 / math.pi * irradiance, rel=0.02)
+    column = np.log([330.0, 250.0, 25.0, 10.0])
+    back = math.exp(np.interp(math.degrees(0.01), [0.2, 0.33, 1.0, 1.5], column))
+    assert low == pytest.approx((back + 0.1 / math.pi) * irradiance, rel=0.01)
+
+
+def test_tape_shines_back_through_fog() -> None:
+    """Thin fog that only absorbs: both ways are 3 m of 0.1 per m, e^−0.6 of the clear view; 0.4 %."""
+    clear = _tape_document((0.0, 0.03, 0.0))
+    totals = []
+    for document in (clear, {**clear, "fog": {"extinction": "0.1 /m", "albedo": 0}}):
+        world = parse_scene(document).at(0.0)
+        placed = world.camera("eye.c")
+        light = indirect(world, rays_of(placed.camera, placed.pose), 1, np.ones(1))
+        assert light is not None
+        totals.append(float(light.radiance_per_w[0, 0].sum(dtype=np.float64)))
+    assert totals[1] / totals[0] == pytest.approx(math.exp(-0.6), rel=0.004)
+
+
 @pytest.mark.verify
 def test_planes_under_an_even_sky_are_as_bright_as_their_files_say() -> None:
     """An integrating arrangement: tiles of all materials under CIE's uniform sky, seen from straight above.
