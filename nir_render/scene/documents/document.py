@@ -230,7 +230,8 @@ class SceneDocument(Document):
             try:
                 materials[name] = expand_preset(written, "materials", folder)
             except ValueError as error:
-                raise ValueError(f"materials.{name}: {error}") from None
+                place = name if re.fullmatch(r"[\w-]{1,100}", str(name)) else shown(name)
+                raise ValueError(f"materials.{place}: {error}") from None
         named: set[str] = set()
         for shape in data["shapes"].values() if isinstance(data.get("shapes"), dict) else ():
             if isinstance(shape, dict):
