@@ -38,6 +38,7 @@ from nir_render.spectra.lambert import polygon_share
 __all__ = ["Clock", "Robot", "SceneDocument", "Waypoint"]
 
 DEFAULT_NOISE = 0.05
+_MOST_NAMED = 40  # of what is known, in a message
 _LARGEST_SEED = 2**63 - 1
 _LEAST_PERCENT, _MOST_PERCENT = 0.1, 100.0
 _NOISE_EXAMPLE = "5 % of temporal variance"
@@ -265,9 +266,11 @@ class SceneDocument(Document):
                 raise ValueError(f"{place}.material: there is no material {shown(shape.material)}; {hint}")
         for name in self.observe:
             if not self.cameras_of(name):
-                known = ", ".join(
+                names = [
                     f"{robot}.{camera}" for robot in self.robots for camera in self.robots[robot].rig.cameras
-                )
+                ]
+                known = ", ".join(names[:_MOST_NAMED])
+                known += f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
                 raise ValueError(
                     f"observe: there is no robot or camera {shown(name)}; known cameras: {known or 'none'}"
                 )
