@@ -1,7 +1,7 @@
 """Documents as careless people and broken tools write them: what each of thousands of mutations is told.
 
-Each document is a scene or campaign of `scenes/`, changed in one to three places, by a generator that is keyed
-by (seed, index): `python -m tests.fuzz --count 10000 --seed 1` prints one JSON object. A document is right, or
+Each document is a scene or campaign of `scenes/`, changed in one to three places, or one whose mesh, curve, picture
+or pattern is damaged, by a generator that is keyed by (seed, index): `python -m tests.fuzz --count 10000 --seed 1` prints one JSON object. A document is right, or
 refused with problems that name the place and a remedy in our own words, in less than 5 s of CPU time.
 """
 
@@ -16,7 +16,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,12 @@ import yaml
 
 from nir_render import InputError, load_scene
 from nir_render.stress.campaign import is_campaign, load_campaign
+from tests.damaged_files import good_files, write_damaged
 from tests.paths import SCENES
 
 MOST_SECONDS = 5.0
 MOST_CHARACTERS = 2000
+_FILES_EACH = 4  # every fourth document is right, and names a file that is not
 # As quick as there are here: only the mutations read and write with them.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -41,7 +43,8 @@ RAW = re.compile(
 )
 REMEDY = re.compile(
     r"such as|wanted|did you mean|[Kk]nown|write|take |give|leave|use |put |check|must |choose|lower|shorten|raise |"
-    r"move|this key is missing|should be|define|set |wants|at least|at most|see |look|indent|lengthen"
+    r"move|this key is missing|should be|define|set |wants|at least|at most|see |look|indent|lengthen|[Ee]xport |unwrap |simplify |"
+    r"sort "
 )
 UNITS = ("m", "mm", "nm", "s", "ms", "Hz", "deg", "rad", "W", "K", "e", "DN", "DN/e", "e/s", "px", "bit", "%", "/m", "",
          "kg", "parsnip", "W/m^2/nm", "m/K", "°", "µm", "lm", "m^99", "m/", "((", "2 m")  # fmt: skip
@@ -83,10 +86,18 @@ def fuzz(
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(scene, target)
     sources = sorted(path.relative_to(folder) for path in folder.rglob("*.yaml"))
+    files = folder / "files"
+    files.mkdir(exist_ok=True)
+    good = good_files()
     summary = Summary()
     started = time.perf_counter()
     for index in indices:
         draw = random.Random(f"{seed}:{index}")
+        if index % _FILES_EACH == _FILES_EACH - 1:
+            _judge_file(files, good, draw, index, summary)
+            if index % 100 == 99:
+                tell(summary)
+            continue
         source = sources[draw.randrange(len(sources))]
         path = (folder / source).with_name("mutant.yaml")
         path.write_text(
@@ -105,8 +116,26 @@ def fuzz(
     return summary
 
 
-def _judge(path: Path, index: int, again: bool, summary: Summary) -> None:
-    """Read a document, and hold what is told of it against what is wanted."""
+def _judge_file(
+    folder: Path, good: Mapping[str, bytes], draw: random.Random, index: int, summary: Summary
+) -> None:
+    """Read a scene whose file is damaged: what is told names the field and the file too."""
+    path, name = write_damaged(folder, good, draw)
+    try:
+        problems = _judge(path, index, False, summary)
+    except Exception:
+        summary.failures.append({"index": index, "source": name, "what": traceback.format_exc()[-1500:]})
+        return
+    for problem in problems:
+        said = problem.removeprefix(str(path))
+        if not re.search(r"(materials\.m|shapes\.(body|wall)|robots\.r2\.rig\.sources\.top)", said):
+            summary.failures.append({"index": index, "what": f"names no field: {said}"[:1500]})
+        if name not in said and not re.search(r"[\d.]+ nm is above 1", said):  # a curve has become points
+            summary.failures.append({"index": index, "what": f"names no file: {said}"[:1500]})
+
+
+def _judge(path: Path, index: int, again: bool, summary: Summary) -> tuple[str, ...]:
+    """Read a document, and hold what is told of it against what is wanted; return that."""
 
     def fail(what: str) -> None:
         summary.failures.append({"index": index, "what": what[:1500]})
@@ -147,6 +176,7 @@ def _judge(path: Path, index: int, again: bool, summary: Summary) -> None:
         path.write_text(scene.resolved_yaml(), encoding="utf-8")
         if load_scene(path).document != scene.document:
             fail("the resolved document is another scene")
+    return problems
 
 
 def mutated(text: str, draw: random.Random) -> str:

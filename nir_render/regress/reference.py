@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.light.light import Light
+from nir_render.scene.documents.materials import texture_of
 from nir_render.scene.documents.shapes import Mesh
 from nir_render.scene.scene import Scene
 from nir_render.transport.fingerprint import code_hash, package_versions
@@ -93,14 +94,27 @@ class Reference:
 
 
 def document_of(scene: Scene) -> dict[str, Any]:
-    """Return a scene with everything expanded as plain data; a mesh by its name beside the scene and hash."""
+    """Return a scene with everything expanded as plain data.
+
+    Meshes and pictures are told by their names beside the scene, and by their hashes.
+    """
     data = scene.document.model_dump(mode="json", by_alias=True, exclude_none=True)
     for name, shape in scene.document.shapes.items():
         if isinstance(shape, Mesh):
-            file = Path(shape.file)
-            data["shapes"][name]["file"] = Path(os.path.relpath(file, scene.folder)).as_posix()
-            data["shapes"][name]["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+            data["shapes"][name] |= _told_file(scene, "file", shape.file)
+    for name, material in scene.document.materials.items():
+        texture = texture_of(material)
+        if texture is not None:
+            data["materials"][name]["reflectance"] |= _told_file(scene, "texture", texture.texture)
     return data
+
+
+def _told_file(scene: Scene, key: str, name: str) -> dict[str, str]:
+    file = Path(name)
+    return {
+        key: Path(os.path.relpath(file, scene.folder)).as_posix(),
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+    }
 
 
 def changes_of(before: Mapping[str, Any], after: Mapping[str, Any]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from nir_render.run.folder import disk_error, write_file
 FIRST_SCENE = "one_source.yaml"
 """The scene to run first: it takes a second."""
 
-_KINDS = (".yaml", ".json", ".py", ".cpp", ".obj")
+_KINDS = (".yaml", ".json", ".py", ".cpp", ".obj", ".png")
 _LEFT_OUT = {
     "__pycache__",
     "references",

@@ -10,6 +10,7 @@ import numpy as np
 from nir_render.camera.optics.leak import Leak, leak
 from nir_render.camera.render_noise import RenderNoise
 from nir_render.light.light import Light
+from nir_render.scene.documents.shapes import Mesh
 from nir_render.scene.emission import emission_spectrum, emission_units
 from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import Shot
@@ -122,6 +123,35 @@ def ambient_facts(scene: Scene) -> dict[str, Any] | None:
             "why_not": "direct light alone: what walls reflect over 380 to 780 nm is not reckoned",
         }
     return facts or None
+
+
+def material_facts(scene: Scene) -> dict[str, Any]:
+    """Return how well each material that is used is known, and which material each slot of a mesh is of.
+
+    `basis` is null where a scene gives figures without evidence. A slot without a name is "".
+    """
+    document = scene.document
+    used = dict.fromkeys(shape.material for shape in document.all_shapes().values())
+    known = {}
+    for name in used:
+        material = document.materials[name]
+        evidence = material.evidence
+        known[name] = {
+            "type": material.type,
+            "basis": None if evidence is None else evidence.basis,
+            "uncertainty": None if evidence is None else evidence.uncertainty,
+            "deviation": material.deviation,
+            "source": None if evidence is None else evidence.source,
+        }
+    slots: dict[str, dict[str, str]] = {}
+    bodies = {f"shapes.{name}": shape for name, shape in document.shapes.items()}
+    for robot, carrier in document.robots.items():
+        bodies |= {f"robots.{robot}.rig.body.{name}": shape for name, shape in carrier.rig.body.items()}
+    for place, shape in bodies.items():
+        if isinstance(shape, Mesh):
+            of_slots = shape.materials or {}
+            slots[place] = {part.slot: of_slots.get(part.slot, shape.material) for part in shape.parts()}
+    return {"known": known, "slots": slots}
 
 
 def refresh_facts(scene: Scene, measured: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nir_render.errors import shown
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
-from nir_render.scene.documents.materials import Dielectric, Pane
+from nir_render.scene.documents.materials import Dielectric, Pane, texture_of
 from nir_render.scene.documents.sensor import Sensor
 from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, ShapeDocument, Sphere
 from nir_render.scene.documents.times.clocks import JITTER_SIGMAS, CameraClock
@@ -41,6 +41,7 @@ def check(document: SceneDocument) -> list[str]:
     return [
         *_flat_cylinders(document),
         *_sheets_and_solids(document),
+        *_pictures_without_a_place(document),
         *_fog_up_to_the_sun(document),
         *_indivisible_sensors(document),
         *_exposures_beyond_the_clock(document),
@@ -166,6 +167,22 @@ def _sheets_and_solids(document: SceneDocument) -> list[str]:
                     f"{place}.material: {shown(shape.material)} is a solid dielectric, and {shape.file} "
                     f"has no inside: {open_by}"
                 )
+    return problems
+
+
+def _pictures_without_a_place(document: SceneDocument) -> list[str]:
+    """Tell of bodies of a material with a picture, on which nothing says what lies where."""
+    problems = []
+    for place, shape in document.all_shapes().items():
+        if texture_of(document.materials[shape.material]) is None or isinstance(shape, Rectangle):
+            continue
+        if isinstance(shape, Mesh) and all(part.uvs is not None for part in shape.parts()):
+            continue
+        what = f"{shape.file} has no uv coordinates" if isinstance(shape, Mesh) else f"not a {shape.type}"
+        problems.append(
+            f"{place}.material: {shown(shape.material)} is a picture, which lies on rectangles and on meshes "
+            f"whose file has uv coordinates (OBJ, glTF); {what}: unwrap it, or take another material"
+        )
     return problems
 
 

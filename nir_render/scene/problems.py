@@ -178,6 +178,8 @@ def _document_keys(location: tuple[int | str, ...], raw: Any) -> tuple[tuple[str
             continue
         if part == "[key]":
             continue
+        if keys[:1] == ["materials"] and len(keys) == 2 and not within and "type" not in (node or {}):
+            continue  # the type that its preset is of
         if not within and isinstance(part, str) and _BRANCH.fullmatch(part):
             branch_at = len(keys) if branch_at is None else branch_at
             continue

@@ -14,6 +14,7 @@ from nir_render.scene.checks import check
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.emitters import Source
+from nir_render.scene.documents.materials import realised
 from nir_render.scene.emission import Emitter, light_groups
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
@@ -103,7 +104,7 @@ class Scene:
                 for name, robot in document.robots.items()
             },
             standing=shapes_at(document.shapes, time_s),
-            materials=document.materials,
+            materials={name: realised(material) for name, material in document.materials.items()},
             lamps=document.shining_lamps,
             sun=document.sun,
             fog=document.fog,

@@ -39,6 +39,7 @@ def scene_schema() -> dict[str, Any]:
         if model.__name__ in definitions:
             definitions[model.__name__] = _or_preset(definitions[model.__name__], model.preset_folder)
     _describe_curves(definitions)
+    _describe_materials(schema)
     fog = definitions["Fog"]
     fog["properties"]["visibility"] = {**fog["properties"]["extinction"], "examples": [VISIBILITY.example]}
     fog["properties"]["visibility"]["description"] = "3.912 / extinction at 550 nm, in place of it"
@@ -57,6 +58,22 @@ def _or_speed(definition: dict[str, Any], key: str) -> None:
     definition["properties"]["speed"] = {"type": "string", "examples": [SPEED.example]}
     definition["required"].remove(key)
     definition["oneOf"] = [{"required": [key]}, {"required": ["speed"]}]
+
+
+def _describe_materials(schema: dict[str, Any]) -> None:
+    """Let a material be a preset's name, or stand on one; and tables of tape be written as they are read."""
+    (written,) = schema["properties"]["materials"]["patternProperties"].values()
+    any_type = {**written, "anyOf": written["oneOf"]}
+    del any_type["oneOf"]
+    named = _or_preset({"title": "Material", "type": "object", "properties": {}}, "materials")["anyOf"]
+    changed = {"type": "object", "not": {"required": ["type"]}, "properties": named[1]["properties"]}
+    written.clear()
+    written["anyOf"] = [any_type, named[0], changed]
+    properties = schema["$defs"]["Retroreflector"]["properties"]
+    for key in ("observation", "entrance"):
+        properties[key] = {
+            "type": "string", "pattern": r"^\s*\[.*\]\s*\S+\s*$", "examples": ["[0.2, 1] deg"],
+        }  # fmt: skip
 
 
 def _describe_curves(definitions: dict[str, Any]) -> None:
@@ -85,6 +102,7 @@ def _describe_curves(definitions: dict[str, Any]) -> None:
         ("Mirror", "reflectance"),
         ("Plastic", "reflectance"),
         ("Pane", "transmission"),
+        ("Retroreflector", "reflectance"),
     ):
         either = definitions[name]["properties"][key]
         either["anyOf"] = either.pop("oneOf")  # a curve may be a number too

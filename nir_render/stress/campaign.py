@@ -22,6 +22,7 @@ from nir_render.stress.metrics import METRICS, Bound, known_metric, parse_bound
 
 MOST_JOBS = 100_000
 _MOST_CHECKED = 200  # values of axes, each of which makes a scene
+_LONGEST_NAME = 400  # of an estimator, with its file and folder
 _DEFAULT_METRICS = ("range_rmse", "recall", "ranged", "false_alarms")
 
 
@@ -287,6 +288,9 @@ def _not_estimators(names: Sequence[str]) -> list[str]:
     """Return what is wrong with estimators: unknown ones, files that cannot be loaded, two of one name."""
     from nir_render.run.perceive import frame_estimators
 
+    longest = max(names, key=len)
+    if len(longest) > _LONGEST_NAME:
+        return [f"{shown(longest)} is too long for an estimator; give one such as robust or file.py:function"]
     try:
         frame_estimators(names)
     except InputError as error:

@@ -29,6 +29,8 @@ from nir_render.camera.optics.lens import corner_directions
 from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.fog import Fog
+from nir_render.scene.documents.materials import MaterialDocument
+from nir_render.scene.documents.matter.texture import TextureDocument
 from nir_render.scene.documents.shapes import Mesh, ShapeDocument
 from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter
@@ -83,7 +85,7 @@ def geometry_key(site: Site) -> str:
     return digest(
         {
             "shapes": [
-                (name, _shape(shape), snapshot.materials[shape.material])
+                (name, _shape(shape), _material(snapshot.materials[shape.material]))
                 for name, shape in snapshot.shapes.items()
             ],
             "lamps": [
@@ -177,10 +179,28 @@ def _shape(shape: ShapeDocument) -> tuple[str, dict[str, Any]]:
     """Return a shape without the name of its material, and a mesh by what its file holds."""
     fields = {name: getattr(shape, name) for name in type(shape).model_fields if name not in _ELSEWHERE}
     if isinstance(shape, Mesh):
-        file = Path(shape.file)
-        state = file.stat()
-        fields["file"] = (file.suffix.lower(), _content(str(file), state.st_mtime_ns, state.st_size))
+        fields["file"] = _file(shape.file)
     return type(shape).__name__, fields
+
+
+def _material(material: MaterialDocument) -> tuple[str, dict[str, Any]]:
+    """Return a material by what it does to light, and a picture by what its file holds.
+
+    What it does not say, as all materials once did not, does not count: others keep their random numbers.
+    """
+    fields = {name: getattr(material, name) for name in type(material).model_fields}
+    kept = {name: value for name, value in fields.items() if name != "evidence" and value is not None}
+    for name, value in kept.items():
+        if isinstance(value, TextureDocument):
+            kept[name] = (_file(value.texture), value.of)
+    return type(material).__name__, kept
+
+
+def _file(name: str) -> tuple[str, str]:
+    """Return a file's kind, and the hash of what it holds."""
+    file = Path(name)
+    state = file.stat()
+    return file.suffix.lower(), _content(str(file), state.st_mtime_ns, state.st_size)
 
 
 def _fog(fog: Fog | None) -> tuple[str, dict[str, Any]] | None:

@@ -17,9 +17,12 @@ from nir_render.scene.documents.materials import (
     Mirror,
     Pane,
     Plastic,
+    Retroreflector,
     RoughConductor,
     number,
+    texture_of,
 )
+from nir_render.scene.documents.matter.retroreflection import reflected_share
 from nir_render.scene.documents.shapes import Mesh, Rectangle
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
@@ -169,12 +172,18 @@ def _outlined(grey: Array, shape: NDArray[np.int64]) -> Array:
 
 def _grey(material: MaterialDocument) -> float:
     """Return what share of light a material sends back, about, where one looks straight at it."""
+    texture = texture_of(material)
+    if texture is not None:
+        return float(texture.reflectance().mean())
     match material:
         case Diffuse() | Mirror():
             return number(material.reflectance)
+        case Retroreflector():
+            return number(material.reflectance) + reflected_share(material.table())
         case RoughConductor():
             n, k = material.index, material.extinction_index
-            return ((n - 1.0) ** 2 + k**2) / ((n + 1.0) ** 2 + k**2)
+            share = 1.0 if material.share is None else material.share
+            return share * ((n - 1.0) ** 2 + k**2) / ((n + 1.0) ** 2 + k**2)
         case Plastic():
             coat = ((material.index - 1.0) / (material.index + 1.0)) ** 2
             return coat + (1.0 - coat) * number(material.reflectance)

@@ -31,7 +31,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.camera": ("timing", "sensor", "optics"),
     "nir_render.light": (),
     "nir_render.scene": ("documents", "meshes", "text"),
-    "nir_render.scene.documents": ("built", "ambient", "times", "spectral"),
+    "nir_render.scene.documents": ("built", "ambient", "times", "spectral", "matter"),
     "nir_render.truth": (),
     "nir_render.spectra": (),
     "nir_render.scattering": (),

@@ -173,6 +173,7 @@ _MEANT = {
     "cube": "box", "cuboid": "box", "ball": "sphere", "tube": "cylinder", "pole": "cylinder", "obj": "mesh",
     "ply": "mesh", "lambertian": "diffuse", "matte": "diffuse", "metal": "rough_conductor",
     "conductor": "rough_conductor", "glass": "dielectric", "window": "pane", "specular": "mirror",
+    "tape": "retroreflector", "retroreflective": "retroreflector",
     "hg": "henyey_greenstein",
 }  # fmt: skip
 

@@ -53,7 +53,10 @@ class CurveDocument(Document):
             known = ", ".join(map(repr, cls.forms[:-1]))
             raise ValueError(f"wanted one of {known} and {cls.forms[-1]!r}, not {forms}")
         if "file" in data:
-            points = read_curve(resolve_file(str(data["file"]), info), "wavelength_nm,value")
+            path = resolve_file(str(data["file"]), info)
+            points = read_curve(path, "wavelength_nm,value")
+            if len(points) < 2:
+                raise ValueError(f"{path}: holds {len(points)} lines of values; wanted at least two")
             others = {key: value for key, value in data.items() if key != "file"}
             return {**others, "points": [(f"{nm!r} nm", value) for nm, value in points]}
         return data

@@ -1,5 +1,6 @@
 """The model of a whole scene file."""
 
+import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ from nir_render.spectra.lambert import polygon_share
 __all__ = ["Clock", "Robot", "SceneDocument", "Waypoint"]
 
 DEFAULT_NOISE = 0.05
+_MOST_NAMED = 40  # of what is known, in a message
 _LARGEST_SEED = 2**63 - 1
 _LEAST_PERCENT, _MOST_PERCENT = 0.1, 100.0
 _NOISE_EXAMPLE = "5 % of temporal variance"
@@ -213,22 +215,33 @@ class SceneDocument(Document):
     @model_validator(mode="before")
     @classmethod
     def _expand_materials(cls, data: Any, info: ValidationInfo) -> Any:
-        """Let shapes name a preset of `data/materials` that the scene itself does not define."""
-        if not isinstance(data, dict) or not isinstance(data.get("shapes"), dict):
+        """Let materials stand on a preset of `data/materials`, and shapes name one that the scene does not.
+
+        `wall: concrete`, `wall: {preset: concrete, deviation: 1}`; what is called as a preset and is of no
+        type of its own is that one, changed: `concrete: {deviation: 1}`.
+        """
+        if not isinstance(data, dict) or not isinstance(data.get("materials") or {}, dict):
             return data
-        if not isinstance(data.get("materials") or {}, dict):
-            return data
+        folder = info.context["folder"] if info.context else Path()
+        known = set(preset_names("materials"))
         materials = dict(data.get("materials") or {})
+        for name, written in materials.items():
+            if isinstance(written, dict) and not written.keys() & {"type", "preset"} and name in known:
+                written = {"preset": name, **written}
+            try:
+                materials[name] = expand_preset(written, "materials", folder)
+            except ValueError as error:
+                place = name if re.fullmatch(r"[\w-]{1,100}", str(name)) else shown(name)
+                raise ValueError(f"materials.{place}: {error}") from None
         named: set[str] = set()
-        for shape in data["shapes"].values():
+        for shape in data["shapes"].values() if isinstance(data.get("shapes"), dict) else ():
             if isinstance(shape, dict):
                 of_slots = shape.get("materials")
                 named |= {str(shape.get("material"))}
                 named |= set(map(str, of_slots.values())) if isinstance(of_slots, dict) else set()
-        for name in sorted(named & set(preset_names("materials")) - set(materials)):
-            folder = info.context["folder"] if info.context else Path()
+        for name in sorted(named & known - set(materials)):
             materials[name] = expand_preset(name, "materials", folder)
-        return {**data, "materials": materials}
+        return {**data, "materials": materials} if materials else data
 
     @model_validator(mode="after")
     def _expand_materials_of_bodies(self, info: ValidationInfo) -> Self:
@@ -247,15 +260,17 @@ class SceneDocument(Document):
     def _names_exist(self) -> Self:
         for place, shape in self.all_shapes().items():
             if shape.material not in self.materials:
-                known = ", ".join([*self.materials, *preset_names("materials")]) or "none"
-                raise ValueError(
-                    f"{place}.material: there is no material {shown(shape.material)}; known: {known}"
-                )
+                names = list(dict.fromkeys([*self.materials, *preset_names("materials")]))
+                near = difflib.get_close_matches(shape.material, names, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names)}"
+                raise ValueError(f"{place}.material: there is no material {shown(shape.material)}; {hint}")
         for name in self.observe:
             if not self.cameras_of(name):
-                known = ", ".join(
+                names = [
                     f"{robot}.{camera}" for robot in self.robots for camera in self.robots[robot].rig.cameras
-                )
+                ]
+                known = ", ".join(names[:_MOST_NAMED])
+                known += f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
                 raise ValueError(
                     f"observe: there is no robot or camera {shown(name)}; known cameras: {known or 'none'}"
                 )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
+    ValidationError,
     ValidationInfo,
     field_serializer,
     field_validator,
@@ -177,18 +178,20 @@ def _read_grid(path: Path) -> dict[str, Any]:
     value_at = {}
     for polar_deg, azimuth_deg, value in read_csv(path, _PATTERN_HEADER):
         if (polar_deg, azimuth_deg) in value_at:
-            raise ValueError(f"{path}: polar {polar_deg:g}, azimuth {azimuth_deg:g} deg stands twice")
+            raise ValueError(
+                f"{path}: polar {polar_deg:g}, azimuth {azimuth_deg:g} deg stands twice; take one of them out"
+            )
         value_at[polar_deg, azimuth_deg] = value
     polars_deg = sorted({polar for polar, _ in value_at})
     azimuths_deg = sorted({azimuth for _, azimuth in value_at})
     if not value_at:
-        raise ValueError(f"{path}: holds no values")
+        raise ValueError(f"{path}: holds no values; write a line for each direction")
     for polar, azimuth in itertools.product(polars_deg, azimuths_deg):
         if (polar, azimuth) not in value_at:
             raise ValueError(
                 f"{path}: no value at polar {polar:g}, azimuth {azimuth:g} deg; wanted a full grid"
             )
-    return {
+    grid = {
         "polar": f"[{', '.join(map(repr, polars_deg))}] deg",
         "azimuth": f"[{', '.join(map(repr, azimuths_deg))}] deg",
         "values": [
@@ -196,3 +199,9 @@ def _read_grid(path: Path) -> dict[str, Any]:
             for polar in polars_deg
         ],
     }
+    try:
+        PatternGrid.model_validate(grid)
+    except ValidationError as error:
+        told = error.errors()[0].get("ctx", {}).get("error", "holds no such grid; check it")
+        raise ValueError(f"{path}: {told}") from None
+    return grid

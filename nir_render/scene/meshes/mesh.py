@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_FARTHEST_UV = 1e4  # beyond, float32 has no place left within a picture
+
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
@@ -24,12 +26,16 @@ class MeshPart:
         shaded as if it were round. None is flat triangles.
     faces
         Vertices of each triangle, counterclockwise seen from outside, shape (m, 3).
+    uvs
+        Where in a picture each vertex is, from 0 to 1 across and up, shape (n, 2); None where the file does
+        not say it.
     """
 
     slot: str
     vertices: Array
     normals: Array | None
     faces: NDArray[np.uint32]
+    uvs: Array | None = None
 
 
 def checked(part: MeshPart) -> MeshPart:
@@ -43,12 +49,14 @@ def checked(part: MeshPart) -> MeshPart:
     named = f" of the slot {part.slot!r}" if part.slot else ""
     off = np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))
     if len(off):
-        raise ValueError(f"vertex {off[0] + 1}{named} is not finite: {_row(part.vertices[off[0]])}")
+        raise ValueError(
+            f"vertex {off[0] + 1}{named} is not finite: {_row(part.vertices[off[0]])}; export the mesh again"
+        )
     beyond = np.flatnonzero((part.faces >= len(part.vertices)).any(axis=1))
     if len(beyond):
         raise ValueError(
             f"triangle {beyond[0] + 1}{named} wants vertex {int(part.faces[beyond[0]].max()) + 1}, but there "
-            f"are {len(part.vertices)}"
+            f"are {len(part.vertices)}; export the mesh again"
         )
     normals = part.normals
     if normals is not None:
@@ -63,7 +71,9 @@ def checked(part: MeshPart) -> MeshPart:
         has_area = np.linalg.norm(_doubled_areas(part.vertices, part.faces), axis=1) > 0.0
     if not has_area.any():
         raise ValueError(f"there is no triangle{named} with an area; export the surface, not points or edges")
-    return MeshPart(part.slot, part.vertices, normals, part.faces[has_area])
+    if part.uvs is not None and not (np.abs(part.uvs) <= _FARTHEST_UV).all():
+        raise ValueError(f"a uv coordinate{named} is not finite or beyond {_FARTHEST_UV:g}; unwrap it again")
+    return MeshPart(part.slot, part.vertices, normals, part.faces[has_area], part.uvs)
 
 
 def lies_open(parts: Sequence[MeshPart]) -> str | None:

@@ -74,10 +74,12 @@ def _parts(data: bytes, kind: str) -> list[MeshPart]:
             raise ValueError(
                 f"cannot be read as {kind}: it claims to hold more than fits; export it again"
             ) from None
-        except Exception as error:  # of any kind: what is damaged meets trimesh's parsers anywhere
-            told = " ".join(str(error).split())[:120] or type(error).__name__
+        except Exception:  # of any kind: what is damaged meets trimesh's parsers anywhere
             other = "; with buffers in files beside it, export as .glb" if kind == "gltf" else ""
-            raise ValueError(f"cannot be read as {kind} ({told}); export the mesh again{other}") from None
+            raise ValueError(
+                f"cannot be read as {kind}: this is another kind of file, or is damaged; export the mesh "
+                f"again{other}"
+            ) from None
 
 
 def _read_by_trimesh(data: bytes, kind: str) -> list[MeshPart]:
@@ -123,30 +125,35 @@ def _part(found: dict[str, Any], slot: str, to_world: Array) -> MeshPart:
         faces = faces[:, ::-1]
     if normals is not None and not np.array_equal(to_world, np.eye(4)):
         normals = np.asarray(normals, dtype=np.float64) @ np.linalg.inv(linear)
+    uvs = getattr(found.get("visual"), "uv", None)
     return MeshPart(
         slot,
         vertices @ linear.T + to_world[:3, 3],
         None if normals is None or len(normals) != len(vertices) else np.asarray(normals, dtype=np.float64),
         faces.astype(np.uint32),
+        None if uvs is None or np.shape(uvs) != (len(vertices), 2) else np.asarray(uvs, dtype=np.float64),
     )
 
 
 def _joined(slot: str, parts: list[MeshPart]) -> MeshPart:
-    """Return pieces of one slot as one; flat where any of them is."""
+    """Return pieces of one slot as one; flat where any of them is, without uvs where any has none."""
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    normals = [part.normals for part in parts]
     return MeshPart(
         slot,
         np.concatenate([part.vertices for part in parts]),
-        None
-        if any(one is None for one in normals)
-        else np.concatenate([one for one in normals if one is not None]),
+        _of_all([part.normals for part in parts]),
         np.concatenate([part.faces + np.uint32(at) for part, at in zip(parts, first, strict=False)]),
+        _of_all([part.uvs for part in parts]),
     )
+
+
+def _of_all(values: list[Array | None]) -> Array | None:
+    given = [one for one in values if one is not None]
+    return np.concatenate(given) if len(given) == len(values) else None
 
 
 def _stood_up(part: MeshPart) -> MeshPart:
     """Return a part whose y is up with z up: x stays."""
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     normals = None if part.normals is None else part.normals @ turn.T
-    return MeshPart(part.slot, part.vertices @ turn.T, normals, part.faces)
+    return MeshPart(part.slot, part.vertices @ turn.T, normals, part.faces, part.uvs)

@@ -14,7 +14,7 @@ from nir_render.errors import shown
 
 # What a file may hold at most: beyond it, reading takes seconds.
 _MOST_CHARACTERS = 20_000_000
-_MOST_VALUES = 20_000
+_MOST_VALUES = 50_000
 _MOST_DEPTH = 32
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 # What the reader of YAML says, and what it means.

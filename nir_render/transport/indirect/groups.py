@@ -18,7 +18,7 @@ from nir_render.light.light import Indirect
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import CLEAR_DEPTH
-from nir_render.scene.documents.materials import Dielectric, Pane
+from nir_render.scene.documents.materials import Dielectric, Pane, texture_of
 from nir_render.scene.documents.shapes import Box
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
@@ -288,6 +288,7 @@ def world_on_device(
         choice=upload_guide(choice),
         fog=None if fog is None else upload_fog(fog),
         max_depth=snapshot.render.indirect.max_depth or default_depth(snapshot, fog, low_m, high_m),
+        pictures=any(texture_of(snapshot.materials[one.material]) for one in snapshot.shapes.values()),
         nodes=_node_table(of_nodes, columns["material"], len(wavelengths_m)),
     )
 

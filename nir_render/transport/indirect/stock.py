@@ -25,6 +25,7 @@ from nir_render.light.light import DirectTable, Indirect
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import CLEAR_DEPTH, IndirectSettings
 from nir_render.scene.documents.emitters import Source
+from nir_render.scene.documents.materials import MaterialDocument, Retroreflector
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.backend.variant import backend, blocked, mi
@@ -92,6 +93,7 @@ def _refuse_what_only_groups_render(snapshot: Snapshot, camera: Camera) -> None:
         ("the sky", snapshot.skylight is not None),
         ("emission patterns", any(placed.source.pattern is not None for placed in snapshot.sources.values())),
         (f"a {camera.lens.model} lens", camera.lens.model != "rectilinear"),
+        ("retroreflectors", any(isinstance(m, Retroreflector) for m in _used(snapshot))),
         ("a principal point off the sensor's middle", (lens.cx_px, lens.cy_px) != middle_px),
     ]
     asked = [name for name, is_there in parts if is_there]
@@ -100,6 +102,10 @@ def _refuse_what_only_groups_render(snapshot: Snapshot, camera: Camera) -> None:
             f"{snapshot.origin}: {' and '.join(asked)} in a scene whose bodies reflect or scatter needs the "
             "light-group renderer, which needs LLVM: nir-render doctor"
         )
+
+
+def _used(snapshot: Snapshot) -> list[MaterialDocument]:
+    return [snapshot.materials[shape.material] for shape in snapshot.shapes.values()]
 
 
 def samples_of(settings: IndirectSettings) -> int:

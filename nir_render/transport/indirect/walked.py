@@ -5,7 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.scene.documents.materials import MaterialDocument, Pane, Plastic, curves_of, number
+from nir_render.scene.documents.materials import (
+    MaterialDocument,
+    Pane,
+    Plastic,
+    Retroreflector,
+    curves_of,
+    number,
+)
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.world.facets import MIRROR, PANE, Facets, facets
 
@@ -52,8 +59,10 @@ def is_coated(material: MaterialDocument) -> bool:
 
 
 def is_glossy(material: MaterialDocument) -> bool:
-    """Tell whether it is so of a blurred reflection over a ground that varies."""
-    return isinstance(material, Plastic) and material.roughness > 0.0
+    """Tell whether it is so of a blurred reflection, or a lobe back, over a ground that varies."""
+    return isinstance(material, Retroreflector) or (
+        isinstance(material, Plastic) and material.roughness > 0.0
+    )
 
 
 def _factors(flat: Facets) -> Array:

@@ -18,16 +18,20 @@ from nir_render.scene.documents.materials import (
     Mirror,
     Pane,
     Plastic,
+    Retroreflector,
     RoughConductor,
     number,
 )
+from nir_render.scene.documents.matter.retroreflection import lobe_of, reflected_share
+from nir_render.scene.documents.matter.texture import TextureDocument
 from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, Sphere
 from nir_render.scene.meshes.mesh import lies_open
 from nir_render.scene.pose import rotation_of
 from nir_render.scene.snapshot import Snapshot
 from nir_render.scene.text.units import LENGTH, format_vector
 from nir_render.spectra.nodes import BAND_M
-from nir_render.transport.backend.variant import mi
+from nir_render.transport.backend.variant import backend, mi
+from nir_render.transport.world.retroreflector import retroreflector
 
 SUN_RADIUS_RAD = Sun.angular_radius_rad
 
@@ -85,7 +89,7 @@ def described(
         material = snapshot.materials[shape.material]
         if isinstance(material, Pane) and not panes:
             continue
-        bsdf = _bsdf(material)
+        bsdf = _bsdf(material, "repeat" if isinstance(shape, Mesh) else "clamp")
         if isinstance(shape, Mesh):
             key = f"shape_{body_id(name)}_0"
             bodies[key] = _mesh(key, shape, bsdf)
@@ -183,15 +187,22 @@ def _mesh(name: str, shape: Mesh, bsdf: dict[str, Any]) -> Any:
     )
     given = [part.normals for part in parts if part.normals is not None]
     smooth = len(given) == len(parts)
+    laid = [part.uvs for part in parts if part.uvs is not None]
+    has_uvs = len(laid) == len(parts)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf, optimize=False)
     properties.set_id(name)
-    mesh = mi.Mesh(name, len(vertices_m), len(faces), props=properties, has_vertex_normals=smooth)
+    mesh = mi.Mesh(
+        name, len(vertices_m), len(faces),
+        props=properties, has_vertex_normals=smooth, has_vertex_texcoords=has_uvs,
+    )  # fmt: skip
     arrays = mi.traverse(mesh)
     arrays["vertex_positions"] = vertices_m.astype(np.float32).ravel()
     arrays["faces"] = faces.ravel()
     if smooth:
         arrays["vertex_normals"] = (np.concatenate(given) @ rotation.T).astype(np.float32).ravel()
+    if has_uvs:
+        arrays["vertex_texcoords"] = np.concatenate(laid).astype(np.float32).ravel()
     arrays.update()
     return mesh
 
@@ -224,6 +235,18 @@ def _share(value: float | CurveDocument) -> dict[str, Any]:
     return _uniform(number(value))
 
 
+def _laid(value: float | CurveDocument | TextureDocument, wrap: str) -> dict[str, Any]:
+    """Return a reflectance; a picture with its lowest row where v is 0, as files of meshes count."""
+    if not isinstance(value, TextureDocument):
+        return _share(value)
+    try:
+        picture = value.reflectance()
+    except ValueError as error:
+        raise InputError(f"{error} (it has changed since the scene was loaded)") from None
+    data = mi.TensorXf(np.ascontiguousarray(picture[::-1, :, None], dtype=np.float32))
+    return {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear", "wrap_mode": wrap}
+
+
 _BLACK = {"type": "diffuse", "reflectance": _uniform(0.0)}
 
 
@@ -231,12 +254,13 @@ def _area_light(radiance: float) -> dict[str, Any]:
     return {"type": "area", "radiance": _uniform(radiance)}
 
 
-def _bsdf(material: MaterialDocument) -> dict[str, Any]:
+def _bsdf(material: MaterialDocument, wrap: str) -> dict[str, Any]:
+    """Return a material; `wrap` tells how a picture goes on beyond its edges."""
     match material:
         case Diffuse():
-            surface: dict[str, Any] = {
+            surface: Any = {
                 "type": "diffuse",
-                "reflectance": _share(material.reflectance),
+                "reflectance": _laid(material.reflectance, wrap),
             }
         case RoughConductor():
             surface = {
@@ -245,6 +269,7 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
                 "alpha": material.roughness,
                 "eta": _uniform(material.index),
                 "k": _uniform(material.extinction_index),
+                **({} if material.share is None else {"specular_reflectance": _uniform(material.share)}),
             }
         case Mirror():
             surface = {
@@ -258,8 +283,10 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
                 **(rough if material.roughness > 0.0 else {"type": "plastic"}),
                 "int_ior": material.index,
                 "ext_ior": 1.0,
-                "diffuse_reflectance": _share(material.reflectance),
+                "diffuse_reflectance": _laid(material.reflectance, wrap),
             }
+        case Retroreflector():
+            surface = _retroreflector(material)
         case Dielectric():
             return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
         case Pane():
@@ -270,6 +297,14 @@ def _bsdf(material: MaterialDocument) -> dict[str, Any]:
                 "specular_transmittance": _share(material.transmission),
             }
     return {"type": "twosided", "nested": surface}
+
+
+def _retroreflector(material: Retroreflector) -> Any:
+    ground = number(material.reflectance)
+    if backend().vectorised:
+        return retroreflector(lobe_of(material.table()), ground)
+    # As a body it is as good; its light is refused where rays go one by one (`indirect.stock`).
+    return {"type": "diffuse", "reflectance": _uniform(ground + reflected_share(material.table()))}
 
 
 def _closed_cylinder(shape: Cylinder) -> list[dict[str, Any]]:

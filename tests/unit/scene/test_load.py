@@ -48,7 +48,7 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"shapes.w": _wall(colour=[1, 0, 0])}, "shapes.w: 'colour': RGB colours have no meaning at 940 nm"),
     ({"shapes.w": _wall(size="[-1, 1] m")}, "shapes.w.size: each extent must be greater than 0"),
     ({"shapes.w": _wall(normal=[0, 0, 0])}, "shapes.w.normal: a direction must not be [0, 0, 0]"),
-    ({"shapes.w": _wall(material="blakc")}, "shapes.w.material: there is no material 'blakc'; known: black"),
+    ({"shapes.w": _wall(material="blakc")}, "shapes.w.material: there is no material 'blakc'; did you mean 'black'?"),
     ({"shapes.w": _wall(type="rectangel")}, "shapes.w: there is no type 'rectangel'; did you mean 'rectangle'?"),
     ({"materials.m": {"type": "diffuse", "reflectance": [0.8, 0.1, 0.1]}}, "RGB colours have no meaning at 940 nm"),
     ({"materials.m": {"type": "diffuse", "reflectance": "#ff0000"}}, "RGB colours have no meaning at 940 nm"),
@@ -381,3 +381,10 @@ def test_cameras_are_selected_by_robot_or_by_name(scene: Scene) -> None:
     ]  # fmt: skip
     with pytest.raises(InputError, match=r"there is no camera 'r1\.fornt'; known: r1\.front"):
         scene.camera("r1.fornt")
+
+
+def test_the_largest_scene_loads_again_when_all_is_written_out(tmp_path: Path) -> None:
+    """Thirty robots with all that presets stand for: 17 000 lines, which a run keeps as scene.yaml."""
+    scene = load_scene(SCENES / "swarm_30.yaml")
+    (tmp_path / "scene.yaml").write_text(scene.resolved_yaml(), encoding="utf-8")
+    assert load_scene(tmp_path / "scene.yaml").document == scene.document

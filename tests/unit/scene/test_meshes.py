@@ -118,7 +118,7 @@ def test_normals_of_a_file_are_kept_and_made_up_nowhere(tmp_path: Path) -> None:
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -4\n", "there is no vertex -4"),
         ("v 0 0 nan\n", "line 1: 'v 0 0 nan': the numbers must be finite"),
         ("v 0 0\n", "three numbers are wanted"),
-        ("v 0 0 zero\n", "could not convert string to float: 'zero'"),
+        ("v 0 0 zero\n", "'zero' is no number; export the mesh again"),
         ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no triangle with an area"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "a face has three corners or more"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 0\nf 1//1 2//1 3//1\n", "normal 1 has no direction"),

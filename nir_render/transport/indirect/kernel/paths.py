@@ -143,7 +143,7 @@ def _meet(scene: DeviceScene, state: PathState) -> Interaction:
     """Return where a path's next stretch meets a surface, Mitsuba's surface interaction."""
     return scene.bodies.ray_intersect(
         mi.Ray3f(state.origin, state.direction),
-        ray_flags=mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame,
+        ray_flags=mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame | (mi.RayFlags.UV if scene.pictures else 0),
         coherent=state.depth == 0,
         active=state.active,
     )

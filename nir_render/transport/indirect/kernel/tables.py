@@ -114,7 +114,7 @@ class DeviceScene:
     """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes.
 
     `max_depth` is the longest path, in stretches, as Mitsuba counts; `nodes` is None where light of one
-    wavelength alone is carried.
+    wavelength alone is carried. `pictures` tells whether any surface has a picture laid on it.
     """
 
     bodies: MitsubaScene
@@ -125,6 +125,7 @@ class DeviceScene:
     fog: FogTable | None
     max_depth: int
     nodes: NodeTable | None = None
+    pictures: bool = False
 
     @property
     def node_count(self) -> int:

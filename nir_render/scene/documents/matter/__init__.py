@@ -1,0 +1,1 @@
+"""What materials are made of: where their figures come from, pictures of reflectance, retroreflection."""
