@@ -328,7 +328,8 @@ def _known(
     used = telling > _LEAST_TELLING
     jacobian, expected_e = jacobian[:, used], expected_e[used]
     variance_e2, telling = variance_e2[used], telling[used]
-    inverse = covariance(fisher_information(jacobian, variance_e2 / telling) + layout.prior(structure))
+    prior = layout.prior(structure, known.motion_px)
+    inverse = covariance(fisher_information(jacobian, variance_e2 / telling) + prior)
     if inverse is None:
         return None
     used = used.reshape(box.height, box.width)

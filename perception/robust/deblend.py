@@ -49,19 +49,16 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
         return found
     asking = sorted(sorted(asking, key=lambda index: -float(found[index].flux_e.max()))[:MOST_WINDOWS])
     lone = [index for index in asking if found[index].count == 1]
-    free = _with_spread(camera, "psf_sigma_px", _WIDTH_FREE)
-    of_free_width = solve([found[index].again() for index in lone], free)
+    of_any_width = of_free_width([found[index] for index in lone], camera)
     null = dict(enumerate(found))
     large = [index for index in lone if float(found[index].image_radius_px[0]) > _LEAST_RADIUS_PX]
     of_any_size = of_free_size([found[index] for index in large], camera)
-    for index, other in [*zip(lone, of_free_width, strict=True), *zip(large, of_any_size, strict=True)]:
+    for index, other in [*zip(lone, of_any_width, strict=True), *zip(large, of_any_size, strict=True)]:
         if other is not None and other.deviance < null[index].deviance:
             null[index] = other
     while asking:
         trials = [(index, starts) for index in asking for starts in _more(found[index])]
-        fits = solve(
-            [Problem(found[i].window, starts, found[i].background_e) for i, starts in trials], camera
-        )
+        fits = solve([_of_more(found[index], starts) for index, starts in trials], camera)
         best: dict[int, Solution] = {}
         for (index, _), fit in zip(trials, fits, strict=True):
             if fit is not None and (index not in best or fit.deviance < best[index].deviance):
@@ -87,6 +84,13 @@ def asks_for_more(solution: Solution) -> bool:
     return left.peak_sigmas > RESIDUAL_SIGMAS
 
 
+def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
+    """Fit flares through a point spread that may be wider or narrower than the calibration says."""
+    if not solutions:
+        return []
+    return solve([one.again() for one in solutions], _with_spread(camera, "psf_sigma_px", _WIDTH_FREE))
+
+
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     """Fit lone flares whose size may be any, whatever their flux says."""
     if not solutions:
@@ -106,6 +110,15 @@ def _gain(fewer: Solution, more: Solution) -> float:
     """Return by how much more flares explain a window better, as 2 Δ ln L with an imperfect model."""
     variance = more.variance_e2(MODEL_ERROR)
     return float(np.sum((fewer.residual_e**2 - more.residual_e**2) / variance))
+
+
+def _of_more(current: Solution, starts: Sequence[Start]) -> Problem:
+    """Return the problem of fitting more flares; where they move, each begins with the mean motion."""
+    motions = None
+    if current.motion_px is not None:
+        along_u, along_v = current.motion_px.mean(axis=0).tolist()
+        motions = [(along_u, along_v)] * len(starts)
+    return Problem(current.window, starts, current.background_e, motions)
 
 
 def _more(current: Solution) -> list[list[Start]]:
