@@ -85,10 +85,11 @@ def _drop_beside_lines(
     shape: tuple[int, int],
     camera: Camera,
 ) -> None:
-    """Hold several flares against a lone one that moves: drop them, or take several that move.
+    """Hold several flares at rest against what moves: drop them, or take several that move.
 
-    Where one that moves explains all but little, several must explain it better than the point spread's own
-    width does; where neither explains enough, flares that move together are tried.
+    Where those that move explain all but little, more of them at rest must explain it better than the point
+    spread's own width does. Where they do not, and it takes three and more at rest, if these are enough, more
+    that move are tried.
     """
     lines = {index: one for index, one in enumerate(chosen) if one is not None and one.motion_px is not None}
     rivals = [index for index, one in lines.items() if index in parted and one.left_over.is_good]
@@ -96,10 +97,13 @@ def _drop_beside_lines(
     for index, line in zip(rivals, free, strict=True):
         if min(lines[index].cost, math.inf if line is None else line.cost) < parted[index].cost:
             del parted[index]
-    poor: list[Solution | None] = [
-        one if index in lines and index not in parted else None for index, one in enumerate(chosen)
-    ]
-    parted.update(_parted(poor, shape, camera))
+    poor: list[Solution | None] = [None] * len(chosen)
+    for index, one in lines.items():
+        if index not in parted or parted[index].count > one.count + 1:
+            poor[index] = one
+    for index, more in _parted(poor, shape, camera).items():
+        if index not in parted or more.cost < parted[index].cost:
+            parted[index] = more
 
 
 def _parted(plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera) -> dict[int, Solution]:

@@ -3,9 +3,13 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
+from perception.model.flare import PixelBox
 from perception.model.window import Camera
+from perception.robust.deblend import asks_for_more
 from perception.robust.goodness import drawn_out
-from perception.robust.solve import Problem, Solution, solve
+from perception.robust.solve import Motion, Problem, Solution, solve
 
 SEEMS_CHI2 = 12.0
 """Of two degrees of freedom, what a lone flare longer than wide leaves over: noise does it once in 400."""
@@ -14,24 +18,57 @@ LEAST_PX = 0.2
 """A flare that seems to move less is taken to rest: it changes its flux by less than a thousandth."""
 
 
+MOST_TOGETHER = 4
+"""More flares in one window are not tried as moving ones."""
+
+AT_REST = (0.0, 0.0)
+"""A fit that begins so stays so: to first order a motion changes nothing."""
+
+
 def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
-    """Fit lone flares that are longer than wide as moving ones, and return by index which are likelier so."""
+    """Fit flares that are longer than wide as moving ones, and return by index which are likelier so.
+
+    Lone ones where the residual says so; of several in one window, where it asks for more, all of them.
+    """
     tried: list[tuple[int, Solution]] = []
     problems = []
     for index, solution in enumerate(solutions):
-        if solution is None or solution.count != 1 or solution.motion_px is not None:
+        if solution is None or solution.count > MOST_TOGETHER:
             continue
-        window = solution.window
-        chi2, along_u, along_v = drawn_out(
-            window.image_e, window.state, solution.expected_e, solution.flares_e, window.floor_e2, window.prnu
-        )
-        if chi2 < SEEMS_CHI2 or math.hypot(along_u, along_v) < LEAST_PX:
+        if solution.count == 1:
+            motions = [_seen(solution, solution.window.box)]
+        elif asks_for_more(solution):
+            motions = [_seen(solution, _around(solution, flare)) for flare in range(solution.count)]
+        else:
             continue
-        tried.append((index, solution))
-        problems.append(Problem(window, solution.starts, solution.background_e, [(along_u, along_v)]))
+        if any(motion != AT_REST for motion in motions):
+            tried.append((index, solution))
+            problems.append(Problem(solution.window, solution.starts, solution.background_e, motions))
     fits = solve(problems, camera)
     return {
         index: fit
         for (index, at_rest), fit in zip(tried, fits, strict=True)
         if fit is not None and fit.cost < at_rest.cost
     }
+
+
+def _seen(solution: Solution, box: PixelBox) -> Motion:
+    """Return the motion that the residual in a part of a window asks for, if it does."""
+    window = solution.window
+    part = box.seen_from(window.box).slices
+    chi2, along_u, along_v = drawn_out(
+        *(np.ascontiguousarray(each[part]) for each in (window.image_e, window.state)),
+        *(np.ascontiguousarray(each[part]) for each in (solution.expected_e, solution.flares_e)),
+        window.floor_e2,
+        window.prnu,
+    )
+    return (along_u, along_v) if chi2 > SEEMS_CHI2 and math.hypot(along_u, along_v) > LEAST_PX else AT_REST
+
+
+def _around(solution: Solution, flare: int) -> PixelBox:
+    """Return the part of a window that one of its flares shines into."""
+    reach_px = math.ceil(float(solution.image_radius_px[flare]) + 3.0 * solution.psf_sigma_px)
+    left, top = round(float(solution.u_px[flare])) - reach_px, round(float(solution.v_px[flare])) - reach_px
+    window, side = solution.window.box, 2 * reach_px + 1
+    part = PixelBox(top, left, side, side).seen_from(window).inside((window.height, window.width))
+    return PixelBox(part.top + window.top, part.left + window.left, part.height, part.width)
