@@ -31,7 +31,10 @@ SPEED_M_PER_S = 0.7
 TURN_RAD_PER_S = 0.5
 """Of the observer about itself, standard deviation per axis."""
 
-_OTHERWISE = 1e-6  # how often neither holds: a blow, a machine that is far quicker
+MOTION_PX = 8.0
+"""Standard deviation of each part of a motion in fits and bounds: hardly any prior; `motion_cost` has it."""
+
+_OTHERWISE = 1e-8  # how often neither holds: a blow, a machine that is far quicker
 _MOST_PX = 10.0
 
 
@@ -173,7 +176,7 @@ def motion_cost(motion_px: Array, log_range: Array, covariance_px2: Array, camer
     """Return what it costs a priori that flares move so far: −2 ln (2π p) of each, summed.
 
     Each part of a motion is normal, of the standard deviation f t √(ω² + (v/d)²) of robots at ordinary
-    speeds, t the exposure; once in a million it may be anything up to 10 px. m and −m are the same. That it
+    speeds, t the exposure; once in 10⁸ it may be anything up to 10 px. m and −m are the same. That it
     may move never speaks for a flare: the density is at most that of the estimate itself.
 
     Parameters

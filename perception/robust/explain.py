@@ -11,7 +11,7 @@ from perception.model.window import Camera
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.deblend import deblend, of_free_width
 from perception.robust.goodness import halo_sigmas
-from perception.robust.motion import moving
+from perception.robust.motion import moving, weighed
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Problem, Solution, solve
 from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
@@ -80,7 +80,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
 
 
 def _drop_beside_lines(
-    chosen: Sequence[Solution | None],
+    chosen: list[Solution | None],
     parted: dict[int, Solution],
     shape: tuple[int, int],
     camera: Camera,
@@ -95,15 +95,18 @@ def _drop_beside_lines(
     rivals = [index for index, one in lines.items() if index in parted and one.left_over.is_good]
     free = of_free_width([lines[index] for index in rivals], camera)
     for index, line in zip(rivals, free, strict=True):
-        if min(lines[index].cost, math.inf if line is None else line.cost) < parted[index].cost:
-            del parted[index]
+        more = parted[index]
+        if min(lines[index].cost, math.inf if line is None else line.cost) < more.cost:
+            chosen[index] = weighed(lines[index], parted.pop(index))
+        else:
+            parted[index] = weighed(more, lines[index])
     poor: list[Solution | None] = [None] * len(chosen)
     for index, one in lines.items():
         if index not in parted or parted[index].count > one.count + 1:
             poor[index] = one
-    for index, more in _parted(poor, shape, camera).items():
-        if index not in parted or more.cost < parted[index].cost:
-            parted[index] = more
+    for index, several in _parted(poor, shape, camera).items():
+        if index not in parted or several.cost < parted[index].cost:
+            parted[index] = several
 
 
 def _parted(plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera) -> dict[int, Solution]:

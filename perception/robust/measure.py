@@ -48,6 +48,7 @@ class MeasuredFlare:
     range_by_size_sigma_m: float = math.nan
     saturated: bool = False
     misfit: bool = False
+    is_doubtful: bool = False
     on_texture: bool = False
     on_edges: bool = False
 
@@ -175,6 +176,7 @@ def _measurement(
         range_sigma_common_m=math.nan if bound_only else range_m * float(solution.log_range_common[index]),
         saturated=saturated,
         misfit=misfit,
+        is_doubtful=solution.is_doubtful,
         on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges or left.peak_sigmas > RESIDUAL_SIGMAS,
     )

@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
 from perception.model.window import Camera
@@ -11,8 +13,10 @@ from perception.robust.deblend import asks_for_more
 from perception.robust.goodness import drawn_out
 from perception.robust.solve import Motion, Problem, Solution, solve
 
-SEEMS_CHI2 = 12.0
-"""Of two degrees of freedom, what a lone flare longer than wide leaves over: noise does it once in 400."""
+Array = NDArray[np.float64]
+
+SEEMS_CHI2 = 6.0
+"""Of two degrees of freedom, what a lone flare longer than wide leaves over: noise does it once in 20."""
 
 LEAST_PX = 0.2
 """A flare that seems to move less is taken to rest: it changes its flux by less than a thousandth."""
@@ -24,11 +28,15 @@ MOST_TOGETHER = 4
 AT_REST = (0.0, 0.0)
 """A fit that begins so stays so: to first order a motion changes nothing."""
 
+_LEAST_SHARE, _DOUBTFUL_SHARE = 1e-4, 0.01
+_MOST_COST = 40.0
+
 
 def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
-    """Fit flares that are longer than wide as moving ones, and return by index which are likelier so.
+    """Fit flares that are longer than wide as moving ones, and return by index the likelier of both.
 
-    Lone ones where the residual says so; of several in one window, where it asks for more, all of them.
+    Lone ones where the residual says so; of several in one window, where it asks for more. The sigmas of what
+    is returned know of the other.
     """
     tried: list[tuple[int, Solution]] = []
     problems = []
@@ -46,10 +54,35 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
             problems.append(Problem(solution.window, solution.starts, solution.background_e, motions))
     fits = solve(problems, camera)
     return {
-        index: fit
+        index: weighed(fit, at_rest) if fit.cost < at_rest.cost else weighed(at_rest, fit)
         for (index, at_rest), fit in zip(tried, fits, strict=True)
-        if fit is not None and fit.cost < at_rest.cost
+        if fit is not None
     }
+
+
+def weighed(solution: Solution, other: Solution) -> Solution:
+    """Return a solution, its sigmas wider by what differs in another, weighted by how likely that one is.
+
+    Of another number of flares the nearest counts; where it is likelier than a hundredth, that is doubtful.
+    """
+    odds = math.exp(-0.5 * min(max(other.cost - solution.cost, -_MOST_COST), _MOST_COST))
+    share = odds / (1.0 + odds)
+    if share < _LEAST_SHARE:
+        return solution
+    apart = np.hypot(solution.u_px[:, None] - other.u_px, solution.v_px[:, None] - other.v_px)
+    nearest = np.argmin(apart, axis=1)
+
+    def wider(sigma: Array, own: Array, others: Array) -> Array:
+        return np.hypot(sigma, math.sqrt(share) * (others[nearest] - own))
+
+    return replace(
+        solution,
+        u_sigma_px=wider(solution.u_sigma_px, solution.u_px, other.u_px),
+        v_sigma_px=wider(solution.v_sigma_px, solution.v_px, other.v_px),
+        flux_sigma_e=wider(solution.flux_sigma_e, solution.flux_e, other.flux_e),
+        log_range_sigma=wider(solution.log_range_sigma, solution.log_range, other.log_range),
+        is_doubtful=solution.is_doubtful or (solution.count != other.count and share > _DOUBTFUL_SHARE),
+    )
 
 
 def _seen(solution: Solution, box: PixelBox) -> Motion:

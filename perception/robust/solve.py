@@ -17,7 +17,7 @@ from perception.model.layout import UNUSABLE, Sources, Structure, View, even
 from perception.model.pixels import maximise
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
-from perception.model.window import Camera, lay_out
+from perception.model.window import MOTION_PX, Camera, lay_out
 from perception.model.window import motion_cost as cost_of_motion
 from perception.robust.goodness import LeftOver, left_over, residual_e
 
@@ -29,7 +29,6 @@ _LAYOUT_KEPT = 0.02
 _LAYOUT_KEPT_PX = 0.05
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
-_MOTION_PX = 8.0  # of a fit's prior alone, hardly any: how likely a motion is, `motion_cost` says
 _PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
 _NEIGHBOURS = 20.0 * 50.0 / (1280.0 * 960.0)  # of twenty flares in a frame, how many lie in those 50 px²
 
@@ -116,6 +115,8 @@ class Solution:
     motion_px, motion_cost
         How far each moves along u and v during the exposure, shape (flares, 2), None where none may; and what
         that costs a priori (`model.window`).
+    is_doubtful
+        Whether another number of flares explains the window nearly as well (`motion.weighed`).
     """
 
     window: Window
@@ -139,6 +140,7 @@ class Solution:
     log_information: float
     motion_px: Array | None = None
     motion_cost: float = 0.0
+    is_doubtful: bool = False
 
     @property
     def cost(self) -> float:
@@ -209,7 +211,7 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     -------
     A solution for each, None where the fit did not converge.
     """
-    moving = replace(camera, motion_px=_MOTION_PX)
+    moving = replace(camera, motion_px=MOTION_PX)
     fits = [_Fit(problem, camera if problem.motions is None else moving) for problem in problems]
     solved: dict[int, Solution] = {}
     for of_camera, moves in ((camera, False), (moving, True)):
