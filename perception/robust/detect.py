@@ -57,9 +57,9 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         a rolling shutter a blob stays one. One that moves is drawn out (`motion`): its place is that in the
         middle of the exposure. `merged`: what is seen does not look like one source, nor like
         several that can be told apart; its sigmas are then widened by √χ². So is called what may be one that
-        moves or two at rest; its sigmas cover both. `ghost` is never set: one frame cannot tell a mirror image
-        from a source. What is no source by its shape, size or brightness is left out, and so is what does not
-        stand out from what lies right beside it, and all but the brightest thousand.
+        moves or two at rest; its sigmas cover both. `ghost` is never set: one frame cannot tell a mirror
+        image from a source. What is no source by shape, size or brightness is left out, and so is what does
+        not stand out from what lies right beside it, and all but the brightest thousand.
 
     Raises
     ------
