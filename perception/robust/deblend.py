@@ -41,13 +41,14 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
 
     Returns
     -------
-    The windows' solutions, those given where nothing is gained.
+    The windows' solutions, those given where nothing is gained; where the search was cut short they say so.
     """
     found = list(solutions)
     asking = [index for index, each in enumerate(found) if asks_for_more(each)]
     if not asking:
         return found
-    asking = sorted(sorted(asking, key=lambda index: -float(found[index].flux_e.max()))[:MOST_WINDOWS])
+    by_flux = sorted(asking, key=lambda index: -float(found[index].flux_e.max()))
+    asking, late = sorted(by_flux[:MOST_WINDOWS]), by_flux[MOST_WINDOWS:]
     lone = [index for index in asking if found[index].count == 1]
     of_any_width = of_free_width([found[index] for index in lone], camera)
     null = dict(enumerate(found))
@@ -67,8 +68,10 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
         for index, fit in best.items():
             if _gain(null[index], fit) >= LEAST_GAIN:
                 found[index] = null[index] = fit
-                if fit.count < MOST_FLARES and asks_for_more(fit):
-                    asking.append(index)
+                if asks_for_more(fit):
+                    (asking if fit.count < MOST_FLARES else late).append(index)
+    for index in late:
+        found[index] = replace(found[index], may_be_more=True)
     return found
 
 

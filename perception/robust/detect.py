@@ -49,8 +49,9 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     Returns
     -------
     Detections
-        From top to bottom; `truncated` where time or the number of blobs ended the search, and with the
-        `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above the detection limit.
+        From top to bottom; `truncated` where time, or the number of blobs or of flares in one, ended the
+        search, and with the `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above
+        the detection limit.
         `saturated`: a pixel is clipped, which counts as censored. Where that does not determine the range
         `range_sigma_m` is NaN; of a disc too large to be fitted the flux is a lower bound, too, and the range
         an upper one. Flares that overlap are fitted together (`deblend`), and their sigmas know of it; behind
@@ -79,7 +80,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
     groups = clusters(brightest(flares, MOST_FLARES), prepared)
     measured, late = _measured(groups, prepared, started + limit_s)
-    truncated = late or len(flares) > MOST_FLARES
+    truncated = late or len(flares) > MOST_FLARES or any(found.may_be_more for _, found in measured)
     measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
     reported = [(blob, found) for blob, found in measured if found.stands_out]
     if not reported:

@@ -9,7 +9,7 @@ import numpy as np
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster, guesses
-from perception.robust.deblend import deblend, of_free_width
+from perception.robust.deblend import asks_for_more, deblend, of_free_width
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
 from perception.robust.search.prepare import PreparedFrame
@@ -52,13 +52,14 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
             chosen[index] = None
     # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
     # flares would explain better.
-    parted = {}
+    parted: dict[int, Solution] = {}
+    cut_short: set[int] = set()
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
-        parted = _parted(plain, prepared.shape, camera)
+        parted = _parted(plain, prepared.shape, camera, cut_short)
         for index, line in moving(plain, camera).items():
             chosen[index] = line
-        _drop_beside_lines(chosen, parted, prepared.shape, camera)
+        _drop_beside_lines(chosen, parted, prepared.shape, camera, cut_short)
     _retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
@@ -76,6 +77,10 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         one = chosen[index]
         if one is None or more.cost < one.cost:
             chosen[index] = more
+    for index in cut_short:
+        one = chosen[index]
+        if one is not None and asks_for_more(one):
+            chosen[index] = replace(one, may_be_more=True)
     return chosen
 
 
@@ -84,6 +89,7 @@ def _drop_beside_lines(
     parted: dict[int, Solution],
     shape: tuple[int, int],
     camera: Camera,
+    cut_short: set[int],
 ) -> None:
     """Hold several flares at rest against what moves: drop them, or take several that move.
 
@@ -104,22 +110,26 @@ def _drop_beside_lines(
     for index, one in lines.items():
         if index not in parted or parted[index].count > one.count + 1:
             poor[index] = one
-    for index, several in _parted(poor, shape, camera).items():
+    for index, several in _parted(poor, shape, camera, cut_short).items():
         if index not in parted or several.cost < parted[index].cost:
             parted[index] = several
 
 
-def _parted(plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera) -> dict[int, Solution]:
+def _parted(
+    plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera, cut_short: set[int]
+) -> dict[int, Solution]:
     """Deblend, and return by index what explains all that is seen: enough flares explain anything by half.
 
-    Flares that would shine where a window does not look explain nothing.
+    Flares that would shine where a window does not look explain nothing. Adds to `cut_short` where there may
+    be more than were looked for.
     """
     tried = [(index, one) for index, one in enumerate(plain) if one is not None]
     more = deblend([one for _, one in tried], camera)
+    cut_short.update(index for (index, _), several in zip(tried, more, strict=True) if several.may_be_more)
     return {
         index: several
         for (index, one), several in zip(tried, more, strict=True)
-        if several is not one
+        if several.count > one.count
         and several.left_over.is_good
         and several.left_over.structure_e == 0.0
         and not any(is_hardly_seen(several, k, shape) for k in range(several.count))

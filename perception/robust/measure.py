@@ -49,6 +49,7 @@ class MeasuredFlare:
     saturated: bool = False
     misfit: bool = False
     is_doubtful: bool = False
+    may_be_more: bool = False
     on_texture: bool = False
     on_edges: bool = False
 
@@ -178,6 +179,7 @@ def _measurement(
         saturated=saturated,
         misfit=misfit,
         is_doubtful=solution.is_doubtful or hidden > log_sigma,
+        may_be_more=solution.may_be_more,
         on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges or left.peak_sigmas > RESIDUAL_SIGMAS,
     )

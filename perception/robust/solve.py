@@ -117,6 +117,8 @@ class Solution:
         that costs a priori (`model.window`).
     is_doubtful
         Whether another number of flares explains the window nearly as well (`motion.weighed`).
+    may_be_more
+        Whether more flares were not looked for, as there are too many already (`deblend`).
     """
 
     window: Window
@@ -141,6 +143,7 @@ class Solution:
     motion_px: Array | None = None
     motion_cost: float = 0.0
     is_doubtful: bool = False
+    may_be_more: bool = False
 
     @property
     def cost(self) -> float:
