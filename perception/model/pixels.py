@@ -22,10 +22,9 @@ MOST_STEPS = 50
 SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 LEAST_PIVOT = 1e-10
-LOG_RANGE_BOUND = 12.0
+LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
 
-_SQRT_HALF = math.sqrt(0.5)
-_LOG_SQRT_2_PI = 0.5 * math.log(2.0 * math.pi)
+_SQRT_HALF, _LOG_SQRT_2_PI = math.sqrt(0.5), 0.5 * math.log(2.0 * math.pi)
 
 
 @compiled
@@ -307,12 +306,13 @@ def inverted(matrix: Array, inverse: Array) -> float:
 
 @compiled
 def _is_inside(values: Array, view: View, count: int, step: int) -> bool:
-    """Tell whether all sources are on the window's pixels, at ranges that can be."""
+    """Tell whether all sources are on the window's pixels, at ranges and motions that can be."""
     rows, columns = view.image_e.shape
     for at in range(0, count * step, step):
         column, row = values[at] - view.left, values[at + 1] - view.top
         on_pixels = -0.5 < column < columns - 0.5 and -0.5 < row < rows - 0.5
-        if not (on_pixels and abs(values[at + 2]) < LOG_RANGE_BOUND):
+        near = step < 5 or math.hypot(values[at + step - 2], values[at + step - 1]) < MOTION_BOUND_PX
+        if not (on_pixels and near and abs(values[at + 2]) < LOG_RANGE_BOUND):
             return False
     return bool(np.isfinite(values).all())
 

@@ -34,8 +34,10 @@ TURN_RAD_PER_S = 0.5
 MOTION_PX = 8.0
 """Standard deviation of each part of a motion in fits and bounds: hardly any prior; `motion_cost` has it."""
 
-_OTHERWISE = 1e-8  # how often neither holds: a blow, a machine that is far quicker
-_MOST_PX = 10.0
+MOST_MOTION_PX = 10.0
+"""What seems to move farther during an exposure is the edge of something, and no flare."""
+
+_OTHERWISE = 1e-8  # how often robots are not as slow: a blow, a machine that is far quicker
 
 
 @dataclass(frozen=True)
@@ -195,6 +197,6 @@ def motion_cost(motion_px: Array, log_range: Array, covariance_px2: Array, camer
     focal_px = math.sqrt(calibration.fx_px * calibration.fy_px)
     sigma2_px2 = (focal_px * camera.exposure_s * turn_rad_per_s) ** 2
     usual = np.exp(-0.5 * (motion_px**2).sum(axis=1) / sigma2_px2) / (math.pi * sigma2_px2)
-    prior = (1.0 - _OTHERWISE) * usual + _OTHERWISE / (0.5 * math.pi * _MOST_PX**2)
+    prior = (1.0 - _OTHERWISE) * usual + _OTHERWISE / (0.5 * math.pi * MOST_MOTION_PX**2)
     least = np.log(np.linalg.det(covariance_px2))
     return float(np.maximum(-2.0 * np.log(2.0 * math.pi * prior), least).sum())

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from perception.model.layout import UNUSABLE
-from perception.model.window import Camera
+from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.deblend import asks_for_more, deblend, of_free_width
 from perception.robust.goodness import halo_sigmas
@@ -130,6 +130,7 @@ def _parted(
         index: several
         for (index, one), several in zip(tried, more, strict=True)
         if several.count > one.count
+        and several.most_motion_px <= MOST_MOTION_PX
         and several.left_over.is_good
         and several.left_over.structure_e == 0.0
         and not any(is_hardly_seen(several, k, shape) for k in range(several.count))

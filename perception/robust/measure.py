@@ -124,7 +124,9 @@ def _judged(
     """Turn a solution into measurements, if it is one of sources."""
     left = solution.left_over
     misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
-    doubted = misfit or cluster.is_clipped
+    # An edge is long, too: what is drawn out on edges must leave hardly any of them.
+    drawn_out = solution.motion_px is not None and solution.window.on_edges
+    doubted = misfit or cluster.is_clipped or drawn_out
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
     if doubted and left.share > most_left:
         return []

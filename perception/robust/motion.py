@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.window import Camera
+from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.deblend import asks_for_more
 from perception.robust.goodness import drawn_out
 from perception.robust.solve import Motion, Problem, Solution, solve
@@ -56,7 +56,7 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
     return {
         index: weighed(fit, at_rest) if fit.cost < at_rest.cost else weighed(at_rest, fit)
         for (index, at_rest), fit in zip(tried, fits, strict=True)
-        if fit is not None
+        if fit is not None and fit.most_motion_px <= MOST_MOTION_PX
     }
 
 

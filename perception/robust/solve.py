@@ -175,6 +175,11 @@ class Solution:
         )
 
     @property
+    def most_motion_px(self) -> float:
+        """How far that moves which moves farthest; 0 where nothing may."""
+        return 0.0 if self.motion_px is None else float(np.hypot(*self.motion_px.T).max())
+
+    @property
     def motions(self) -> list[Motion] | None:
         """How they move as first guesses of another fit."""
         return None if self.motion_px is None else [(float(u), float(v)) for u, v in self.motion_px]
