@@ -95,7 +95,11 @@ def _seen(solution: Solution, box: PixelBox) -> Motion:
         window.floor_e2,
         window.prnu,
     )
-    return (along_u, along_v) if chi2 > SEEMS_CHI2 and math.hypot(along_u, along_v) > LEAST_PX else AT_REST
+    length_px = math.hypot(along_u, along_v)
+    if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
+        return AT_REST
+    shorter = min(1.0, 0.5 * MOST_MOTION_PX / length_px)
+    return shorter * along_u, shorter * along_v
 
 
 def _around(solution: Solution, flare: int) -> PixelBox:
