@@ -1,4 +1,4 @@
-"""Flares that move while they are exposed, of the brute-force simulator of `benchmarks/drawn_out.py`."""
+"""Flares that move while they are exposed, by brute force."""
 
 import math
 from dataclasses import replace
@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 import perception
-from benchmarks.drawn_out import CAMERA, drawn, drawn_out_e, lit_for
 from perception.model.fisher import flare_limits
 from perception.model.window import Camera, motion_cost
 from perception.robust.goodness import drawn_out
 from perception.types import Calibration, Detections
+from tests.moving_flares import CAMERA, drawn, drawn_out_e, lit_for
 from tests.unit.perception.simulation import expose, random
 
 Array = NDArray[np.float64]
