@@ -59,15 +59,15 @@ def main() -> None:
                     errors[int(length)].append((off_m / range_m, off_m / hit.range_sigma_m, *off))
     figures = {}
     for length in sorted(count):
-        found, off = np.array(count[length]), np.array(errors[length]).reshape(-1, 4)
+        found, pulls = np.array(count[length]), np.array(errors[length]).reshape(-1, 4)
         figures[f"{length} to {length + 1} px"] = {
             "flares": len(found),
             "split": round(float(np.mean(found > 1)), 5),
             "not_found": round(float(np.mean(found == 0)), 5),
             "merged": round(float(np.mean(merged[length])), 5),
-            "range_bias": round(float(np.median(off[:, 0])), 4),
-            "range_pull_rms": round(float(np.sqrt(np.mean(off[:, 1] ** 2))), 2),
-            "place_pull_rms": round(float(np.sqrt(np.mean(off[:, 2:] ** 2))), 2),
+            "range_bias": round(float(np.median(pulls[:, 0])), 4),
+            "range_pull_rms": round(float(np.sqrt(np.mean(pulls[:, 1] ** 2))), 2),
+            "place_pull_rms": round(float(np.sqrt(np.mean(pulls[:, 2:] ** 2))), 2),
         }
     seconds = round(time.perf_counter() - started, 1)
     print(json.dumps({"benchmark": "drawn_out", "seconds": seconds, "length": figures}, indent=2))

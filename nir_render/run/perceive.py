@@ -82,8 +82,9 @@ def chosen_estimators(names: Sequence[str], limit_s: float | None = None) -> dic
     chosen: dict[str, RunEstimator] = {}
     for name in dict.fromkeys(names):
         if name in ESTIMATORS:
-            limited = limit_s is not None and ESTIMATORS[name] is detect_robust
-            chosen[name] = partial(detect_robust, limit_s=limit_s) if limited else ESTIMATORS[name]
+            chosen[name] = ESTIMATORS[name]
+            if limit_s is not None and ESTIMATORS[name] is detect_robust:
+                chosen[name] = partial(detect_robust, limit_s=limit_s)
             continue
         if ":" not in name and not name.endswith(".py"):
             known = ", ".join(ESTIMATORS)

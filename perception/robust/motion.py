@@ -73,7 +73,7 @@ def weighed(solution: Solution, other: Solution) -> Solution:
     nearest = np.argmin(apart, axis=1)
 
     def wider(sigma: Array, own: Array, others: Array) -> Array:
-        return np.hypot(sigma, math.sqrt(share) * (others[nearest] - own))
+        return np.asarray(np.hypot(sigma, math.sqrt(share) * (others[nearest] - own)))
 
     return replace(
         solution,
@@ -90,8 +90,10 @@ def _seen(solution: Solution, box: PixelBox) -> Motion:
     window = solution.window
     part = box.seen_from(window.box).slices
     chi2, along_u, along_v = drawn_out(
-        *(np.ascontiguousarray(each[part]) for each in (window.image_e, window.state)),
-        *(np.ascontiguousarray(each[part]) for each in (solution.expected_e, solution.flares_e)),
+        np.ascontiguousarray(window.image_e[part]),
+        np.ascontiguousarray(window.state[part]),
+        np.ascontiguousarray(solution.expected_e[part]),
+        np.ascontiguousarray(solution.flares_e[part]),
         window.floor_e2,
         window.prnu,
     )
