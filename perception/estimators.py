@@ -101,6 +101,8 @@ def detect_frames(
     frames: Sequence[RawFrame],
     calibrations: Mapping[str, Calibration],
     estimator: str | Estimator = "robust",
+    *,
+    limit_s: float = math.inf,
 ) -> list[Detections]:
     """Find the flares of several frames, such as those of a robot's cameras, side by side on all cores.
 
@@ -112,6 +114,8 @@ def detect_frames(
         Of each camera, by its name.
     estimator
         As for `detect`; one's own is called by several threads at once.
+    limit_s
+        As for `detect`, of each frame.
 
     Returns
     -------
@@ -129,7 +133,7 @@ def detect_frames(
         )
 
     def found(frame: RawFrame) -> Detections:
-        return detect(frame, calibrations[frame.camera], estimator)
+        return detect(frame, calibrations[frame.camera], estimator, limit_s=limit_s)
 
     if len(frames) < 2:
         return [found(frame) for frame in frames]

@@ -102,6 +102,8 @@ class Pipeline:
         which is helped by a `PairReader` while two tracks are in one place of the image.
     keep_signals
         Whether `signals` is to know them all: a robot that runs for days has no use for that.
+    limit_s
+        As for `detect`, of each frame.
     """
 
     def __init__(
@@ -111,8 +113,10 @@ class Pipeline:
         tracker: Follows | None = None,
         decoder: Callable[[str, int], Reads] = Decoder,
         keep_signals: bool = False,
+        limit_s: float = math.inf,
     ) -> None:
         self._calibrations = calibrations
+        self._limit_s = limit_s
         self._estimator = estimator
         self._tracker: Follows = Tracker() if tracker is None else tracker
         self._decoder = decoder
@@ -162,7 +166,8 @@ class Pipeline:
         ValueError
             There are no frames, or those of another robot than before; as for `detect`.
         """
-        return self.follow(frames, detect_frames(frames, self._calibrations, self._estimator), odometry)
+        found = detect_frames(frames, self._calibrations, self._estimator, limit_s=self._limit_s)
+        return self.follow(frames, found, odometry)
 
     def follow(
         self,

@@ -61,9 +61,12 @@ CalibrationFile = Annotated[
     ),
 ]
 TimeLimit = Annotated[
-    float,
+    float | None,
     typer.Option(
-        "--time-limit", metavar="S", help="Seconds that an estimator 'cmd: …' may take for a frame."
+        "--time-limit",
+        metavar="S",
+        help="Seconds for a frame: an estimator 'cmd: …' that takes longer fails (60 by default), and robust "
+        "begins with no further flare.",
     ),
 ]
 KeepLight = Annotated[
@@ -97,12 +100,12 @@ def read_scene(path: Path, settings: list[str] | None, seed: int | None) -> "Sce
     return load_scene(path, overrides if seed is None else {**overrides, "seed": seed})
 
 
-def chosen_estimators(names: list[str] | None, time_limit_s: float) -> "dict[str, RunEstimator]":
+def chosen_estimators(names: list[str] | None, time_limit_s: float | None) -> "dict[str, RunEstimator]":
     """Return the estimators that `--estimator` names; paper and robust if none is named."""
     from nir_render.run.perceive import chosen_estimators
     from perception import ESTIMATORS
 
-    if not (math.isfinite(time_limit_s) and time_limit_s > 0.0):
+    if time_limit_s is not None and not (math.isfinite(time_limit_s) and time_limit_s > 0.0):
         raise InputError(f"--time-limit {time_limit_s:g}: wanted seconds above 0, such as 60")
     return chosen_estimators(names or list(ESTIMATORS), time_limit_s)
 

@@ -42,7 +42,7 @@ def run(
     estimators: Estimators = None,
     tracker: OwnTracker = None,
     decoder: OwnDecoder = None,
-    time_limit_s: TimeLimit = 60.0,
+    time_limit_s: TimeLimit = None,
     overwrite: Overwrite = False,
     seed: Seed = None,
     threads: Threads = None,
@@ -121,7 +121,7 @@ def perceive(
         bool,
         typer.Option("--causes", help="Also write what each range's σ is made of: causes.NAME.jsonl."),
     ] = False,
-    time_limit_s: TimeLimit = 60.0,
+    time_limit_s: TimeLimit = None,
     as_json: Json = False,
 ) -> None:
     """Detect and range flares in the frames of any folder, also one recorded by a real camera."""

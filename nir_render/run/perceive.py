@@ -38,6 +38,7 @@ from perception.command_estimator import LIMIT_S, is_command
 from perception.messages.own import DecoderError
 from perception.rig.frame_sets import robot_of
 from perception.rig.overlap import finest, overlap_warnings
+from perception.robust.detect import detect_robust
 from perception.robust.reason import NO_FAULT
 from perception.track.own import TrackerError
 from perception.types import FrameKey, Odometry
@@ -66,11 +67,12 @@ class Perceived:
         return tuple(f"--estimator {text}" for text in self.failures.values())
 
 
-def chosen_estimators(names: Sequence[str], limit_s: float = LIMIT_S) -> dict[str, RunEstimator]:
+def chosen_estimators(names: Sequence[str], limit_s: float | None = None) -> dict[str, RunEstimator]:
     """Return the estimators of these names, by name.
 
     `file.py:function` loads one of the user's own, `cmd: …` and `NAME=cmd: …` are programs, which may take
-    `limit_s` for a frame.
+    `limit_s` for a frame, by default a minute. After so much `robust` begins with no further flare, if it is
+    given.
 
     Raises
     ------
@@ -81,6 +83,8 @@ def chosen_estimators(names: Sequence[str], limit_s: float = LIMIT_S) -> dict[st
     for name in dict.fromkeys(names):
         if name in ESTIMATORS:
             chosen[name] = ESTIMATORS[name]
+            if limit_s is not None and ESTIMATORS[name] is detect_robust:
+                chosen[name] = partial(detect_robust, limit_s=limit_s)
             continue
         if ":" not in name and not name.endswith(".py"):
             known = ", ".join(ESTIMATORS)
@@ -89,7 +93,7 @@ def chosen_estimators(names: Sequence[str], limit_s: float = LIMIT_S) -> dict[st
                 "'cmd: PROGRAM'"
             )
         try:
-            own = load_command(name, limit_s) if is_command(name) else load_estimator(name)
+            own = load_command(name, limit_s or LIMIT_S) if is_command(name) else load_estimator(name)
         except EstimatorError as error:
             raise InputError(f"--estimator {error}") from None
         if own.name in chosen:
@@ -279,7 +283,7 @@ class _Notes:
                     yield from self._nothing(name, f" of {camera}", faults)
         if self.truncated:
             frames = "one frame" if self.truncated == 1 else f"{self.truncated} frames"
-            yield f"{name} saw more in {frames} than it measures: the brightest alone are reported"
+            yield f"{name} saw more in {frames} than it measures: the brightest are reported and told apart"
 
     @staticmethod
     def _nothing(name: str, whose: str, reasons: Counter[str]) -> Iterator[str]:

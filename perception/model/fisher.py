@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from perception.model.layout import Layout, Structure, View, even
 from perception.model.pixels import expectation
 from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import clip_level_e, noise_floor_e2, pixel_variance_e2
-from perception.model.window import Camera, lay_out
+from perception.model.window import MOTION_PX, Camera, lay_out
 from perception.types import Calibration
 
 WIDE_PX = 64.0
@@ -174,6 +174,7 @@ def flare_limits(
     *,
     clipped_tell_nothing: bool = True,
     structure: Structure | None = None,
+    motions_px: Sequence[tuple[float, float]] | None = None,
 ) -> list[FlareLimit]:
     """Cramér–Rao bounds of flares in one another's light: places, ranges and the background are all unknown.
 
@@ -193,6 +194,9 @@ def flare_limits(
         Count pixels as clipped where the camera would clip them: they tell no more than that they are.
     structure
         What else may lie on the background, for a window of `limit_box`.
+    motions_px
+        How far each moves along u and v during the exposure, which is not known beforehand; by default none
+        does, and that is known.
 
     Returns
     -------
@@ -215,7 +219,7 @@ def flare_limits(
             else flare_limit(calibration, *flare, background_e, clipped_tell_nothing=clipped_tell_nothing)
             for flare, angle, radius in zip(flares, radius_rad, radius_px, strict=True)
         ]
-    known = _known(calibration, place, background_e, clipped_tell_nothing, structure)
+    known = _known(calibration, place, background_e, clipped_tell_nothing, structure, motions_px)
     if known is None:
         return [FlareLimit(math.inf, math.inf, math.inf, math.inf)] * len(flares)
     return _limits(known.camera, known.layout, place, known.inverse)
@@ -302,12 +306,18 @@ def _known(
     background_e: float,
     clipped_tell_nothing: bool,
     structure: Structure | None,
+    motions_px: Sequence[tuple[float, float]] | None = None,
 ) -> _Known | None:
     """Return what is known of flares, shape (flares, 4) as in `flare_limits`; None if nothing is."""
-    box = limit_box(calibration, place)
-    camera = Camera(calibration, 1.0, 1.0)
+    box, camera, moved_px = limit_box(calibration, place), Camera(calibration, 1.0, 1.0), None
+    if motions_px is not None:
+        camera = replace(camera, motion_px=MOTION_PX)
+        moved_px = np.hypot(*np.array(motions_px, dtype=np.float64).T)
+        box = box.with_margin(math.ceil(float(moved_px.max()))).inside(
+            (calibration.height_px, calibration.width_px)
+        )
     log_range, pixels = np.log(place[:, 2]), box.height * box.width
-    sources, imaged = lay_out(camera, place[:, 0], place[:, 1], log_range)
+    sources, imaged = lay_out(camera, place[:, 0], place[:, 1], log_range, moved_px=moved_px)
     if not imaged.all() or pixels == 0:
         return None
     clip_e = clip_level_e(calibration, calibration.black_level_dn) if clipped_tell_nothing else math.inf
@@ -316,6 +326,8 @@ def _known(
     values = np.zeros(layout.size)
     own = layout.of_sources(values)
     own[:, 0], own[:, 1], own[:, 2] = place[:, 0], place[:, 1], log_range
+    if motions_px is not None:
+        own[:, layout.motion :] = motions_px
     values[layout.background] = background_e
     expected_e, variance_e2, jacobian = np.empty(pixels), np.empty(pixels), np.empty((layout.size, pixels))
     at_1_m = sources._replace(log_flux_at_1_m=np.log(place[:, 3]) + 2.0 * log_range)
@@ -328,7 +340,8 @@ def _known(
     used = telling > _LEAST_TELLING
     jacobian, expected_e = jacobian[:, used], expected_e[used]
     variance_e2, telling = variance_e2[used], telling[used]
-    inverse = covariance(fisher_information(jacobian, variance_e2 / telling) + layout.prior(structure))
+    prior = layout.prior(structure, known.motion_px)
+    inverse = covariance(fisher_information(jacobian, variance_e2 / telling) + prior)
     if inverse is None:
         return None
     used = used.reshape(box.height, box.width)

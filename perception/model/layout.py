@@ -12,25 +12,33 @@ Array = NDArray[np.float64]
 UNUSABLE, SEEN, CLIPPED = 0, 1, 2
 """What a pixel may be."""
 
-_MOST_STEP = (1.0, 1.0, 0.5, 3.0)  # px, px, ln range, σ
+_MOST_STEP = (1.0, 1.0, 0.5)  # px, px, ln range
+_MOST_SLACK, _MOST_MOTION_PX = 3.0, 1.0
 
 
 @dataclass(frozen=True)
 class Layout:
     """Where each unknown of a window stands in its vector.
 
-    For each source u, v, l, and its slack if it has one; then w if the width is not exact, B, and c.
+    For each source u, v, l, its slack if it has one, and how far it moves along u and v if it does; then w if
+    the width is not exact, B, and c.
     """
 
     sources: int
     has_slack: bool
+    moves: bool
     has_width: bool
     structure: int
 
     @cached_property
     def per_source(self) -> int:
         """Unknowns of each source."""
-        return 4 if self.has_slack else 3
+        return 3 + self.has_slack + 2 * self.moves
+
+    @cached_property
+    def motion(self) -> int:
+        """Index of the first of a source's two unknowns of motion among its own."""
+        return 3 + self.has_slack
 
     @cached_property
     def width(self) -> int:
@@ -55,17 +63,22 @@ class Layout:
     def most_step(self) -> Array:
         """How far each unknown may move in one step of a fit that trusts its slopes, shape (unknowns,)."""
         most = np.full(self.size, np.inf)
-        most[: self.width] = _MOST_STEP[: self.per_source] * self.sources
+        of_source = (*_MOST_STEP, *(_MOST_SLACK,) * self.has_slack, *(_MOST_MOTION_PX,) * (2 * self.moves))
+        most[: self.width] = of_source * self.sources
         if self.has_width:
-            most[self.width] = _MOST_STEP[3]
+            most[self.width] = _MOST_SLACK
         return most
 
-    def prior(self, structure: "Structure") -> Array:
-        """Return the prior precision of the unknowns, shape (unknowns, unknowns)."""
+    def prior(self, structure: "Structure", motion_px: float) -> Array:
+        """Return the prior precision of the unknowns, shape (unknowns, unknowns); `motion_px` of `Known`."""
         precision = np.zeros((self.size, self.size))
         if self.has_slack:
-            slack = np.arange(3, self.width, 4)
+            slack = np.arange(3, self.width, self.per_source)
             precision[slack, slack] = 1.0
+        if self.moves:
+            for motion in (self.motion, self.motion + 1):
+                moved = np.arange(motion, self.width, self.per_source)
+                precision[moved, moved] = 1.0 / motion_px**2
         if self.has_width:
             precision[self.width, self.width] = 1.0
         precision[self.background + 1 :, self.background + 1 :] = structure.precision
@@ -78,19 +91,22 @@ _layout = lru_cache(maxsize=256)(Layout)  # every window asks for one, and most 
 class Known(NamedTuple):
     """What is known of a camera; which unknowns a window has follows from it.
 
-    `tie_spread` and `width_spread` are those of `window.Camera`: where they are 0 no source has a slack, and
-    no window a width. `clip_e` may be infinite.
+    `tie_spread`, `width_spread` and `motion_px` are those of `window.Camera`: where they are 0 no source
+    has a slack, no window a width, and nothing moves. `clip_e` may be infinite.
     """
 
     psf_sigma_px: float
     tie_spread: float
     width_spread: float
+    motion_px: float
     clip_e: float
     prnu: float
 
     def layout(self, sources: int, structure: int) -> Layout:
         """Return where the unknowns of so many sources and amplitudes stand."""
-        return _layout(sources, self.tie_spread > 0.0, self.width_spread > 0.0, structure)
+        return _layout(
+            sources, self.tie_spread > 0.0, self.motion_px > 0.0, self.width_spread > 0.0, structure
+        )
 
 
 class Sources(NamedTuple):
@@ -103,6 +119,8 @@ class Sources(NamedTuple):
     node_u_px, node_v_px, weight
         Where nodes are, relative to the source's place, and their share of its light, shape (nodes,).
         Infinite where there is no image: that light falls on no pixel.
+    node_along
+        By what part of its motion during the exposure each lies off, -½ to ½, same shape; 0 where none moves.
     log_range_at
         ln of the range for whose size they are laid out, shape (sources,).
     log_flux_at_1_m
@@ -112,6 +130,7 @@ class Sources(NamedTuple):
     first_node: NDArray[np.int64]
     node_u_px: Array
     node_v_px: Array
+    node_along: Array
     weight: Array
     log_range_at: Array
     log_flux_at_1_m: Array
@@ -123,6 +142,7 @@ class Sources(NamedTuple):
             self.first_node[first : end + 1] - nodes.start,
             self.node_u_px[nodes],
             self.node_v_px[nodes],
+            self.node_along[nodes],
             self.weight[nodes],
             self.log_range_at[first:end],
             self.log_flux_at_1_m[first:end],

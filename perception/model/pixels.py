@@ -3,9 +3,8 @@
 Each pixel counts as x + σ² ~ Poisson(λ + σ²), σ² the variance of a dark pixel (Snyder et al., J. Opt. Soc.
 Am. A 12, 272, 1995), widened by the spread of the pixels' responses; its score is (x - λ) / variance. A
 clipped pixel says only that x is c or more: its score is φ(z) / (σ Q(z)), z = (c - λ) / σ. Variances come
-from the model, not from the data: weights from the data would favour pixels that came out low.
-
-All that is here is compiled, one window at a time; `model.window` says what the unknowns are.
+from the model, not from the data: weights from the data would favour pixels that came out low. All that is
+here is compiled, one window at a time; `model.window` says what the unknowns are.
 """
 
 import math
@@ -23,10 +22,9 @@ MOST_STEPS = 50
 SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 LEAST_PIVOT = 1e-10
-LOG_RANGE_BOUND = 12.0
+LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
 
-_SQRT_HALF = math.sqrt(0.5)
-_LOG_SQRT_2_PI = 0.5 * math.log(2.0 * math.pi)
+_SQRT_HALF, _LOG_SQRT_2_PI = math.sqrt(0.5), 0.5 * math.log(2.0 * math.pi)
 
 
 @compiled
@@ -60,32 +58,33 @@ def shares(at_px: float, count: int, sigma_px: float, into: Array) -> tuple[int,
 
 @compiled
 def spread_nodes(
-    sources: Sources, source: int, place: tuple[float, float], growth: float, sigma_px: float, image: Array
-) -> None:
+    sources: Sources, source: int, place: tuple[float, float], growth: float, motion: tuple[float, float],
+    sigma_px: float, image: Array,
+) -> None:  # fmt: skip
     """Integrate one source's image over the pixels of a window.
 
     Parameters
     ----------
-    sources, source
-        Which one.
-    place
-        Column and row of it in the window.
-    growth
-        Factor on the size for which it is laid out.
+    sources, source, place
+        Which one, and its column and row in the window.
+    growth, motion
+        Factor on the size for which it is laid out, and how far it moves along columns and rows during the
+        exposure, evenly, half of it before `place`.
     sigma_px
         Width of the point spread.
     image
-        Zeros of shape (5, rows, columns): the share of its flux in each pixel is added, and that share's
-        derivatives by column, row, ln size and ln width of the point spread.
+        Zeros of shape (5 or 7, rows, columns): the share of its flux in each pixel is added, and that share's
+        derivatives by column, row, ln size and ln width of the point spread, and by both parts of its motion.
     """
-    _, rows, columns = image.shape
+    planes, rows, columns = image.shape
     across, down = np.empty((3, columns)), np.empty((3, rows))
     for node in range(sources.first_node[source], sources.first_node[source + 1]):
         out_u, out_v = growth * sources.node_u_px[node], growth * sources.node_v_px[node]
         if not (math.isfinite(out_u) and math.isfinite(out_v)):
             continue
-        left, right = shares(place[0] + out_u, columns, sigma_px, across)
-        top, bottom = shares(place[1] + out_v, rows, sigma_px, down)
+        along = sources.node_along[node]
+        left, right = shares(place[0] + (out_u + along * motion[0]), columns, sigma_px, across)
+        top, bottom = shares(place[1] + (out_v + along * motion[1]), rows, sigma_px, down)
         weight = sources.weight[node]
         in_u, by_u, wider_u = across[0, left:right], across[1, left:right], across[2, left:right]
         for row in range(top, bottom):
@@ -98,6 +97,9 @@ def spread_nodes(
                 line[2, column] += by_v_here
                 line[3, column] += out_u * by_u_here + out_v * by_v_here
                 line[4, column] += in_v * wider_u[column] + wider_v * in_u[column]
+                if planes == 7:
+                    line[5, column] += along * by_u_here
+                    line[6, column] += along * by_v_here
 
 
 @compiled
@@ -116,43 +118,44 @@ def expectation(
     expected, jacobian, variance
         Shape (pixels,), (unknowns, pixels) and (pixels,): written; the last as `sensor.pixel_variance_e2`.
     """
-    count, step = len(sources.log_range_at), 4 if known.tie_spread > 0.0 else 3
+    count, has_slack, moves = len(sources.log_range_at), known.tie_spread > 0.0, known.motion_px > 0.0
+    step = 3 + has_slack + 2 * moves
     width = count * step
     background = width + (1 if known.width_spread > 0.0 else 0)
     sigma_px = known.psf_sigma_px
     if known.width_spread > 0.0:
         sigma_px *= math.exp(known.width_spread * values[width])
         jacobian[width] = 0.0
-    expected[:] = values[background]
-    jacobian[background] = 1.0
+    expected[:], jacobian[background] = values[background], 1.0
     for wave in range(len(structure.columns)):
-        amplitude = values[background + 1 + wave]
-        for pixel in range(len(expected)):
-            expected[pixel] += amplitude * structure.columns[wave, pixel]
-            jacobian[background + 1 + wave, pixel] = structure.columns[wave, pixel]
-    image = np.empty((5, *view.image_e.shape))
-    flat = image.reshape(5, -1)
+        expected += values[background + 1 + wave] * structure.columns[wave]
+        jacobian[background + 1 + wave] = structure.columns[wave]
+    image = np.empty((7 if moves else 5, *view.image_e.shape))
+    flat = image.reshape(len(image), -1)
+    motion = (0.0, 0.0)
     for source in range(count):
         at = source * step
         by_size = values[at + 2]
-        if step == 4:
+        if has_slack:
             by_size -= known.tie_spread * values[at + 3]
+        if moves:
+            motion = (values[at + step - 2], values[at + step - 1])
         image[:] = 0.0
         place = (values[at] - view.left, values[at + 1] - view.top)
         growth = math.exp(sources.log_range_at[source] - by_size)
-        spread_nodes(sources, source, place, growth, sigma_px, image)
+        spread_nodes(sources, source, place, growth, motion, sigma_px, image)
         flux = math.exp(sources.log_flux_at_1_m[source] - 2.0 * values[at + 2])
         for pixel in range(len(expected)):
             expected[pixel] += flux * flat[0, pixel]
             jacobian[at, pixel] = flux * flat[1, pixel]
             jacobian[at + 1, pixel] = flux * flat[2, pixel]
             jacobian[at + 2, pixel] = -flux * (2.0 * flat[0, pixel] + flat[3, pixel])
-        if step == 4:
-            for pixel in range(len(expected)):
-                jacobian[at + 3, pixel] = known.tie_spread * flux * flat[3, pixel]
+        if has_slack:
+            jacobian[at + 3] = known.tie_spread * flux * flat[3]
+        if moves:
+            jacobian[at + step - 2], jacobian[at + step - 1] = flux * flat[5], flux * flat[6]
         if known.width_spread > 0.0:
-            for pixel in range(len(expected)):
-                jacobian[width, pixel] += known.width_spread * flux * flat[4, pixel]
+            jacobian[width] += known.width_spread * flux * flat[4]
     for pixel in range(len(expected)):
         lit_e = max(expected[pixel], 0.0)
         variance[pixel] = lit_e + (known.prnu * lit_e) ** 2 + view.floor_e2
@@ -303,13 +306,13 @@ def inverted(matrix: Array, inverse: Array) -> float:
 
 @compiled
 def _is_inside(values: Array, view: View, count: int, step: int) -> bool:
-    """Tell whether all sources are on the window's pixels, at ranges that can be."""
+    """Tell whether all sources are on the window's pixels, at ranges and motions that can be."""
     rows, columns = view.image_e.shape
     for at in range(0, count * step, step):
         column, row = values[at] - view.left, values[at + 1] - view.top
-        if not (-0.5 < column < columns - 0.5 and -0.5 < row < rows - 0.5):
-            return False
-        if not abs(values[at + 2]) < LOG_RANGE_BOUND:
+        on_pixels = -0.5 < column < columns - 0.5 and -0.5 < row < rows - 0.5
+        near = step < 5 or math.hypot(values[at + step - 2], values[at + step - 1]) < MOTION_BOUND_PX
+        if not (on_pixels and near and abs(values[at + 2]) < LOG_RANGE_BOUND):
             return False
     return bool(np.isfinite(values).all())
 
@@ -339,7 +342,7 @@ def maximise(
     priors; both infinite where no step below a hundredth of a standard deviation was reached.
     """
     size, pixels, count = len(values), len(expected), len(sources.log_range_at)
-    step = 4 if known.tie_spread > 0.0 else 3
+    step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
     jacobian, new_jacobian = np.empty((size, pixels)), np.empty((size, pixels))
     new_expected, variance, new_variance = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     gradient, trial, clip_e = np.empty(size), np.empty(size), known.clip_e

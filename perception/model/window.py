@@ -5,7 +5,9 @@ background B with structure. Range sets flux *and* size: with l the logarithm of
 says, F = F₁ e^(-2l), F₁ the flux at one metre, and ρ = (r / 1 m) e^(-l + σ_t a). The slack a, a priori normal
 with variance 1, is by how much the size may disagree with the flux: σ_t² = (σ_K / 2K)² + (σ_r / r)², so a
 source whose flux is not to be trusted is ranged by its size. The width of the point spread is free within its
-own σ: σ_psf e^(σ_w w). These priors enter as `precision` does for the structure's amplitudes c.
+own σ: σ_psf e^(σ_w w). These priors enter as `precision` does for the structure's amplitudes c. A flare that
+moves by m during the exposure, evenly, is drawn out along a line: the mean of S(u + s m) over s from -½ to ½,
+u its place in the middle of the exposure.
 """
 
 import math
@@ -23,6 +25,20 @@ from perception.types import Calibration
 
 Array = NDArray[np.float64]
 
+SPEED_M_PER_S = 0.7
+"""Of one robot past another, standard deviation across the line of sight, per axis: 0.5 m/s each."""
+
+TURN_RAD_PER_S = 0.5
+"""Of the observer about itself, standard deviation per axis."""
+
+MOTION_PX = 8.0
+"""Standard deviation of each part of a motion in fits and bounds: hardly any prior; `motion_cost` has it."""
+
+MOST_MOTION_PX = 10.0
+"""What seems to move farther during an exposure is the edge of something, and no flare."""
+
+_OTHERWISE = 1e-8  # how often robots are not as slow: a blow, a machine that is far quicker
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -34,11 +50,14 @@ class Camera:
         Of the camera.
     exposure_s, gain
         Of the frame.
+    motion_px
+        How far flares may move during the exposure, the standard deviation of each part of it; 0: none does.
     """
 
     calibration: Calibration
     exposure_s: float
     gain: float
+    motion_px: float = 0.0
 
     @property
     def flux_spread(self) -> float:
@@ -72,7 +91,8 @@ class Camera:
         calibration = self.calibration
         tie_spread = self.tie_spread if self.radius_m > 0.0 else 0.0
         width_px, prnu = float(calibration.psf_sigma_px), float(calibration.prnu)
-        return Known(width_px, float(tie_spread), float(self.width_spread), float(clip_e), prnu)
+        width_spread, motion_px = float(self.width_spread), float(self.motion_px)
+        return Known(width_px, float(tie_spread), width_spread, motion_px, float(clip_e), prnu)
 
     def log_range(
         self, photometric: Array, slack: Array | None, covariance: Array
@@ -110,7 +130,12 @@ def _share(sigma: float, value: float) -> float:
 
 
 def lay_out(
-    camera: Camera, u_px: Array, v_px: Array, log_range: Array, hidden_e: Array | None = None
+    camera: Camera,
+    u_px: Array,
+    v_px: Array,
+    log_range: Array,
+    hidden_e: Array | None = None,
+    moved_px: Array | None = None,
 ) -> tuple[Sources, NDArray[np.bool_]]:
     """Lay sources out as quadrature nodes, all of them at once.
 
@@ -123,6 +148,8 @@ def lay_out(
     hidden_e
         What each would take away of the background from one metre, shape (sources,): so much its flux lacks.
         By default nothing.
+    moved_px
+        How far each moves at most during the exposure, shape (sources,). By default nothing does.
 
     Returns
     -------
@@ -140,7 +167,36 @@ def lay_out(
         u_px, v_px = np.where(imaged, u_px, calibration.cx_px), np.where(imaged, v_px, calibration.cy_px)
         direction = np.where(imaged[:, None], direction, (0.0, 0.0, 1.0))
         radius_rad = np.where(imaged, radius_rad, 0.0)
-    nodes = disc_nodes(u_px, v_px, direction, radius_rad, calibration)
+    nodes = disc_nodes(u_px, v_px, direction, radius_rad, calibration, moved_px)
     log_flux_at_1_m = np.log(np.where(at_1_m_e > 0.0, at_1_m_e, 1.0))
     at = np.ascontiguousarray(log_range)
-    return Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.weight, at, log_flux_at_1_m), imaged
+    sources = Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.along, nodes.weight, at, log_flux_at_1_m)
+    return sources, imaged
+
+
+def motion_cost(motion_px: Array, log_range: Array, covariance_px2: Array, camera: Camera) -> float:
+    """Return what it costs a priori that flares move so far: −2 ln (2π p) of each, summed.
+
+    Each part of a motion is normal, of the standard deviation f t √(ω² + (v/d)²) of robots at ordinary
+    speeds, t the exposure; once in 10⁸ it may be anything up to 10 px. m and −m are the same. That it
+    may move never speaks for a flare: the density is at most that of the estimate itself.
+
+    Parameters
+    ----------
+    motion_px
+        How far flares move along u and v, shape (flares, 2).
+    log_range
+        Logarithms of their ranges, shape (flares,).
+    covariance_px2
+        Of their motions, shape (flares, 2, 2).
+    camera
+        The camera, at the frame's exposure.
+    """
+    calibration = camera.calibration
+    turn_rad_per_s = np.hypot(TURN_RAD_PER_S, SPEED_M_PER_S * np.exp(-log_range))
+    focal_px = math.sqrt(calibration.fx_px * calibration.fy_px)
+    sigma2_px2 = (focal_px * camera.exposure_s * turn_rad_per_s) ** 2
+    usual = np.exp(-0.5 * (motion_px**2).sum(axis=1) / sigma2_px2) / (math.pi * sigma2_px2)
+    prior = (1.0 - _OTHERWISE) * usual + _OTHERWISE / (0.5 * math.pi * MOST_MOTION_PX**2)
+    least = np.log(np.linalg.det(covariance_px2))
+    return float(np.maximum(-2.0 * np.log(2.0 * math.pi * prior), least).sum())

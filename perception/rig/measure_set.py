@@ -1,5 +1,6 @@
 """The one call from a set of frames to who stands where."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from perception.rig.sightings import sightings_of
 from perception.types import (
     Calibration,
     Detection,
+    Detections,
     Measurement,
     MirrorPlane,
     Odometry,
@@ -33,6 +35,8 @@ def detect_set(
     estimator: str | Estimator = "robust",
     planes: Sequence[MirrorPlane] = (),
     odometry: Sequence[Odometry] = (),
+    *,
+    limit_s: float = math.inf,
 ) -> SetMeasurements:
     """Find the sources around a robot in a set of its cameras' frames.
 
@@ -48,6 +52,8 @@ def detect_set(
         Mirrors known from earlier sets, in the body axes of today.
     odometry
         As for `measure_set`.
+    limit_s
+        As for `detect`, of each frame.
 
     Returns
     -------
@@ -61,7 +67,7 @@ def detect_set(
     ValueError
         As for `detect`, if a camera has no calibration, or the frames are of several robots.
     """
-    found = detect_frames(frames, calibrations, estimator)
+    found = detect_frames(frames, calibrations, estimator, limit_s=limit_s)
     return measure_set(frames, found, calibrations, planes, odometry)
 
 
@@ -108,12 +114,19 @@ def measure_set(
         known, measurements, mirrors = _measured(frames, detections, calibrations, planes, odometry)
     seen = SetMeasurements(
         measurements,
-        tuple(map(tuple, detections)),
+        tuple(map(_kept, as_found, detections)),
         mirrors,
         *((extinction.per_m, extinction.sigma_per_m) if extinction is not None else ()),
     )
     cameras = tuple(dict.fromkeys(frame.camera for frame in frames))
     return replace(seen, robots=told_robots(known, detections, calibrations, measurements, cameras))
+
+
+def _kept(found: Sequence[Detection], now: Sequence[Detection]) -> Detections:
+    """Return a frame's detections, with what was said of them as a whole."""
+    if isinstance(found, Detections):
+        return Detections(now, reason=found.reason, truncated=found.truncated)
+    return Detections(now)
 
 
 def _measured(

@@ -41,27 +41,25 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
 
     Returns
     -------
-    The windows' solutions, those given where nothing is gained.
+    The windows' solutions, those given where nothing is gained; where the search was cut short they say so.
     """
     found = list(solutions)
     asking = [index for index, each in enumerate(found) if asks_for_more(each)]
     if not asking:
         return found
-    asking = sorted(sorted(asking, key=lambda index: -float(found[index].flux_e.max()))[:MOST_WINDOWS])
+    by_flux = sorted(asking, key=lambda index: -float(found[index].flux_e.max()))
+    asking, late = sorted(by_flux[:MOST_WINDOWS]), by_flux[MOST_WINDOWS:]
     lone = [index for index in asking if found[index].count == 1]
-    free = _with_spread(camera, "psf_sigma_px", _WIDTH_FREE)
-    of_free_width = solve([found[index].again() for index in lone], free)
+    of_any_width = of_free_width([found[index] for index in lone], camera)
     null = dict(enumerate(found))
     large = [index for index in lone if float(found[index].image_radius_px[0]) > _LEAST_RADIUS_PX]
     of_any_size = of_free_size([found[index] for index in large], camera)
-    for index, other in [*zip(lone, of_free_width, strict=True), *zip(large, of_any_size, strict=True)]:
+    for index, other in [*zip(lone, of_any_width, strict=True), *zip(large, of_any_size, strict=True)]:
         if other is not None and other.deviance < null[index].deviance:
             null[index] = other
     while asking:
         trials = [(index, starts) for index in asking for starts in _more(found[index])]
-        fits = solve(
-            [Problem(found[i].window, starts, found[i].background_e) for i, starts in trials], camera
-        )
+        fits = solve([_of_more(found[index], starts) for index, starts in trials], camera)
         best: dict[int, Solution] = {}
         for (index, _), fit in zip(trials, fits, strict=True):
             if fit is not None and (index not in best or fit.deviance < best[index].deviance):
@@ -70,8 +68,10 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
         for index, fit in best.items():
             if _gain(null[index], fit) >= LEAST_GAIN:
                 found[index] = null[index] = fit
-                if fit.count < MOST_FLARES and asks_for_more(fit):
-                    asking.append(index)
+                if asks_for_more(fit):
+                    (asking if fit.count < MOST_FLARES else late).append(index)
+    for index in late:
+        found[index] = replace(found[index], may_be_more=True)
     return found
 
 
@@ -85,6 +85,13 @@ def asks_for_more(solution: Solution) -> bool:
     if left.seen_chi2 > left.seen_pixels + LEAST_GAIN - 4.0 * math.sqrt(2.0 * left.seen_pixels):
         return True
     return left.peak_sigmas > RESIDUAL_SIGMAS
+
+
+def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
+    """Fit flares through a point spread that may be wider or narrower than the calibration says."""
+    if not solutions:
+        return []
+    return solve([one.again() for one in solutions], _with_spread(camera, "psf_sigma_px", _WIDTH_FREE))
 
 
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -106,6 +113,15 @@ def _gain(fewer: Solution, more: Solution) -> float:
     """Return by how much more flares explain a window better, as 2 Δ ln L with an imperfect model."""
     variance = more.variance_e2(MODEL_ERROR)
     return float(np.sum((fewer.residual_e**2 - more.residual_e**2) / variance))
+
+
+def _of_more(current: Solution, starts: Sequence[Start]) -> Problem:
+    """Return the problem of fitting more flares; where they move, each begins with the mean motion."""
+    motions = None
+    if current.motion_px is not None:
+        along_u, along_v = current.motion_px.mean(axis=0).tolist()
+        motions = [(along_u, along_v)] * len(starts)
+    return Problem(current.window, starts, current.background_e, motions)
 
 
 def _more(current: Solution) -> list[list[Start]]:

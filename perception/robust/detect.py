@@ -49,16 +49,18 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     Returns
     -------
     Detections
-        From top to bottom; `truncated` where time or the number of blobs ended the search, and with the
-        `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above the detection limit.
+        From top to bottom; `truncated` where time, or the number of blobs or of flares in one, ended the
+        search, and with the `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above
+        the detection limit.
         `saturated`: a pixel is clipped, which counts as censored. Where that does not determine the range
         `range_sigma_m` is NaN; of a disc too large to be fitted the flux is a lower bound, too, and the range
         an upper one. Flares that overlap are fitted together (`deblend`), and their sigmas know of it; behind
-        a rolling shutter a blob stays one. `merged`: what is seen does not look like one source, nor like
-        several that can be told apart; its sigmas are then widened by √χ². `ghost` is never set: one frame
-        cannot tell a mirror image from a source. What is no source by its shape, size or brightness is left
-        out, and so is what does not stand out from what lies right beside it, and all but the brightest
-        thousand.
+        a rolling shutter a blob stays one. One that moves is drawn out (`motion`): its place is that in the
+        middle of the exposure. `merged`: what is seen does not look like one source, nor like
+        several that can be told apart; its sigmas are then widened by √χ². So is called what may be one that
+        moves or two at rest; its sigmas cover both. `ghost` is never set: one frame cannot tell a mirror
+        image from a source. What is no source by shape, size or brightness is left out, and so is what does
+        not stand out from what lies right beside it, and all but the brightest thousand.
 
     Raises
     ------
@@ -78,7 +80,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
     groups = clusters(brightest(flares, MOST_FLARES), prepared)
     measured, late = _measured(groups, prepared, started + limit_s)
-    truncated = late or len(flares) > MOST_FLARES
+    truncated = late or len(flares) > MOST_FLARES or any(found.may_be_more for _, found in measured)
     measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
     reported = [(blob, found) for blob, found in measured if found.stands_out]
     if not reported:
@@ -211,7 +213,7 @@ def _detection(
         background_dn=frame.black_level_dn + measured.background_e * gain,
         area_px=blob.area_px,
         saturated=measured.saturated,
-        merged=measured.misfit,
+        merged=measured.misfit or measured.is_doubtful,
         ghost=False,
         range_m=measured.range_m,
         range_sigma_m=measured.range_sigma_m,

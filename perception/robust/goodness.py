@@ -215,6 +215,67 @@ def _matched_peak(weighted: Array, weight: Array, smooth_px: float) -> tuple[flo
 
 
 @compiled
+def drawn_out(
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float, prnu: float
+) -> tuple[float, float, float]:
+    """Tell by how much longer than wide an image is than its fit, as one does that moves while exposed.
+
+    A motion m adds to a flare's light F S the part ∂ᵢ∂ⱼ(F S) mᵢ mⱼ / 24, to first order, of which what is the
+    same all around is left out, as a wrong size or point spread makes it; so are place, flux and ground.
+    The arguments are as for `left_over`.
+
+    Returns
+    -------
+    χ² of two degrees of freedom, and the motion along u and v in pixels that the residual asks for.
+    """
+    rows, columns = image_e.shape
+    parts, count = np.empty((8, rows * columns)), 0
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            if state[row, column] != SEEN:
+                continue
+            weight = 1.0 / math.sqrt(_noise_e2(expected_e[row, column], floor_e2, prnu))
+            near = flares_e[row - 1 : row + 2, column - 1 : column + 2]
+            by_uu = near[1, 2] - 2.0 * near[1, 1] + near[1, 0]
+            by_vv = near[2, 1] - 2.0 * near[1, 1] + near[0, 1]
+            parts[0, count] = weight
+            parts[1, count] = weight * near[1, 1]
+            parts[2, count] = weight * (near[1, 2] - near[1, 0])
+            parts[3, count] = weight * (near[2, 1] - near[0, 1])
+            parts[4, count] = weight * (by_uu + by_vv)
+            parts[5, count] = weight * (by_uu - by_vv)
+            parts[6, count] = weight * 0.25 * (near[2, 2] + near[0, 0] - near[2, 0] - near[0, 2])
+            parts[7, count] = weight * (image_e[row, column] - expected_e[row, column])
+            count += 1
+    shown = np.zeros(7)
+    for one in range(7):
+        power = 0.0
+        for pixel in range(count):
+            power += parts[one, pixel] ** 2
+        if not power > 0.0:
+            return 0.0, 0.0, 0.0
+        for other in range(one + 1, 8):
+            share = 0.0
+            for pixel in range(count):
+                share += parts[one, pixel] * parts[other, pixel]
+            share /= power
+            if other == 7:
+                shown[one] = share * math.sqrt(power)
+            if one == 5 and other == 6:
+                mixed = share
+            for pixel in range(count):
+                parts[other, pixel] -= share * parts[one, pixel]
+        if one == 5:
+            power_5 = power
+    across = shown[6] / math.sqrt(power)
+    along = shown[5] / math.sqrt(power_5) - mixed * across
+    # Of m = |m| (cos φ, sin φ): along = |m|² cos 2φ / 48, across = |m|² sin 2φ / 24.
+    turn, length2 = 0.5 * math.atan2(24.0 * across, 48.0 * along), math.hypot(48.0 * along, 24.0 * across)
+    length = math.sqrt(length2)
+    return shown[5] ** 2 + shown[6] ** 2, length * math.cos(turn), length * math.sin(turn)
+
+
+@compiled
 def halo_sigmas(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, floor_e2: float, prnu: float,
     place: tuple[float, float], widths_px: tuple[float, ...],

@@ -1,42 +1,31 @@
 """From clusters to measured flares: the fit, what to do where it is bad, and what is no source at all."""
 
 import math
-from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.layout import UNUSABLE
 from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux
-from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guesses
-from perception.robust.deblend import RESIDUAL_SIGMAS, deblend, of_free_size
-from perception.robust.goodness import halo_sigmas
+from perception.robust.clusters import Candidate, Cluster, clusters, dilated
+from perception.robust.deblend import RESIDUAL_SIGMAS, of_free_size
+from perception.robust.explain import MOST_LEFT, best
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.solve import Problem, Solution, solve
-from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
+from perception.robust.solve import Solution
 from perception.robust.verdict import (
     LEAST_RANGE_M,
     is_border,
-    is_hardly_seen,
     is_no_large_disc,
-    is_one_pixel,
     is_other_size,
 )
 
 CLIPPED_RANGE_SIGMA = 0.125
 """A clipped flare counts as recovered if its fit claims its range to better than this, relatively."""
-
-HALO_SEEMS_SIGMAS = 1.5
-HALO_GAIN = 10.0
-"""2 Δ ln L that a halo must bring: noise gives χ² of three degrees of freedom, 10 twice in a hundred."""
-
-MOST_LEFT = 0.25
-"""What a fit may leave over, relative to the flares' light, of what is still called a source."""
 
 MOST_LEFT_ON_EDGES = 0.1
 
@@ -59,6 +48,8 @@ class MeasuredFlare:
     range_by_size_sigma_m: float = math.nan
     saturated: bool = False
     misfit: bool = False
+    is_doubtful: bool = False
+    may_be_more: bool = False
     on_texture: bool = False
     on_edges: bool = False
 
@@ -101,7 +92,7 @@ def measure(
     """
     camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
     fitted = [cluster for cluster in found if not any(member.is_beyond_fit for member in cluster.members)]
-    solutions = _best(fitted, prepared, camera)
+    solutions = best(fitted, prepared, camera)
     odd = [index for index, solution in enumerate(solutions) if solution is not None and _is_odd(solution)]
     of_odd = of_free_size([solution for k in odd if (solution := solutions[k]) is not None], camera)
     free = dict(zip(odd, of_odd, strict=True))
@@ -122,138 +113,6 @@ def measure(
     return measured + [each for cluster in others for each in _by_apertures(cluster, prepared)]
 
 
-def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
-    """Solve clusters, and deblend them."""
-    problems = [
-        (index, Problem(cluster.window, starts, cluster.background_e))
-        for index, cluster in enumerate(found)
-        for starts in guesses(cluster, prepared)
-    ]
-    best: list[Solution | None] = [None] * len(found)
-    for (index, _), solution in zip(problems, solve([p for _, p in problems], camera), strict=True):
-        held = best[index]
-        if solution is not None and (held is None or solution.deviance < held.deviance):
-            best[index] = solution
-    for index, (cluster, solution) in enumerate(zip(found, best, strict=True)):
-        if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
-            best[index] = None
-    # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
-    # flares would explain better.
-    parted = {}
-    if prepared.frame.line_time_s == 0.0:
-        plain = [None if c.is_in_crowd else s for c, s in zip(found, best, strict=True)]
-        parted = _parted(plain, prepared.shape, camera)
-    _retry_without_spill(best, parted, prepared, camera)
-    uneven_e = [0.0 if one is None else one.left_over.structure_e for one in best]
-    # Many flares where one blob was seen may be something wide: its whole residual counts.
-    spread_e = {
-        index: one.excess_e
-        for index, more in parted.items()
-        if (one := best[index]) is not None and more.count > one.count + 1
-    }
-    for index in _retry_with_halo(best, camera):
-        one = best[index]
-        uneven_e[index] = 0.0 if one is None else one.left_over.structure_e
-    uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
-    _retry_on_uneven_ground(best, uneven_e, camera)
-    for index, more in parted.items():
-        one = best[index]
-        if one is None or more.cost < one.cost:
-            best[index] = more
-    return best
-
-
-def _parted(plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera) -> dict[int, Solution]:
-    """Deblend, and return by index what explains all that is seen: enough flares explain anything by half.
-
-    Flares that would shine where a window does not look explain nothing.
-    """
-    tried = [(index, one) for index, one in enumerate(plain) if one is not None]
-    more = deblend([one for _, one in tried], camera)
-    return {
-        index: several
-        for (index, one), several in zip(tried, more, strict=True)
-        if several is not one
-        and several.left_over.is_good
-        and several.left_over.structure_e == 0.0
-        and not any(is_hardly_seen(several, k, shape) for k in range(several.count))
-    }
-
-
-def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
-    """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it.
-
-    Returns which have one.
-    """
-    tried: list[tuple[int, Solution]] = []
-    problems = []
-    for index, solution in enumerate(best):
-        if solution is None or solution.count != 1:
-            continue
-        u_px, v_px, _ = solution.starts[0]
-        radius_px, flux_e = float(solution.image_radius_px[0]), float(solution.flux_e[0])
-        window = solution.window
-        seems = halo_sigmas(
-            window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
-            (u_px - window.box.left, v_px - window.box.top), halo_widths_px(radius_px),
-        )  # fmt: skip
-        if seems < HALO_SEEMS_SIGMAS:
-            continue
-        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e)
-        tried.append((index, solution))
-        problems.append(solution.again(replace(window, structure=joined(window.structure, halo))))
-    having = []
-    for (index, without), again in zip(tried, solve(problems, camera), strict=True):
-        if again is not None and without.deviance - again.deviance > HALO_GAIN:
-            best[index] = again
-            having.append(index)
-    return having
-
-
-def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:
-    """Fit again where something lies around the flares: edges, of the strength that plain fits leave over.
-
-    What is too sharp even for them counts as noise of the window.
-    """
-    for is_noise in (False, True):
-        tried, problems = [], []
-        for index, solution in enumerate(best):
-            if solution is None or uneven_e[index] == 0.0:
-                continue
-            window, left_e = solution.window, solution.left_over.structure_e if is_noise else 0.0
-            if left_e > 0.0:
-                window = replace(window, floor_e2=window.floor_e2 + left_e**2)
-            elif not is_noise:
-                strength_e = math.hypot(uneven_e[index], window.structure_e)
-                edges = structure_of(EDGES, window.box.height, strength_e)
-                window = replace(window, structure=edges, structure_e=strength_e, on_edges=True)
-            else:
-                continue
-            tried.append(index)
-            problems.append(solution.again(window))
-        for index, again in zip(tried, solve(problems, camera), strict=True):
-            best[index] = again
-
-
-def _retry_without_spill(
-    best: list[Solution | None], parted: Container[int], prepared: PreparedFrame, camera: Camera
-) -> None:
-    """Fit badly fitted clipped flares without the columns of clipped pixels, where charge may spill."""
-    tried, problems = [], []
-    for index, solution in enumerate(best):
-        if solution is None or index in parted or solution.left_over.is_good:
-            continue
-        # Also those of flares that are none of the window's.
-        spilled = prepared.clipped_columns(solution.window.box)
-        if spilled.any():
-            tried.append(index)
-            state = np.where(spilled, UNUSABLE, solution.window.state).astype(np.uint8)
-            problems.append(solution.again(replace(solution.window, state=state)))
-    for index, again in zip(tried, solve(problems, camera), strict=True):
-        if again is not None and again.left_over.share < MOST_LEFT:
-            best[index] = again
-
-
 def _is_odd(solution: Solution) -> bool:
     """Tell whether a lone flare fits so badly that its size has to be looked at."""
     return solution.count == 1 and not solution.left_over.is_good
@@ -265,7 +124,9 @@ def _judged(
     """Turn a solution into measurements, if it is one of sources."""
     left = solution.left_over
     misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
-    doubted = misfit or cluster.is_clipped
+    # An edge is long, too: what is drawn out on edges must leave hardly any of them.
+    drawn_out = solution.motion_px is not None and solution.window.on_edges
+    doubted = misfit or cluster.is_clipped or drawn_out
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
     if doubted and left.share > most_left:
         return []
@@ -293,7 +154,8 @@ def _measurement(
     u_px, v_px = float(solution.u_px[index]), float(solution.v_px[index])
     flux_e = float(solution.flux_e[index])
     flux_sigma_e = float(solution.flux_sigma_e[index]) * widening
-    log_sigma = float(solution.log_range_sigma[index]) * widening
+    hidden = _hidden_log_range(solution, index)
+    log_sigma = math.hypot(float(solution.log_range_sigma[index]) * widening, hidden / math.sqrt(3.0))
     # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.
     range_m = math.nan
     if solution.ranged[index]:
@@ -318,9 +180,32 @@ def _measurement(
         range_sigma_common_m=math.nan if bound_only else range_m * float(solution.log_range_common[index]),
         saturated=saturated,
         misfit=misfit,
+        is_doubtful=solution.is_doubtful or hidden > log_sigma,
+        may_be_more=solution.may_be_more,
         on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges or left.peak_sigmas > RESIDUAL_SIGMAS,
     )
+
+
+def _hidden_log_range(solution: Solution, index: int) -> float:
+    """Return how far a flare's ln range may be off because sources hide parts of each other.
+
+    What is fitted are whole discs, which shine through each other. Where they overlap so much of a source's
+    light may lack, or be another's. And one that seems farther than another, within two radii of which it
+    lies, may be as near as that, most of it hidden behind it.
+    """
+    apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
+    others_px = solution.image_radius_px
+    if solution.motion_px is not None:
+        others_px = others_px - 0.5 * np.hypot(*solution.motion_px.T)
+    own_px = float(others_px[index])
+    farther = solution.log_range[index] - solution.log_range[apart_px < 2.0 * others_px]
+    # Of two discs of unlike size the chord of the smaller one: what a half plane at the mean edge cuts off.
+    into = (others_px + own_px - apart_px) / (2.0 * max(own_px, 1e-9))
+    into[index] = 0.0
+    depth = np.clip(into, 0.0, 1.0)
+    cut = (np.arccos(1.0 - 2.0 * depth) - (1.0 - 2.0 * depth) * 2.0 * np.sqrt(depth - depth**2)) / np.pi
+    return max(float(farther.max(initial=0.0)), 0.5 * float(cut.sum()))
 
 
 def _by_apertures(cluster: Cluster, prepared: PreparedFrame) -> list[tuple[Blob, MeasuredFlare]]:

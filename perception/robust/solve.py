@@ -6,7 +6,7 @@ laid out for all windows at once, and anew where a size has moved far from the o
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +17,8 @@ from perception.model.layout import UNUSABLE, Sources, Structure, View, even
 from perception.model.pixels import maximise
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
-from perception.model.window import Camera, lay_out
+from perception.model.window import MOTION_PX, Camera, lay_out
+from perception.model.window import motion_cost as cost_of_motion
 from perception.robust.goodness import LeftOver, left_over, residual_e
 
 Array = NDArray[np.float64]
@@ -27,11 +28,15 @@ _MOST_LAYOUTS = 7
 _LAYOUT_KEPT = 0.02
 _LAYOUT_KEPT_PX = 0.05
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
+_LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
 _PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
 _NEIGHBOURS = 20.0 * 50.0 / (1280.0 * 960.0)  # of twenty flares in a frame, how many lie in those 50 px²
 
 Start = tuple[float, float, float]
 """First guess of (u_px, v_px, ln range) of a flare, its range as the flux alone says."""
+
+Motion = tuple[float, float]
+"""How far a flare moves along u and v during the exposure, in pixels; m and -m are the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +75,12 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A window, first guesses of its flares and of its background."""
+    """A window, first guesses of its flares, of its background, and of how each moves; None: none does."""
 
     window: Window
     starts: Sequence[Start]
     background_e: float
+    motions: Sequence[Motion] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +101,7 @@ class Solution:
     ranged
         Whether a range can be had there, same shape.
     image_radius_px
-        Radius of each image before the point spread, same shape.
+        Radius of each image before the point spread, half of its motion included, same shape.
     background_e
         Of a pixel, beneath all of them.
     expected_e, flares_e
@@ -106,6 +112,13 @@ class Solution:
         Width of the point spread as calibrated.
     log_information
         Logarithm of the determinant of the information, priors included, over that of the structure's prior.
+    motion_px, motion_cost
+        How far each moves along u and v during the exposure, shape (flares, 2), None where none may; and what
+        that costs a priori (`model.window`).
+    is_doubtful
+        Whether another number of flares explains the window nearly as well (`motion.weighed`).
+    may_be_more
+        Whether more flares were not looked for, as there are too many already (`deblend`).
     """
 
     window: Window
@@ -127,6 +140,10 @@ class Solution:
     deviance: float
     psf_sigma_px: float
     log_information: float
+    motion_px: Array | None = None
+    motion_cost: float = 0.0
+    is_doubtful: bool = False
+    may_be_more: bool = False
 
     @property
     def cost(self) -> float:
@@ -138,7 +155,7 @@ class Solution:
         """
         by_flares = self.count * (2.0 * math.log(_PLACES) - 3.0 * math.log(2.0 * math.pi))
         by_chance = -2.0 * (self.count - 1) * math.log(_NEIGHBOURS)
-        return self.deviance + self.log_information + by_flares + by_chance
+        return self.deviance + self.log_information + by_flares + by_chance + self.motion_cost
 
     @property
     def count(self) -> int:
@@ -153,7 +170,19 @@ class Solution:
 
     def again(self, window: Window | None = None) -> Problem:
         """Return the problem of fitting these flares again, or to another view of their window."""
-        return Problem(self.window if window is None else window, self.starts, self.background_e)
+        return Problem(
+            self.window if window is None else window, self.starts, self.background_e, self.motions
+        )
+
+    @property
+    def most_motion_px(self) -> float:
+        """How far that moves which moves farthest; 0 where nothing may."""
+        return 0.0 if self.motion_px is None else float(np.hypot(*self.motion_px.T).max())
+
+    @property
+    def motions(self) -> list[Motion] | None:
+        """How they move as first guesses of another fit."""
+        return None if self.motion_px is None else [(float(u), float(v)) for u, v in self.motion_px]
 
     @cached_property
     def residual_e(self) -> Array:
@@ -190,14 +219,20 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     -------
     A solution for each, None where the fit did not converge.
     """
-    fits = [_Fit(problem, camera) for problem in problems]
-    going = fits
-    for _ in range(_MOST_LAYOUTS):
-        if not going:
-            break
-        going = _climbed(going, camera)
-    solutions = iter(_solutions([fit for fit in fits if fit.converged], camera))
-    return [next(solutions) if fit.converged else None for fit in fits]
+    moving = replace(camera, motion_px=MOTION_PX)
+    fits = [_Fit(problem, camera if problem.motions is None else moving) for problem in problems]
+    solved: dict[int, Solution] = {}
+    for of_camera, moves in ((camera, False), (moving, True)):
+        alike = [(index, fit) for index, fit in enumerate(fits) if fit.layout.moves == moves]
+        going = [fit for _, fit in alike]
+        for _ in range(_MOST_LAYOUTS):
+            if not going:
+                break
+            going = _climbed(going, of_camera)
+        done = [(index, fit) for index, fit in alike if fit.converged]
+        found = _solutions([fit for _, fit in done], of_camera)
+        solved.update((index, one) for (index, _), one in zip(done, found, strict=True))
+    return [solved.get(index) for index in range(len(fits))]
 
 
 class _Fit:
@@ -210,6 +245,8 @@ class _Fit:
         self.layout = self.known.layout(len(problem.starts), len(self.structure.columns))
         self.values = np.zeros(self.layout.size)
         self.own[:, :3] = problem.starts
+        if problem.motions is not None:
+            self.own[:, self.layout.motion :] = problem.motions
         self.values[self.layout.background] = problem.background_e
         self.covariance = np.empty((self.layout.size, self.layout.size))
         self.expected_e = np.empty(window.image_e.shape)
@@ -240,8 +277,8 @@ class _Fit:
         box, layout = self.window.box, self.layout
         view = View(box.top, box.left, self.window.image_e, self.window.state, self.window.floor_e2)
         self.deviance, self.log_information = maximise(
-            view, sources, self.structure, self.known, layout.prior(self.structure), layout.most_step,
-            self.values, self.covariance, self.expected_e.ravel(),
+            view, sources, self.structure, self.known, layout.prior(self.structure, self.known.motion_px),
+            layout.most_step, self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
         self.converged = math.isfinite(self.deviance)
         growth = np.exp(sources.log_range_at - _log_range_by_size(self.own, self))
@@ -254,15 +291,20 @@ def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
     hidden_px = _hidden_px_at_1_m(own, camera)
     background_e = np.concatenate([fit.background_e for fit in fits])
     hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
-    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]), hidden_e)
+    motion_px = _motion_px(own, fits[0])
+    laid_px = None if motion_px is None else motion_px + _LINE_KEPT_PX
+    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]), hidden_e, laid_px)
     reach_px = laid.reach_px
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
         fit.converged = False
         if imaged[first:end].all():
             fit.climb(laid.part(first, end), reach_px[first:end])
-    change = laid.log_range_at - _log_range_by_size(np.concatenate([fit.own for fit in fits]), fits[0])
+    own = np.concatenate([fit.own for fit in fits])
+    change = laid.log_range_at - _log_range_by_size(own, fits[0])
     moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
+    if laid_px is not None and (motion_px := _motion_px(own, fits[0])) is not None:
+        moved |= motion_px > laid_px
     if hidden_px is not None:
         more_e = np.concatenate([fit.background_e for fit in fits]) - background_e
         moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
@@ -284,6 +326,13 @@ def _hidden_px_at_1_m(own: Array, camera: Camera) -> Array | None:
 def _log_range_by_size(own: Array, fit: _Fit) -> Array:
     """Return the logarithm of the range that each source's size stands for."""
     return np.asarray(own[:, 2] - fit.known.tie_spread * own[:, 3]) if fit.layout.has_slack else own[:, 2]
+
+
+def _motion_px(own: Array, fit: _Fit) -> Array | None:
+    """Return how far each source moves, None if none may."""
+    if not fit.layout.moves:
+        return None
+    return np.asarray(np.hypot(own[:, fit.layout.motion], own[:, fit.layout.motion + 1]))
 
 
 def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
@@ -308,7 +357,13 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
     for fit in fits:
         these = slice(first, first + fit.layout.sources)
         first = these.stop
-        background_e = float(fit.values[fit.layout.background])
+        background_e, radius_px = float(fit.values[fit.layout.background]), fit.image_radius_px
+        motion_px = own[these, fit.layout.motion :] if fit.layout.moves else None
+        motion_cost = 0.0
+        if motion_px is not None:
+            part = slice(fit.layout.motion, fit.layout.motion + 2)
+            motion_cost = cost_of_motion(motion_px, own[these, 2], covariance[these, part, part], camera)
+            radius_px = radius_px + 0.5 * np.hypot(*motion_px.T)
         flares_e, log_information = fit.expected_e - background_e, fit.log_information
         if waves := fit.layout.structure:
             flares_e -= (fit.values[-waves:] @ fit.structure.columns).reshape(flares_e.shape)
@@ -327,13 +382,15 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
                 log_range_sigma=log_range_sigma[these],
                 log_range_common=log_range_common[these],
                 ranged=ranged[these],
-                image_radius_px=fit.image_radius_px,
+                image_radius_px=radius_px,
                 background_e=background_e,
                 expected_e=fit.expected_e,
                 flares_e=flares_e,
                 deviance=fit.deviance,
                 psf_sigma_px=fit.known.psf_sigma_px,
                 log_information=log_information,
+                motion_px=motion_px,
+                motion_cost=motion_cost,
             )
         )
     return solutions

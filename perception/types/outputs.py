@@ -55,7 +55,8 @@ class Detections(list[Detection]):
     reason
         Why it is empty, in words; "" where it is not, or where the estimator does not say.
     truncated
-        Whether more was seen than was measured: time was up, or there were too many. The brightest are kept.
+        Whether more was seen than was measured: time was up, or there were too many, in the frame or in one
+        place. The brightest are kept.
     """
 
     def __init__(self, found: Iterable[Detection] = (), *, reason: str = "", truncated: bool = False) -> None:
@@ -232,7 +233,7 @@ class SetMeasurements:
     """
 
     measurements: tuple[Measurement, ...]
-    detections: tuple[tuple[Detection, ...], ...]
+    detections: tuple[Detections, ...]
     planes: tuple[MirrorPlane, ...] = ()
     extinction_per_m: float = math.nan
     extinction_sigma_per_m: float = math.nan

@@ -48,6 +48,21 @@ def test_time_is_limited_for_robust_alone() -> None:
             perception.detect(FRAME, CAMERA, limit_s=limit_s)
 
 
+def test_time_is_limited_for_many_frames_sets_and_pipelines_too() -> None:
+    """And what a set holds says so: that time was up is no empty frame."""
+    known = {CAMERA.camera: CAMERA}
+    for limit_s, counts, cut in ((60.0, [1], [False]), (1e-9, [0], [True])):
+        pipeline = perception.Pipeline(known, limit_s=limit_s)
+        for seen in (
+            perception.detect_frames([FRAME], known, limit_s=limit_s),
+            perception.detect_set([FRAME], known, limit_s=limit_s).detections,
+            pipeline.push([FRAME]).measurements.detections,
+        ):
+            assert [len(found) for found in seen] == counts
+            assert [found.truncated for found in seen] == cut
+            assert [found.reason.startswith("time was up") for found in seen] == cut
+
+
 def test_inputs_are_left_as_they_were() -> None:
     before = FRAME.data_dn.copy()
     perception.detect(FRAME, CAMERA)

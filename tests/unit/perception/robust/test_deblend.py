@@ -8,6 +8,7 @@ import pytest
 
 import perception
 from perception.model.flare import PixelBox, flare_image
+from perception.robust import deblend
 from perception.robust.search.blobs import Blob, divide, near_groups
 from tests.hard_frames import (
     BACKGROUND_E,
@@ -32,6 +33,16 @@ def couples_of(apart_px: float, ratio: float, count: int, *key: int) -> list[tup
             (Flare(u + du - x, v + dv - y, BRIGHT_E), Flare(u + du + x, v + dv + y, BRIGHT_E / ratio))
         )
     return couples
+
+
+def test_where_more_flares_than_are_tried_may_be_the_frame_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three in a row, of which two alone are looked for: `truncated`; and not where eight may be."""
+    flares = [Flare(150.2 + 2.2 * k, 150.4 + 0.3 * k, BRIGHT_E) for k in range(3)]
+    frame = frame_of(flares, POINT, BACKGROUND_E, 25)
+    whole = perception.detect(frame, POINT)
+    assert (len(whole), whole.truncated) == (3, False)
+    monkeypatch.setattr(deblend, "MOST_FLARES", 2)
+    assert perception.detect(frame, POINT).truncated
 
 
 @pytest.mark.parametrize(("apart_px", "ratio"), [(1.0, 1.0), (2.0, 1.0), (3.0, 1.0), (2.0, 5.0), (3.0, 20.0)])

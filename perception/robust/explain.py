@@ -1,0 +1,211 @@
+"""What explains a cluster best: flares at rest or drawn out, one or several, a halo, uneven ground, spill."""
+
+import math
+from collections.abc import Container, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from perception.model.layout import UNUSABLE
+from perception.model.window import MOST_MOTION_PX, Camera
+from perception.robust.clusters import Cluster, guesses
+from perception.robust.deblend import asks_for_more, deblend, of_free_width
+from perception.robust.goodness import halo_sigmas
+from perception.robust.motion import moving, weighed
+from perception.robust.search.prepare import PreparedFrame
+from perception.robust.solve import Problem, Solution, solve
+from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
+from perception.robust.verdict import is_hardly_seen, is_one_pixel
+
+HALO_SEEMS_SIGMAS = 1.5
+HALO_GAIN = 10.0
+"""2 Δ ln L that a halo must bring: noise gives χ² of three degrees of freedom, 10 twice in a hundred."""
+
+MOST_LEFT = 0.25
+"""What a fit may leave over, relative to the flares' light, of what is still called a source."""
+
+
+def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
+    """Solve clusters: by a flare for each blob, drawn out or not, by several, with what lies around them.
+
+    Parameters
+    ----------
+    found, prepared, camera
+        The clusters, the frame they are of, and its camera.
+
+    Returns
+    -------
+    What explains each best; None where nothing does.
+    """
+    problems = [
+        (index, Problem(cluster.window, starts, cluster.background_e))
+        for index, cluster in enumerate(found)
+        for starts in guesses(cluster, prepared)
+    ]
+    chosen: list[Solution | None] = [None] * len(found)
+    for (index, _), solution in zip(problems, solve([p for _, p in problems], camera), strict=True):
+        held = chosen[index]
+        if solution is not None and (held is None or solution.deviance < held.deviance):
+            chosen[index] = solution
+    for index, (cluster, solution) in enumerate(zip(found, chosen, strict=True)):
+        if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
+            chosen[index] = None
+    # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
+    # flares would explain better.
+    parted: dict[int, Solution] = {}
+    cut_short: set[int] = set()
+    if prepared.frame.line_time_s == 0.0:
+        plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
+        parted = _parted(plain, prepared.shape, camera, cut_short)
+        for index, line in moving(plain, camera).items():
+            chosen[index] = line
+        _drop_beside_lines(chosen, parted, prepared.shape, camera, cut_short)
+    _retry_without_spill(chosen, parted, prepared, camera)
+    uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
+    # Many flares where one blob was seen may be something wide: its whole residual counts.
+    spread_e = {
+        index: one.excess_e
+        for index, more in parted.items()
+        if (one := chosen[index]) is not None and more.count > one.count + 1
+    }
+    for index in _retry_with_halo(chosen, camera):
+        one = chosen[index]
+        uneven_e[index] = 0.0 if one is None else one.left_over.structure_e
+    uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
+    _retry_on_uneven_ground(chosen, uneven_e, camera)
+    for index, more in parted.items():
+        one = chosen[index]
+        if one is None or more.cost < one.cost:
+            chosen[index] = more
+    for index in cut_short:
+        one = chosen[index]
+        if one is not None and asks_for_more(one):
+            chosen[index] = replace(one, may_be_more=True)
+    return chosen
+
+
+def _drop_beside_lines(
+    chosen: list[Solution | None],
+    parted: dict[int, Solution],
+    shape: tuple[int, int],
+    camera: Camera,
+    cut_short: set[int],
+) -> None:
+    """Hold several flares at rest against what moves: drop them, or take several that move.
+
+    Where those that move explain all but little, more of them at rest must explain it better than the point
+    spread's own width does. Where they do not, and it takes three and more at rest, if these are enough, more
+    that move are tried.
+    """
+    lines = {index: one for index, one in enumerate(chosen) if one is not None and one.motion_px is not None}
+    rivals = [index for index, one in lines.items() if index in parted and one.left_over.is_good]
+    free = of_free_width([lines[index] for index in rivals], camera)
+    for index, line in zip(rivals, free, strict=True):
+        more = parted[index]
+        if min(lines[index].cost, math.inf if line is None else line.cost) < more.cost:
+            chosen[index] = weighed(lines[index], parted.pop(index))
+        else:
+            parted[index] = weighed(more, lines[index])
+    poor: list[Solution | None] = [None] * len(chosen)
+    for index, one in lines.items():
+        if index not in parted or parted[index].count > one.count + 1:
+            poor[index] = one
+    for index, several in _parted(poor, shape, camera, cut_short).items():
+        if index not in parted or several.cost < parted[index].cost:
+            parted[index] = several
+
+
+def _parted(
+    plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera, cut_short: set[int]
+) -> dict[int, Solution]:
+    """Deblend, and return by index what explains all that is seen: enough flares explain anything by half.
+
+    Flares that would shine where a window does not look explain nothing. Adds to `cut_short` where there may
+    be more than were looked for.
+    """
+    tried = [(index, one) for index, one in enumerate(plain) if one is not None]
+    more = deblend([one for _, one in tried], camera)
+    cut_short.update(index for (index, _), several in zip(tried, more, strict=True) if several.may_be_more)
+    return {
+        index: several
+        for (index, one), several in zip(tried, more, strict=True)
+        if several.count > one.count
+        and several.most_motion_px <= MOST_MOTION_PX
+        and several.left_over.is_good
+        and several.left_over.structure_e == 0.0
+        and not any(is_hardly_seen(several, k, shape) for k in range(several.count))
+    }
+
+
+def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
+    """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it.
+
+    Returns which have one.
+    """
+    tried: list[tuple[int, Solution]] = []
+    problems = []
+    for index, solution in enumerate(best):
+        if solution is None or solution.count != 1:
+            continue
+        u_px, v_px, _ = solution.starts[0]
+        radius_px, flux_e = float(solution.image_radius_px[0]), float(solution.flux_e[0])
+        window = solution.window
+        seems = halo_sigmas(
+            window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
+            (u_px - window.box.left, v_px - window.box.top), halo_widths_px(radius_px),
+        )  # fmt: skip
+        if seems < HALO_SEEMS_SIGMAS:
+            continue
+        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e)
+        tried.append((index, solution))
+        problems.append(solution.again(replace(window, structure=joined(window.structure, halo))))
+    having = []
+    for (index, without), again in zip(tried, solve(problems, camera), strict=True):
+        if again is not None and without.deviance - again.deviance > HALO_GAIN:
+            best[index] = again
+            having.append(index)
+    return having
+
+
+def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:
+    """Fit again where something lies around the flares: edges, of the strength that plain fits leave over.
+
+    What is too sharp even for them counts as noise of the window.
+    """
+    for is_noise in (False, True):
+        tried, problems = [], []
+        for index, solution in enumerate(best):
+            if solution is None or uneven_e[index] == 0.0:
+                continue
+            window, left_e = solution.window, solution.left_over.structure_e if is_noise else 0.0
+            if left_e > 0.0:
+                window = replace(window, floor_e2=window.floor_e2 + left_e**2)
+            elif not is_noise:
+                strength_e = math.hypot(uneven_e[index], window.structure_e)
+                edges = structure_of(EDGES, window.box.height, strength_e)
+                window = replace(window, structure=edges, structure_e=strength_e, on_edges=True)
+            else:
+                continue
+            tried.append(index)
+            problems.append(solution.again(window))
+        for index, again in zip(tried, solve(problems, camera), strict=True):
+            best[index] = again
+
+
+def _retry_without_spill(
+    best: list[Solution | None], parted: Container[int], prepared: PreparedFrame, camera: Camera
+) -> None:
+    """Fit badly fitted clipped flares without the columns of clipped pixels, where charge may spill."""
+    tried, problems = [], []
+    for index, solution in enumerate(best):
+        if solution is None or index in parted or solution.left_over.is_good:
+            continue
+        # Also those of flares that are none of the window's.
+        spilled = prepared.clipped_columns(solution.window.box)
+        if spilled.any():
+            tried.append(index)
+            state = np.where(spilled, UNUSABLE, solution.window.state).astype(np.uint8)
+            problems.append(solution.again(replace(solution.window, state=state)))
+    for index, again in zip(tried, solve(problems, camera), strict=True):
+        if again is not None and again.left_over.share < MOST_LEFT:
+            best[index] = again

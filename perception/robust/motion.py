@@ -1,0 +1,113 @@
+"""Flares that are drawn out, as they move while they are exposed: rivals of round ones and of pairs."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.flare import PixelBox
+from perception.model.window import MOST_MOTION_PX, Camera
+from perception.robust.deblend import asks_for_more
+from perception.robust.goodness import drawn_out
+from perception.robust.solve import Motion, Problem, Solution, solve
+
+Array = NDArray[np.float64]
+
+SEEMS_CHI2 = 6.0
+"""Of two degrees of freedom, what a lone flare longer than wide leaves over: noise does it once in 20."""
+
+LEAST_PX = 0.2
+"""A flare that seems to move less is taken to rest: it changes its flux by less than a thousandth."""
+
+
+MOST_TOGETHER = 4
+"""More flares in one window are not tried as moving ones."""
+
+AT_REST = (0.0, 0.0)
+"""A fit that begins so stays so: to first order a motion changes nothing."""
+
+_LEAST_SHARE, _DOUBTFUL_SHARE = 1e-4, 0.01
+_MOST_COST = 40.0
+
+
+def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
+    """Fit flares that are longer than wide as moving ones, and return by index the likelier of both.
+
+    Lone ones where the residual says so; of several in one window, where it asks for more. The sigmas of what
+    is returned know of the other.
+    """
+    tried: list[tuple[int, Solution]] = []
+    problems = []
+    for index, solution in enumerate(solutions):
+        if solution is None or solution.count > MOST_TOGETHER:
+            continue
+        if solution.count == 1:
+            motions = [_seen(solution, solution.window.box)]
+        elif asks_for_more(solution):
+            motions = [_seen(solution, _around(solution, flare)) for flare in range(solution.count)]
+        else:
+            continue
+        if any(motion != AT_REST for motion in motions):
+            tried.append((index, solution))
+            problems.append(Problem(solution.window, solution.starts, solution.background_e, motions))
+    fits = solve(problems, camera)
+    return {
+        index: weighed(fit, at_rest) if fit.cost < at_rest.cost else weighed(at_rest, fit)
+        for (index, at_rest), fit in zip(tried, fits, strict=True)
+        if fit is not None and fit.most_motion_px <= MOST_MOTION_PX
+    }
+
+
+def weighed(solution: Solution, other: Solution) -> Solution:
+    """Return a solution, its sigmas wider by what differs in another, weighted by how likely that one is.
+
+    Of another number of flares the nearest counts; where it is likelier than a hundredth, that is doubtful.
+    """
+    odds = math.exp(-0.5 * min(max(other.cost - solution.cost, -_MOST_COST), _MOST_COST))
+    share = odds / (1.0 + odds)
+    if share < _LEAST_SHARE:
+        return solution
+    apart = np.hypot(solution.u_px[:, None] - other.u_px, solution.v_px[:, None] - other.v_px)
+    nearest = np.argmin(apart, axis=1)
+
+    def wider(sigma: Array, own: Array, others: Array) -> Array:
+        return np.asarray(np.hypot(sigma, math.sqrt(share) * (others[nearest] - own)))
+
+    return replace(
+        solution,
+        u_sigma_px=wider(solution.u_sigma_px, solution.u_px, other.u_px),
+        v_sigma_px=wider(solution.v_sigma_px, solution.v_px, other.v_px),
+        flux_sigma_e=wider(solution.flux_sigma_e, solution.flux_e, other.flux_e),
+        log_range_sigma=wider(solution.log_range_sigma, solution.log_range, other.log_range),
+        is_doubtful=solution.is_doubtful or (solution.count != other.count and share > _DOUBTFUL_SHARE),
+    )
+
+
+def _seen(solution: Solution, box: PixelBox) -> Motion:
+    """Return the motion that the residual in a part of a window asks for, if it does."""
+    window = solution.window
+    part = box.seen_from(window.box).slices
+    chi2, along_u, along_v = drawn_out(
+        np.ascontiguousarray(window.image_e[part]),
+        np.ascontiguousarray(window.state[part]),
+        np.ascontiguousarray(solution.expected_e[part]),
+        np.ascontiguousarray(solution.flares_e[part]),
+        window.floor_e2,
+        window.prnu,
+    )
+    length_px = math.hypot(along_u, along_v)
+    if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
+        return AT_REST
+    shorter = min(1.0, 0.5 * MOST_MOTION_PX / length_px)
+    return shorter * along_u, shorter * along_v
+
+
+def _around(solution: Solution, flare: int) -> PixelBox:
+    """Return the part of a window that one of its flares shines into."""
+    reach_px = math.ceil(float(solution.image_radius_px[flare]) + 3.0 * solution.psf_sigma_px)
+    left, top = round(float(solution.u_px[flare])) - reach_px, round(float(solution.v_px[flare])) - reach_px
+    window, side = solution.window.box, 2 * reach_px + 1
+    part = PixelBox(top, left, side, side).seen_from(window).inside((window.height, window.width))
+    return PixelBox(part.top + window.top, part.left + window.left, part.height, part.width)
