@@ -1,6 +1,6 @@
 """Whether a source's light stands alone beside much stronger light, and what that costs: one JSON object.
 
-    python benchmarks/weak_groups.py [--seeds 10] [--only fog,yard,workshop,yard_in_fog,hall] [--keep FILE]
+    python benchmarks/weak_groups.py [--seeds 10] [--only fog,yard,workshop,…] [--keep FILE]
 
 Each scene is rendered with all its light, and again by the sources alone, sun and sky taken away and lamps
 dimmed to nothing; the light of each source's own array is compared, as it is when frames are exposed with the
@@ -9,10 +9,11 @@ others off, in 16 × 12 tiles.
 `median_tile`, `darkest_tile` and `whole` are relative errors of one render against the sources alone (twice
 the seeds), the median over seeds; `whole_said` is the standard error that the render says itself, and
 `whole_z_rms`, `tile_z_rms` are errors over what is said of both; `noise_to_own` is σ over that of as many
-samples of the sources alone. `holm` has the p-value of each source's `mean_of_seeds` (Student's t of the seeds
-less one), the smallest times their number, and whether Holm's procedure at 5 % finds any that differs; `--keep`
-writes each scene's figures when they stand. `cost` is the variance of the strongest group, between seeds, summed over the
+samples of the sources alone. `cost` is the variance of the strongest group, between seeds, summed over the
 film, × CPU seconds; `cost_as_said` the same by what renders say.
+
+`holm` has the p-value of each source's `mean_of_seeds` (Student's t, of the seeds less one), the smallest
+times their number, and which differ by Holm's procedure at 5 %. `--keep` writes figures scene by scene.
 """
 
 import argparse
@@ -25,7 +26,6 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-
 from scipy.stats import t as student_t
 
 import nir_render as nr

@@ -112,7 +112,7 @@ def expectation(
     values
         Unknowns, in the order of `layout.Layout`.
     view, sources, structure, known
-        The window, of which the place, the shape and the dark variance count, and what is in it.
+        The window, of which all but what it shows counts, and what is in it.
     expected, jacobian, variance
         Shape (pixels,), (unknowns, pixels) and (pixels,): written; the last as `sensor.pixel_variance_e2`.
     """
@@ -123,8 +123,10 @@ def expectation(
     if known.width_spread > 0.0:
         sigma_px *= math.exp(known.width_spread * values[width])
         jacobian[width] = 0.0
-    expected[:] = values[background]
     jacobian[background] = 1.0
+    there = view.known_e.ravel()
+    for pixel in range(len(expected)):
+        expected[pixel] = values[background] + there[pixel]
     for wave in range(len(structure.columns)):
         amplitude = values[background + 1 + wave]
         for pixel in range(len(expected)):

@@ -15,6 +15,7 @@ from perception.robust.aperture import aperture_flux
 from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guesses
 from perception.robust.deblend import RESIDUAL_SIGMAS, deblend, of_free_size
 from perception.robust.goodness import halo_sigmas
+from perception.robust.known_light import fit_beside_forward_light
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Problem, Solution, solve
@@ -137,6 +138,7 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
     for index, (cluster, solution) in enumerate(zip(found, best, strict=True)):
         if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
             best[index] = None
+    fit_beside_forward_light(best, camera)
     # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
     # flares would explain better.
     parted = {}
