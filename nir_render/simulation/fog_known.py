@@ -4,6 +4,7 @@ Then its calibration tells what the fog scatters forward about a flare, to the d
 of; where it does not know these, to all that fog is usually of, with what these differ by as σ.
 """
 
+import math
 from dataclasses import replace
 from functools import lru_cache
 
@@ -23,9 +24,8 @@ USUAL = ("advection_heavy", "advection_moderate", "radiation_heavy", "radiation_
 
 _EXACT_PER_M = 1e-6
 _DEPTHS = (0.25, 0.5, 1.0, 2.0, 4.0)
-_ANGLES_RAD = tuple(
-    float(angle) for angle in np.radians([0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0])
-)  # fmt: skip
+_ANGLES_DEG = (0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
+_ANGLES_RAD = tuple(math.radians(angle_deg) for angle_deg in _ANGLES_DEG)
 
 
 def knowing_fog(
