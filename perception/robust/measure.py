@@ -14,8 +14,8 @@ from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux
 from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guesses
 from perception.robust.deblend import RESIDUAL_SIGMAS, deblend, of_free_size
+from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
-from perception.robust.known_light import fit_beside_forward_light
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Problem, Solution, solve
@@ -154,13 +154,11 @@ def _best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> 
         if (one := best[index]) is not None and more.count > one.count + 1
     }
     for index in _retry_with_halo(best, camera):
-        one = best[index]
-        uneven_e[index] = 0.0 if one is None else one.left_over.structure_e
+        uneven_e[index] = one.left_over.structure_e if (one := best[index]) else 0.0
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     _retry_on_uneven_ground(best, uneven_e, camera)
     for index, more in parted.items():
-        one = best[index]
-        if one is None or more.cost < one.cost:
+        if (one := best[index]) is None or more.cost < one.cost:
             best[index] = more
     return best
 

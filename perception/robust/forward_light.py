@@ -1,19 +1,77 @@
-"""Light that fog scatters forward: the halo about a flare, as a calibration knows it, in a window's pixels.
+"""Light that fog scatters forward: the halo about a flare, and the fit of flares beside it.
 
 Droplets larger than the wavelength turn much of the light by less than a degree. It arrives beside the
 source's image and within it: a fit that does not know of it takes a part for the source's own.
 """
+
+import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.flare import PixelBox
+from perception.model.fog import extinction_sigma_per_m, forward_sigma, may_be_in_fog, range_in_fog_m
+from perception.model.layout import Structure
+from perception.model.window import Camera
+from perception.robust.solve import Solution, Window, solve
+from perception.robust.structure import joined
 from perception.types import Calibration, ForwardLight
 
 Array = NDArray[np.float64]
 
+_ROUNDS = 3
+_SETTLED = 1e-3  # of a flux
 _RING_SIGMAS, _STEP_SIGMAS = 0.5, 0.25
+
+
+def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> None:
+    """Replace solutions by those of windows in which the flares' halos by fog are known light.
+
+    How bright a halo is follows from the flare's flux and the range at which fog leaves so much of it; the
+    flux is smaller where the halo is known: so it is done until fluxes stay. What is not known of extinction
+    and forward light is structure. Nothing is changed where the calibration knows of no forward light.
+    """
+    calibration = camera.calibration
+    if not (calibration.forward_light and may_be_in_fog(calibration)):
+        return
+    first = {index: one for index, one in enumerate(best) if one is not None and bool(one.ranged.all())}
+    going = dict(first)
+    for _ in range(_ROUNDS):
+        problems = [one.again(_with_halos(one, first[index], camera)) for index, one in going.items()]
+        again = dict(zip(going, solve(problems, camera), strict=True))
+        moved = {}
+        for index, now in again.items():
+            if now is None:
+                continue
+            best[index] = now
+            if np.any(np.abs(np.log(now.flux_e / going[index].flux_e)) > _SETTLED):
+                moved[index] = now
+        going = moved
+        if not going:
+            return
+
+
+def _with_halos(solution: Solution, first: Solution, camera: Camera) -> Window:
+    """Return a solution's window with the halos of its flares as known light.
+
+    What is not known of their strength is structure of it, on what the first had.
+    """
+    calibration, window = camera.calibration, solution.window
+    ranges_m = range_in_fog_m(np.exp(solution.log_photometric_range), calibration.extinction_per_m)
+    unsure_per_m = extinction_sigma_per_m(calibration)
+    # Where no fog is the likeliest, halos of as much as there may be are structure alone.
+    known = calibration.extinction_per_m > 0.0
+    per_m = calibration.extinction_per_m if known else unsure_per_m
+    depths = per_m * ranges_m
+    rows = zip(solution.u_px, solution.v_px, solution.flux_e, solution.image_radius_px, depths, strict=True)
+    halos = [halo_e(*map(float, row), window.box, calibration) for row in rows]
+    halo, structure = np.sum(halos, axis=0), first.window.structure
+    sigma = math.hypot(unsure_per_m / per_m, forward_sigma(calibration))
+    if sigma > 0.0:
+        structure = joined(structure, Structure(halo.reshape(1, -1), np.array([[1.0 / sigma**2]])))
+    return replace(window, known_e=halo if known else None, structure=structure)
 
 
 def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array, Array]:
@@ -46,7 +104,7 @@ def halo_e(
     """Return the electrons that fog brings forward about a flare into the pixels of a window.
 
     Between angles of the table the light lies evenly over the angle, as a halo of 1/α does; what blurs it,
-    point spread, pixel, and the source's own image, counts as one Gaussian.
+    point spread, pixel, and the source's own image, counts as one Gaussian, round in directions.
 
     Parameters
     ----------
