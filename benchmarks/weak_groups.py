@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
+from scipy.special import stdtr
 
 import nir_render as nr
 from nir_render.light.light import Indirect
@@ -171,7 +171,7 @@ def holm(result: dict[str, Any], seeds: int) -> dict[str, Any]:
         for name, one in figures.items() if isinstance(figures, dict) else ():
             if isinstance(one, dict) and "mean_of_seeds" in one:
                 t = abs(one["mean_of_seeds"]) / one["mean_of_seeds_error"]
-                p_values[f"{scene}: {name}"] = float(2.0 * student_t.sf(t, seeds - 1))
+                p_values[f"{scene}: {name}"] = float(2.0 * stdtr(seeds - 1, -t))
     ordered = sorted(p_values, key=lambda key: p_values[key])
     differing: list[str] = []
     for rank, key in enumerate(ordered):

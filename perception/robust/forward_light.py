@@ -65,8 +65,13 @@ def _with_halos(solution: Solution, first: Solution, camera: Camera) -> Window:
     known = calibration.extinction_per_m > 0.0
     per_m = calibration.extinction_per_m if known else unsure_per_m
     depths = per_m * ranges_m
-    rows = zip(solution.u_px, solution.v_px, solution.flux_e, solution.image_radius_px, depths, strict=True)
-    halos = [halo_e(*map(float, row), window.box, calibration) for row in rows]
+    halos = [
+        halo_e(
+            float(solution.u_px[k]), float(solution.v_px[k]), float(solution.flux_e[k]),
+            float(solution.image_radius_px[k]), float(depths[k]), window.box, calibration,
+        )
+        for k in range(solution.count)
+    ]  # fmt: skip
     halo, structure = np.sum(halos, axis=0), first.window.structure
     sigma = math.hypot(unsure_per_m / per_m, forward_sigma(calibration))
     if sigma > 0.0:
