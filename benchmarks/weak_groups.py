@@ -20,6 +20,7 @@ import argparse
 import json
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -189,7 +190,7 @@ def main() -> None:
     parser.add_argument("--only", default="fog,yard,workshop,yard_in_fog,hall")
     parser.add_argument("--keep", type=Path)
     options = parser.parse_args()
-    scenes = {
+    scenes: dict[str, Callable[[], Scene]] = {
         "fog": source_beside_sun,
         "yard": lambda: of_library("sunlit_yard", 32, 2),
         "workshop": lambda: of_library("workshop", 16, 4),
