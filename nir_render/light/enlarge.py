@@ -31,8 +31,8 @@ class Enlargement:
     block, weight
         Numbers of blocks, and what they weigh, shape (m,).
     patch
-        Numbers of the pixels that no block tells of well enough, or that the edge of a lamp cuts, shape (p,):
-        they are rendered one by one.
+        Numbers of the pixels that no block tells of well enough, or that the edge of a lamp cuts, or that lie
+        in a flare's halo sharper than blocks, shape (p,): they are rendered one by one.
     left_out
         How many more of these there are than may be rendered one by one: they are interpolated.
     """
@@ -124,6 +124,13 @@ def part_of(enlargement: Enlargement, pixels: NDArray[np.int64]) -> Enlargement:
         weight=enlargement.weight[entries],
         patch=enlargement.patch[np.isin(enlargement.patch, pixels)],
     )
+
+
+def with_patch(enlargement: Enlargement, pixels: NDArray[np.int64]) -> Enlargement:
+    """Return an enlargement in which some more pixels are rendered one by one."""
+    patch = np.union1d(enlargement.patch, pixels)
+    others = part_of(enlargement, np.setdiff1d(enlargement.pixels, patch))
+    return replace(others, patch=patch.astype(np.int32))
 
 
 def weights_of(pixels: NDArray[np.int64], scale: int, enlargement: Enlargement) -> csr_array:

@@ -1,7 +1,8 @@
 """What perception may know about a camera of a scene: its calibration, exact.
 
 The range constants are those of the sources of the other robots (of its own, where there are no others);
-where these differ, their mean, with their spread as σ. Of fog it says that there may be some, not how much.
+where these differ, their mean, with their spread as σ. Of fog it says that there may be some, not how much,
+and what fogs usually scatter forward.
 Sources are rendered as black spheres: in clear air they hide all of the background.
 """
 
@@ -22,6 +23,7 @@ from nir_render.scene.pose import camera_mount
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.flare_spread import Progress, flare_spread, source_beam
+from nir_render.simulation.fog_known import USUAL, forward_light
 from nir_render.spectra.nodes import BAND_M
 from perception.estimators import detect
 from perception.paper import regress_paper_range_constant
@@ -85,7 +87,7 @@ def _with_robot(known: Calibration, world: Scene | Snapshot) -> Calibration:
         sigma["extinction_per_m"] = FOG_SIGMA_PER_M
         # How much of the light beside a source comes from fog before it is anybody's guess: even over 0 to 1.
         sigma["hidden_background"] = math.sqrt(1.0 / 12.0)
-        known = replace(known, hidden_background=0.5)
+        known = replace(known, hidden_background=0.5, forward_light=forward_light(USUAL))
     own_sources_body_m = np.array(places, dtype=np.float64).reshape(-1, 3)
     return replace(
         known,

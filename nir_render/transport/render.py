@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.optics.apertures import pixels_around_flares
 from nir_render.errors import InputError
-from nir_render.light.enlarge import Enlargement, part_of
+from nir_render.light.enlarge import Enlargement, part_of, with_patch
 from nir_render.light.light import DirectTable, Indirect, Light
 from nir_render.light.nodes import direct_over_nodes, indirect_over_nodes
 from nir_render.scene.bodies import place_of_shape
@@ -23,7 +24,7 @@ from nir_render.transport.direct.table import bodies_of, direct_table
 from nir_render.transport.indirect import groups, sample_plan, stock
 from nir_render.transport.indirect.guide import group_power
 from nir_render.transport.indirect.kernel.tables import DeviceScene
-from nir_render.transport.indirect.sharpen import enlargement_of, flare_pilot, sharpened
+from nir_render.transport.indirect.sharpen import enlargement_of, flare_pilot, halo_reach_px, sharpened
 from nir_render.transport.wavelengths import carried_wavelengths
 from nir_render.transport.world import mitsuba_scene
 from nir_render.transport.world.facets import facets
@@ -202,7 +203,13 @@ class _Rendering:
 
     @cached_property
     def _enlargement(self) -> Enlargement:
-        return enlargement_of(self._built, self._rays, self.site.snapshot.render.indirect.scale)
+        site = self.site
+        scale = site.snapshot.render.indirect.scale
+        enlargement = enlargement_of(self._built, self._rays, scale)
+        reach_px = halo_reach_px(site.snapshot, self._rays, scale)
+        if reach_px == 0.0:
+            return enlargement
+        return with_patch(enlargement, pixels_around_flares(self._light(None), site.camera, reach_px))
 
     @cached_property
     def _direct(self) -> DirectTable:

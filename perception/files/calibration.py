@@ -19,7 +19,7 @@ from perception.files.entries import Entry, check_names, read_entries, read_entr
 from perception.files.fields import Faults, Place, RecordingError, check_format, get, shown
 from perception.files.readers import plain
 from perception.model.lens import COEFFICIENTS
-from perception.types import Calibration, Layout
+from perception.types import Calibration, ForwardLight, Layout
 
 _QUATERNION = "quaternion_body_camera_xyzw"
 _MOST_DN = 65535.0
@@ -41,6 +41,14 @@ LAYOUT_ENTRIES = (
     ),
 )  # fmt: skip
 """The fields of a layout among `layouts`."""
+
+FORWARD_ENTRIES = (
+    Entry("depth", "number", "optical depth of the way from a source", 0.0, 100.0, above=True),
+    Entry("angle_rad", "list", "angles off the source, increasing, above 0", 0.0, 3.2),
+    Entry("share", "list", "light that fog scatters forward within each, over what comes straight", 0.0, 1e6),
+    Entry("share_sigma", "number", "relative σ of all shares together", 0.0, 10.0, default=0.0),
+)
+"""The fields of one optical depth among `forward_light`."""
 
 CALIBRATION_ENTRIES = (
     Entry("width_px", "whole", "columns of a frame", 1, 65535, sigma=True),
@@ -124,6 +132,10 @@ CALIBRATION_ENTRIES = (
         "layouts", "objects", "where robots of a kind carry their sources, if several; a robot's heading is "
         "told by it", default=(), fields=LAYOUT_ENTRIES,
     ),
+    Entry(
+        "forward_light", "objects", "what fog of this kind scatters forward about a source, by rising "
+        "optical depth", default=(), fields=FORWARD_ENTRIES,
+    ),
 )  # fmt: skip
 """The fields of a camera in `calibration.json`."""
 
@@ -177,6 +189,8 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
         record["offset_file"] = calibration.offset_file
     if calibration.layouts:
         record["layouts"] = [_layout_record(layout) for layout in calibration.layouts]
+    if calibration.forward_light:
+        record["forward_light"] = [asdict(light) for light in calibration.forward_light]
     record["distortion"] = [float(number) for number in calibration.distortion]
     for field, sigma in calibration.sigma.items():
         name = _QUATERNION if field == "rotation_body_camera" else field
@@ -250,6 +264,7 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
         sigma=sigma,
         distortion=tuple(values.pop("distortion", ())),
         layouts=tuple(_layout(layout) for layout in values.pop("layouts", ())),
+        forward_light=tuple(_forward_light(light) for light in values.pop("forward_light", ())),
         **arrays,
         **values,
     )
@@ -258,6 +273,11 @@ def _calibration(name: str, record: Any, place: Place) -> Calibration:
 def _layout(values: Mapping[str, Any]) -> Layout:
     places = tuple((float(x), float(y), float(z)) for x, y, z in values["places_body_m"])
     return Layout(**{**values, "places_body_m": places, "relative_flux": tuple(values["relative_flux"])})
+
+
+def _forward_light(values: Mapping[str, Any]) -> ForwardLight:
+    lists = {name: tuple(values[name]) for name in ("angle_rad", "share")}
+    return ForwardLight(**{**values, **lists})
 
 
 def _told_of(given: Mapping[str, Any], record: Mapping[str, Any]) -> list[Entry]:
@@ -310,10 +330,29 @@ def _contradictions(values: Mapping[str, Any], place: Place) -> Iterator[Recordi
         elif len(flux) != len(places):
             remedy = f"Write a list of {len(places)} numbers, one for each source"
             yield inside.error(f"has {len(flux)} numbers", remedy, "relative_flux")
+    yield from _contradictions_of_forward_light(values.get("forward_light", ()), place)
     black_dn, saturation_dn = values.get("black_level_dn", -math.inf), values.get("saturation_dn", math.inf)
     if black_dn >= saturation_dn:
         problem = f"is {black_dn:g}, not below saturation_dn = {saturation_dn}"
         yield place.error(problem, "Write the mean count of a frame taken in the dark", "black_level_dn")
+
+
+def _contradictions_of_forward_light(
+    lights: Iterable[Mapping[str, Any]], place: Place
+) -> Iterator[RecordingError]:
+    before = 0.0
+    for number, light in enumerate(lights):
+        inside = place.within(f"forward_light[{number}]")
+        if not light["depth"] > before:
+            yield inside.error("does not increase", "Sort them by optical depth", "depth")
+        before = light["depth"]
+        if any(b <= a for a, b in pairwise([0.0, *light["angle_rad"]])):
+            yield inside.error("does not increase from above 0", "Sort the angles", "angle_rad")
+        if len(light["share"]) != len(light["angle_rad"]):
+            remedy = f"Write a list of {len(light['angle_rad'])} numbers, one for each angle"
+            yield inside.error(f"has {len(light['share'])} numbers", remedy, "share")
+        elif any(b < a for a, b in pairwise([0.0, *light["share"]])):
+            yield inside.error("falls", "Write the light within each angle: it rises with it", "share")
 
 
 def _split_sigmas(

@@ -332,7 +332,7 @@ def _known(
     expected_e, variance_e2, jacobian = np.empty(pixels), np.empty(pixels), np.empty((layout.size, pixels))
     at_1_m = sources._replace(log_flux_at_1_m=np.log(place[:, 3]) + 2.0 * log_range)
     blank = np.zeros((box.height, box.width))
-    view = View(box.top, box.left, blank, blank.astype(np.uint8), noise_floor_e2(calibration))
+    view = View(box.top, box.left, blank, blank.astype(np.uint8), noise_floor_e2(calibration), blank)
     expectation(values, view, at_1_m, structure, known, expected_e, jacobian, variance_e2)
     telling = np.ones(pixels)
     if clipped_tell_nothing:

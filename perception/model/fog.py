@@ -39,6 +39,11 @@ def extinction_sigma_per_m(calibration: Calibration) -> float:
     return calibration.sigma.get("extinction_per_m", 0.0)
 
 
+def forward_sigma(calibration: Calibration) -> float:
+    """Return the relative standard deviation of the forward light that a calibration states, 0 of none."""
+    return max((light.share_sigma for light in calibration.forward_light), default=0.0)
+
+
 def loosened(calibration: Calibration) -> Calibration:
     """Return a calibration that ties sizes to fluxes no closer than fog allows."""
     constant = calibration.range_constant_dn_m2_per_s

@@ -159,6 +159,7 @@ class View(NamedTuple):
     """A window of a frame: its corner, its pixels in electrons, what each is, and the dark variance.
 
     `image_e` and `state` have the shape (rows, columns), `state` one of `UNUSABLE`, `SEEN` and `CLIPPED`.
+    `known_e`, of the same shape, is light that is there whatever the unknowns are.
     """
 
     top: int
@@ -166,6 +167,7 @@ class View(NamedTuple):
     image_e: Array
     state: NDArray[np.uint8]
     floor_e2: float
+    known_e: Array
 
 
 class Structure(NamedTuple):

@@ -114,7 +114,7 @@ def expectation(
     values
         Unknowns, in the order of `layout.Layout`.
     view, sources, structure, known
-        The window, of which the place, the shape and the dark variance count, and what is in it.
+        The window, of which all but what it shows counts, and what is in it.
     expected, jacobian, variance
         Shape (pixels,), (unknowns, pixels) and (pixels,): written; the last as `sensor.pixel_variance_e2`.
     """
@@ -127,6 +127,7 @@ def expectation(
         sigma_px *= math.exp(known.width_spread * values[width])
         jacobian[width] = 0.0
     expected[:], jacobian[background] = values[background], 1.0
+    expected += view.known_e.ravel()
     for wave in range(len(structure.columns)):
         expected += values[background + 1 + wave] * structure.columns[wave]
         jacobian[background + 1 + wave] = structure.columns[wave]

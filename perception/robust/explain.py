@@ -10,6 +10,7 @@ from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.deblend import asks_for_more, deblend, of_free_width
+from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
 from perception.robust.search.prepare import PreparedFrame
@@ -50,6 +51,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, (cluster, solution) in enumerate(zip(found, chosen, strict=True)):
         if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
             chosen[index] = None
+    fit_beside_forward_light(chosen, camera)
     # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
     # flares would explain better.
     parted: dict[int, Solution] = {}

@@ -55,6 +55,8 @@ class Window:
         What may lie on the background beside flares, and its standard deviation; None and 0 where it is even.
     on_edges
         Whether that structure is not the frame's texture but something sharper, found in the window itself.
+    known_e
+        Light that is there beside flares and background, shape (height, width); None where there is none.
     """
 
     box: PixelBox
@@ -66,6 +68,7 @@ class Window:
     structure: Structure | None = None
     structure_e: float = 0.0
     on_edges: bool = False
+    known_e: Array | None = None
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -275,7 +278,9 @@ class _Fit:
     def climb(self, sources: Sources, reach_px: Array) -> None:
         """Go on to the greatest likelihood, with images as laid out, of so large radii."""
         box, layout = self.window.box, self.layout
-        view = View(box.top, box.left, self.window.image_e, self.window.state, self.window.floor_e2)
+        window = self.window
+        known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
+        view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
         self.deviance, self.log_information = maximise(
             view, sources, self.structure, self.known, layout.prior(self.structure, self.known.motion_px),
             layout.most_step, self.values, self.covariance, self.expected_e.ravel(),
@@ -365,6 +370,8 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
             motion_cost = cost_of_motion(motion_px, own[these, 2], covariance[these, part, part], camera)
             radius_px = radius_px + 0.5 * np.hypot(*motion_px.T)
         flares_e, log_information = fit.expected_e - background_e, fit.log_information
+        if fit.window.known_e is not None:
+            flares_e -= fit.window.known_e
         if waves := fit.layout.structure:
             flares_e -= (fit.values[-waves:] @ fit.structure.columns).reshape(flares_e.shape)
             log_information -= fit.structure.log_determinant

@@ -1,6 +1,6 @@
 """The contract: what perception reads (`inputs`) and what it says (`outputs`)."""
 
-from perception.types.inputs import Calibration, FrameKey, Layout, Odometry, RawFrame
+from perception.types.inputs import Calibration, ForwardLight, FrameKey, Layout, Odometry, RawFrame
 from perception.types.outputs import (
     Detection,
     Detections,
@@ -20,6 +20,7 @@ __all__ = [
     "Calibration",
     "Detection",
     "Detections",
+    "ForwardLight",
     "FrameKey",
     "Ghost",
     "Layout",

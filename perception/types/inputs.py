@@ -64,6 +64,28 @@ class Layout:
     flux_sigma_own: float = 0.0
 
 
+@dataclass(frozen=True)
+class ForwardLight:
+    """What fog scatters forward about a source seen through it, at one optical depth.
+
+    Attributes
+    ----------
+    depth
+        Optical depth of the way from the source, extinction times range.
+    angle_rad
+        Angles off the source, increasing, above 0.
+    share
+        Light within each, over that which comes straight.
+    share_sigma
+        Relative σ of all shares together.
+    """
+
+    depth: float
+    angle_rad: tuple[float, ...]
+    share: tuple[float, ...]
+    share_sigma: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """All that perception may know about one camera, and about the sources it looks for.
@@ -111,6 +133,9 @@ class Calibration:
     extinction_per_m
         Of the fog, 0 in clear air. Where it is not known a σ says so (0.05 /m: anything from clear air to
         a visibility of 40 m): ranges by flux are then no better than that allows.
+    forward_light
+        What fog of this kind scatters forward about a source, by rising optical depth; where it is not known
+        flares are taken to have none of it.
     hidden_background
         Share of the background's light that a source takes away where it stands before it: 1 for a black
         sphere in clear air, 0 where it sends back as much of the ambient light as it hides.
@@ -157,6 +182,7 @@ class Calibration:
     glare_exponent: float = 2.5
     own_sources_body_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
     layouts: tuple[Layout, ...] = ()
+    forward_light: tuple[ForwardLight, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

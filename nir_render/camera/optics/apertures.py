@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
@@ -99,6 +100,16 @@ def aperture_weights(
     shape = (len(places), len(enlargement.patch))
     of_patch = coo_array((weight[alone], (number[alone], at[alone])), shape=shape).tocsr()
     return of_blocks, of_patch
+
+
+def pixels_around_flares(light: Light, camera: Camera, reach_px: float) -> NDArray[np.int64]:
+    """Return the numbers, row by row, of the pixels no farther than `reach_px` from a flare's, shape (n,)."""
+    apart = np.ones((camera.sensor.rows, camera.sensor.columns), dtype=np.uint8)
+    for aperture in flare_apertures(light, camera):
+        apart[aperture.pixels()] = 0
+    if apart.all():
+        return np.empty(0, dtype=np.int64)
+    return np.flatnonzero(cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= reach_px)
 
 
 def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:

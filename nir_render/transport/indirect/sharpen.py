@@ -12,8 +12,12 @@ from nir_render.transport.indirect import groups
 from nir_render.transport.indirect.enlargement import fit_enlargement
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.labels import labels_of
+from nir_render.transport.world.medium import medium
 
 FLARE_PILOT_SAMPLES = 256
+# Fog that throws more than this of the light scattered once, over straight light and optical depth, within
+# half a block of a source has halos that blocks smear: so many blocks about each are rendered by the pixel.
+_SHARP_SHARE, _HALO_BLOCKS = 0.04, 3.0
 
 
 def enlargement_of(built: DeviceScene, rays: groups.Rays, scale: int) -> Enlargement:
@@ -21,6 +25,22 @@ def enlargement_of(built: DeviceScene, rays: groups.Rays, scale: int) -> Enlarge
     if scale == 1:
         return without_edges(*(count - 1 for count in rays.corners.shape[:2]))
     return fit_enlargement(labels_of(built, rays.origin_m, rays.corners), scale)
+
+
+def halo_reach_px(snapshot: Snapshot, rays: groups.Rays, scale: int) -> float:
+    """Return how far about flares pixels are rendered one by one, as fog's halos are sharper than blocks.
+
+    A halo of light scattered once goes as ∫ p dβ / α, α the angle off the source (`scattering.forward`).
+    """
+    fog = medium(snapshot)
+    if fog is None or scale == 1:
+        return 0.0
+    row, column = (count // 2 for count in rays.corners.shape[:2])
+    beside = rays.corners[row, column - 1 : column + 1]
+    first, second = beside / np.linalg.norm(beside, axis=1, keepdims=True)
+    half_block_rad = 0.5 * scale * float(np.linalg.norm(second - first))
+    within = 2.0 * np.pi * half_block_rad * fog.albedo * float(fog.phase.arc[-1])
+    return _HALO_BLOCKS * scale if within > _SHARP_SHARE else 0.0
 
 
 def sharpened(

@@ -100,6 +100,12 @@ def draw_by_weight(
     return chosen, chosen_weight, total
 
 
+def power_heuristic(density: Float, other_density: Float) -> Float:
+    """Return the power heuristic's weight of the way whose density is `density`."""
+    ratio = other_density / dr.maximum(density, 1e-30)
+    return dr.select(density > 0.0, 1.0 / (1.0 + ratio * ratio), 0.0)
+
+
 _BELOW_ONE = 1.0 - 2.0**-24
 
 

@@ -2,7 +2,9 @@
 
 One light is drawn for each stretch, and one place, both by what they bring: the phase function and the
 inverse square cancel where the place is drawn evenly in ∫ p dβ, β being the angle at which the light stands
-off the ray (equiangular sampling, Kulla & Fajardo 2012, with the phase function in it).
+off the ray (equiangular sampling, Kulla & Fajardo 2012, with the phase function in it). That is so for lights
+much smaller than the forward peak; of a larger one the peak picks a part, which asking for evenly drawn
+points of it seldom meets. Paths that turn do: so both ways bring the light, weighted by the power heuristic.
 """
 
 from dataclasses import dataclass
@@ -32,6 +34,9 @@ from nir_render.transport.world.emitters import SKY, SUN
 # Up to so many lights fog weighs each of them for each stretch; with more, the guide proposes so many.
 _WEIGHED_LIGHTS = 16
 _CANDIDATES = 4  # for each of which `draws` has two numbers
+# How many paths turn at a place in fog for each light that is asked for there, roughly: it weighs the two
+# ways to a light, and moves nothing but noise.
+TURNED = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +67,6 @@ def scatter_on_stretch(
     fog = scene.fog
     assert fog is not None  # only called in fog
     lost = dr.select(active, absorbed_share(fog.extinction * (end - begin)), 0.0)
-    # The last stretch but one may scatter, and the last may not: all its light has been asked for before, but
-    # for the sky's, which turned paths meet by themselves: fog throws it mostly onwards.
-    turns = active & (state.depth + (2 if scene.lights.sky < 0 else 1) < max_depth)
     active = active & (state.depth + 1 < max_depth)
     row, chance = _light_for_stretch(scene, state, begin, end, active, number)
     distance, density = _place_on_stretch(scene, row, state, begin, end, number(draws.FOG_PLACE), active)
@@ -72,13 +74,15 @@ def scatter_on_stretch(
     aim = connect.aim_at_light(scene.lights, row, place, number(draws.FOG_U), number(draws.FOG_V), active)
     turn = 0.5 * dr.squared_norm(aim.direction - state.direction)
     weight = fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin)) / density
-    brought = state.weight * weight * phase_function(fog, turn) * aim.radiance / (chance * aim.density)
+    phase = phase_function(fog, turn)
+    brought = state.weight * weight * phase * aim.radiance / (chance * aim.density)
+    brought = brought * draws.power_heuristic(aim.density, TURNED * phase)
     if state.dealt is not None:
         brought = brought * state.dealt
     seen = active & (brought > 0.0) & dr.isfinite(brought)
     share, kept = connect.arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
     add(brought * share, nodes.times(state.shares, kept), row, seen & (share > 0.0))
-    return FogScattering(lost, place, weight, turns)
+    return FogScattering(lost, place, weight, active)
 
 
 def _light_for_stretch(

@@ -10,7 +10,7 @@ from typing import Any
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws
 from nir_render.transport.indirect.kernel.fog import draw_angle, draw_scattering, phase_function, table_slope
-from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, weighs_all
+from nir_render.transport.indirect.kernel.fog_scatter import TURNED, FogScattering, weighs_all
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import (
     Float,
@@ -25,8 +25,8 @@ from nir_render.transport.indirect.kernel.types import (
 from nir_render.transport.world.emitters import SKY, SUN
 
 # Shares of directions that go into the halo of a light, from surfaces in fog and from fog itself. Each turn
-# that misses the halo weighs by one over what is left: near 1 it must be for the sun, whose paths turn often.
-_FROM_SURFACE, _FROM_FOG, _FROM_FOG_TO_SUN = 0.25, 0.5, 0.15
+# that misses the halo weighs by one over what is left: near 1 it must be, as paths turn often.
+_FROM_SURFACE, _FROM_FOG = 0.25, 0.15
 # So many times more often than light do paths turn in fog: what comes of it varies more than what comes from
 # surfaces.
 _TURNS = 3.0
@@ -37,9 +37,9 @@ _BRIGHTEST_PER_SR = 10.0  # how bright a halo counts, at most, in front of a pat
 class NextDirection:
     """How a path goes on.
 
-    From a place in a unit direction, which the surface draws with a density per sr (0 in fog); the weight of
-    it; the share of light that goes on at such a vertex, however it was drawn; whether by a smooth part of
-    the surface; whether by turning in fog.
+    From a place in a unit direction, which the surface, or fog by itself, draws with a density per sr; the
+    weight of it; the share of light that goes on at such a vertex, however it was drawn; whether by a smooth
+    part of the surface; whether by turning in fog.
     """
 
     place: Point
@@ -120,7 +120,7 @@ def leave_in_fog(
     return NextDirection(
         place=place,
         direction=direction,
-        density=dr.select(turned, 0.0, density),
+        density=dr.select(turned, TURNED * phase, density),
         weight=dr.select(turned, turned_weight / chance, weight * stays),
         left=dr.select(turned, fog.albedo * lost / chance, left * stays),
         smooth=smooth & ~turned,
@@ -129,21 +129,14 @@ def leave_in_fog(
 
 
 def _share_from_fog(scene: DeviceScene, state: PathState) -> Float:
-    """Return the share of directions from fog that go into halos, by whether the path serves sun or sky.
-
-    The sky has no halo: paths that serve it alone go as fog sends them.
-    """
-    lights, share = scene.lights, mi.Float(_FROM_FOG)
-    of_sky = 0.0 if lights.sky_alone else _FROM_FOG_TO_SUN
-    for row, own in ((lights.sky, of_sky), (lights.sun, _FROM_FOG_TO_SUN)):
-        if row < 0:
-            continue
-        if state.tier is None:
-            share = mi.Float(own)
-        else:
-            serves = state.tier == dr.gather(mi.UInt32, lights.tier, mi.UInt32(row))
-            share = dr.select(serves, own, share)
-    return share
+    """Return the share of directions from fog that go into halos; none for the sky alone, which has none."""
+    lights = scene.lights
+    if not lights.sky_alone:
+        return mi.Float(_FROM_FOG)
+    if state.tier is None:
+        return mi.Float(0.0)
+    serves = state.tier == dr.gather(mi.UInt32, lights.tier, mi.UInt32(lights.sky))
+    return dr.select(serves, 0.0, _FROM_FOG)
 
 
 class _Halos:

@@ -7,7 +7,7 @@ number of threads.
 Each step is a stretch of a path, from a vertex to the next: fog on the way scatters light of one light
 towards the vertex (a place drawn where the phase function and the inverse square put it, Kulla & Fajardo
 2012); at the surface one light is asked for (next-event estimation), and the path goes on by the surface's
-own scattering. Both ways to a light are weighted by the power heuristic (Veach 1995).
+own scattering, or by the fog's. Both ways to a light are weighted by the power heuristic (Veach 1995).
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from typing import Any
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws, nodes
 from nir_render.transport.indirect.kernel.begin import Film, camera_direction, deal_of
-from nir_render.transport.indirect.kernel.draws import Draws
+from nir_render.transport.indirect.kernel.draws import Draws, power_heuristic
 from nir_render.transport.indirect.kernel.fog import fog_interval
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
@@ -107,6 +107,7 @@ def walk(
         scattered=dr.zeros(mi.Bool, lanes),
         way=dr.full(mi.Int32, _STRAIGHT, lanes),
         inside=dr.zeros(mi.Bool, lanes),
+        in_fog=None if scene.fog is None else dr.zeros(mi.Bool, lanes),
         tier=tier,
         dealt=dealt,
         active=dr.full(mi.Bool, True, lanes),
@@ -210,12 +211,14 @@ def _add_unasked_light(
         normal = dr.gather(mi.Vector3f, scene.surfaces.normal, mi.UInt32(state.way), mirrored)
         towards = dr.select(mirrored, towards - 2.0 * dr.dot(towards, normal) * normal, towards)
     asked = active & state.scattered & (state.way != _OTHERWISE) & (row >= 0)
-    if lights.sky >= 0:  # fog does not ask for it
-        asked = asked & ((light != lights.sky) | (state.density > 0.0))
+    if lights.sky >= 0 and state.in_fog is not None:  # fog does not ask for it
+        asked = asked & ((light != lights.sky) | ~state.in_fog)
     known = mi.UInt32(dr.maximum(row, 0))
     density = connect.aim_density(lights, known, state.place, towards, asked)
-    density = density * connect.light_chance(scene.choice, lights, state.cell, known, asked)
-    share = dr.select(asked, _power_heuristic(state.density, density), 1.0)
+    chance = connect.light_chance(scene.choice, lights, state.cell, known, asked)
+    if state.in_fog is not None:
+        chance = dr.select(state.in_fog, 1.0, chance)
+    share = dr.select(asked, power_heuristic(state.density, density * chance), 1.0)
     small = dr.gather(mi.UInt32, lights.kind, light, active) != RECTANGLE
     if scene.lights.sky >= 0:
         small = small & (light != scene.lights.sky)
@@ -259,7 +262,7 @@ def _ask_light(
         mi.Point2f(number(draws.LOBE_U), number(draws.LOBE_V)), surface,
     )  # fmt: skip
     asked = aim.density * chance
-    brought = weight * value[0] * aim.radiance / asked * _power_heuristic(asked, density)
+    brought = weight * value[0] * aim.radiance / asked * power_heuristic(asked, density)
     if state.dealt is not None:
         brought = brought * state.dealt
     seen = surface & (brought > 0.0) & dr.isfinite(brought)
@@ -366,6 +369,7 @@ def _survive(
         scattered=goes_on & (state.scattered | evenly),
         way=dr.select(goes_on & ~evenly, onward_path.way, _STRAIGHT),
         inside=goes_on & onward_path.inside,
+        in_fog=None if state.in_fog is None else dr.select(evenly, leaving.turned, state.in_fog),
         tier=None if tier is None else dr.select(goes_on, state.tier, tier),
         dealt=None if dealt is None else dr.select(goes_on, state.dealt, dealt),
         active=state.active & (sample_next < draw.samples),
@@ -382,9 +386,3 @@ def _facet(surfaces: Surfaces, si: Interaction, shape: UInt, active: Mask) -> In
     first = dr.gather(mi.Int32, surfaces.facet_of_shape, shape, active)
     box = dr.gather(mi.Bool, surfaces.box_of_shape, shape, active)
     return dr.select(active, dr.select(box, first + mi.Int32(si.prim_index >> 1), first), -1)
-
-
-def _power_heuristic(density: Float, other_density: Float) -> Float:
-    """Return the power heuristic's weight of the way whose density is `density`."""
-    ratio = other_density / dr.maximum(density, 1e-30)
-    return dr.select(density > 0.0, 1.0 / (1.0 + ratio * ratio), 0.0)

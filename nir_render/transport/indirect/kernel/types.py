@@ -36,12 +36,11 @@ class PathState:
     left: Float  # what surfaces and fog have left of a path's light
     place: Point  # the last vertex that scatters evenly
     cell: UInt
-    density: (
-        Float  # with which its direction was drawn; 0 after fog, where lights have been asked for already
-    )
+    density: Float  # with which a surface there draws its direction; in fog `TURNED` of the phase function
     scattered: Mask  # whether there is such a vertex
     way: Int
     inside: Mask  # a transparent solid
+    in_fog: Mask | None  # whether that vertex is fog's; None in clear air
     tier: UInt | None  # of lights that the path serves; None where all are of one
     dealt: Float | None  # one over the share of samples that serve it
     active: Mask

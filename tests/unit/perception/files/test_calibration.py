@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception import Layout, RecordingError, calibration_document, parse_calibration_document
+from perception import ForwardLight, Layout, RecordingError, calibration_document, parse_calibration_document
 from tests.unit.perception.simulation import calibration
 
 ARRAYS = (
@@ -31,6 +32,10 @@ FULL = calibration(
     dsnu_e=4.0 + 1.0 / 3.0,
     prnu=0.009,
     layouts=(Layout("pair", ((0.06, 0.0, 1.0 / 3.0), (-0.06, 0.0, 0.28)), (1.0, 1.0 / 3.0), 0.1, 0.05),),
+    forward_light=(
+        ForwardLight(0.5, (1e-3, 1.0 / 300.0), (0.01, 1.0 / 30.0), 0.4),
+        ForwardLight(1.0, (1e-3,), (0.03,)),
+    ),
     lens_model="brown_conrady",
     distortion=(-0.1, 0.01, 1e-3, -1.0 / 3.0, 0.0),
 )
@@ -47,6 +52,23 @@ def test_round_trip_through_text() -> None:
     for name in ARRAYS[1:]:
         assert np.array_equal(getattr(back, name), getattr(FULL, name)), name
     np.testing.assert_allclose(back.rotation_body_camera, FULL.rotation_body_camera, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"depth": 0.1}, "forward_light[1]"),
+        ({"angle_rad": [2e-3]}, "has 2 numbers"),
+        ({"angle_rad": [1e-3, 1e-3]}, "does not increase"),
+        ({"share": [0.1, 0.05]}, "falls"),
+    ],
+)
+def test_forward_light_that_contradicts_itself_is_refused(change: dict[str, Any], words: str) -> None:
+    record = {"depth": 0.2, "angle_rad": [1e-3, 2e-3], "share": [0.1, 0.2]}
+    document = calibration_document([FULL])
+    document["cameras"]["r1.front"]["forward_light"] = [record, {**record, "depth": 0.3, **change}]
+    with pytest.raises(RecordingError, match=re.escape(words)):
+        parse_calibration_document(document)
 
 
 def test_a_file_without_a_lens_model_is_of_a_rectilinear_lens() -> None:
@@ -66,6 +88,7 @@ def test_every_number_of_a_calibration_can_have_a_sigma() -> None:
         "offset_dn",
         "offset_file",
         "layouts",
+        "forward_light",
     }
     sigma = {name: 0.01 * number for number, name in enumerate(sorted(names), 1)}
     document = json.loads(json.dumps(calibration_document([replace(FULL, sigma=sigma)])))

@@ -1,0 +1,92 @@
+"""What a robot may know of fog beyond that there is some: how thick it is, and of which droplets.
+
+Then its calibration tells what the fog scatters forward about a flare, to the droplets that it takes it to be
+of; where it does not know these, to all that fog is usually of, with what these differ by as σ.
+"""
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.errors import InputError
+from nir_render.scattering.forward import scattered_forward
+from nir_render.scattering.optics import ANGLE_RAD
+from nir_render.scene.documents.ambient.droplets import Droplets
+from nir_render.scene.scene import Scene
+from nir_render.scene.snapshot import Snapshot
+from perception.types import Calibration, ForwardLight
+
+USUAL = ("advection_heavy", "advection_moderate", "radiation_heavy", "radiation_moderate")
+"""The droplets of which fog may be where a robot does not know them."""
+
+_EXACT_PER_M = 1e-6
+_DEPTHS = (0.25, 0.5, 1.0, 2.0, 4.0)
+_ANGLES_DEG = (0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
+_ANGLES_RAD = tuple(math.radians(angle_deg) for angle_deg in _ANGLES_DEG)
+
+
+def knowing_fog(
+    known: Calibration,
+    world: Scene | Snapshot,
+    droplets: tuple[str, ...] = USUAL,
+    extinction_sigma_per_m: float = _EXACT_PER_M,
+) -> Calibration:
+    """Return a calibration of a robot that knows the extinction of the scene's fog.
+
+    Parameters
+    ----------
+    known
+        The calibration without that knowledge, as `calibration` gives it.
+    world
+        Whose fog it is.
+    droplets
+        Presets of `data/droplets`: what it takes the fog to be of, one of these.
+    extinction_sigma_per_m
+        How well it knows the extinction.
+
+    Raises
+    ------
+    InputError
+        The scene has no fog, or no droplets of such a name are known.
+    """
+    fog = (world.at(0.0) if isinstance(world, Scene) else world).fog
+    if fog is None or fog.extinction_per_m == 0.0:
+        raise InputError("there is no fog to know of; give the scene one, such as fog: {visibility: 50 m}")
+    if not droplets:
+        raise InputError("droplets: none is named; name one of those that the fog may be of, or more")
+    return replace(
+        known,
+        extinction_per_m=fog.extinction_per_m,
+        forward_light=forward_light(droplets),
+        sigma={**known.sigma, "extinction_per_m": extinction_sigma_per_m},
+    )
+
+
+def forward_light(droplets: tuple[str, ...]) -> tuple[ForwardLight, ...]:
+    """Return what fog of one of some droplets scatters forward: their mean, and what they differ by as σ.
+
+    The σ is that of the light within half a degree, about what the window of a flare holds.
+    """
+    tables = np.stack([_shares(name) for name in droplets])
+    mean, spread = tables.mean(axis=0), tables.std(axis=0)
+    of_flare = int(np.argmin(np.abs(np.array(_ANGLES_RAD) - np.radians(0.5))))
+    return tuple(
+        ForwardLight(
+            depth,
+            _ANGLES_RAD,
+            tuple(float(share) for share in mean[k]),
+            float(spread[k, of_flare] / mean[k, of_flare]),
+        )
+        for k, depth in enumerate(_DEPTHS)
+    )
+
+
+@lru_cache(maxsize=32)
+def _shares(name: str) -> NDArray[np.float64]:
+    """Return the forward light of a preset's droplets, shape (depths, angles)."""
+    optics = Droplets.model_validate(name).optics
+    albedo = 1.0 - optics.absorbed_share
+    return scattered_forward(ANGLE_RAD, optics.phase_per_sr, albedo, np.array(_ANGLES_RAD), np.array(_DEPTHS))

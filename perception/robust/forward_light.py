@@ -1,0 +1,162 @@
+"""Light that fog scatters forward: the halo about a flare, and the fit of flares beside it.
+
+Droplets larger than the wavelength turn much of the light by less than a degree. It arrives beside the
+source's image and within it: a fit that does not know of it takes a part for the source's own.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.bearing import direction_camera
+from perception.model.flare import PixelBox
+from perception.model.fog import extinction_sigma_per_m, forward_sigma, may_be_in_fog, range_in_fog_m
+from perception.model.layout import Structure
+from perception.model.window import Camera
+from perception.robust.solve import Solution, Window, solve
+from perception.robust.structure import joined
+from perception.types import Calibration, ForwardLight
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 3
+_SETTLED = 1e-3  # of a flux
+_RING_SIGMAS, _STEP_SIGMAS = 0.5, 0.25
+
+
+def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> None:
+    """Replace solutions by those of windows in which the flares' halos by fog are known light.
+
+    How bright a halo is follows from the flare's flux and the range at which fog leaves so much of it; the
+    flux is smaller where the halo is known: so it is done until fluxes stay. What is not known of extinction
+    and forward light is structure. Nothing is changed where the calibration knows of no forward light.
+    """
+    calibration = camera.calibration
+    if not (calibration.forward_light and may_be_in_fog(calibration)):
+        return
+    first = {index: one for index, one in enumerate(best) if one is not None and bool(one.ranged.all())}
+    going = dict(first)
+    for _ in range(_ROUNDS):
+        problems = [one.again(_with_halos(one, first[index], camera)) for index, one in going.items()]
+        again = dict(zip(going, solve(problems, camera), strict=True))
+        moved = {}
+        for index, now in again.items():
+            if now is None:
+                continue
+            best[index] = now
+            if np.any(np.abs(np.log(now.flux_e / going[index].flux_e)) > _SETTLED):
+                moved[index] = now
+        going = moved
+        if not going:
+            return
+
+
+def _with_halos(solution: Solution, first: Solution, camera: Camera) -> Window:
+    """Return a solution's window with the halos of its flares as known light.
+
+    What is not known of their strength is structure of it, on what the first had.
+    """
+    calibration, window = camera.calibration, solution.window
+    ranges_m = range_in_fog_m(np.exp(solution.log_photometric_range), calibration.extinction_per_m)
+    unsure_per_m = extinction_sigma_per_m(calibration)
+    # Where no fog is the likeliest, halos of as much as there may be are structure alone.
+    known = calibration.extinction_per_m > 0.0
+    per_m = calibration.extinction_per_m if known else unsure_per_m
+    depths = per_m * ranges_m
+    halos = [
+        halo_e(
+            float(solution.u_px[k]), float(solution.v_px[k]), float(solution.flux_e[k]),
+            float(solution.image_radius_px[k]), float(depths[k]), window.box, calibration,
+        )
+        for k in range(solution.count)
+    ]  # fmt: skip
+    halo, structure = np.sum(halos, axis=0), first.window.structure
+    sigma = math.hypot(unsure_per_m / per_m, forward_sigma(calibration))
+    if sigma > 0.0:
+        structure = joined(structure, Structure(halo.reshape(1, -1), np.array([[1.0 / sigma**2]])))
+    return replace(window, known_e=halo if known else None, structure=structure)
+
+
+def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array, Array]:
+    """Return the light within angles over what comes straight, at an optical depth, and these angles.
+
+    Between tabulated depths the share per depth is interpolated, and held beyond them.
+
+    Parameters
+    ----------
+    lights
+        At least one, by rising depth.
+
+    Returns
+    -------
+    Shares and angles in rad, shape (n,) each; the first of both is 0.
+    """
+    angle_rad = np.unique(np.concatenate([[0.0], *(light.angle_rad for light in lights)]))
+    rates = np.array(
+        [np.interp(angle_rad, [0.0, *one.angle_rad], [0.0, *one.share]) / one.depth for one in lights]
+    )
+    depths = [one.depth for one in lights]
+    rate = [np.interp(depth, depths, rates[:, k]) for k in range(len(angle_rad))]
+    return depth * np.array(rate), angle_rad
+
+
+def halo_e(
+    u_px: float, v_px: float, flux_e: float, image_radius_px: float, depth: float,
+    box: PixelBox, calibration: Calibration,
+) -> Array:  # fmt: skip
+    """Return the electrons that fog brings forward about a flare into the pixels of a window.
+
+    Between angles of the table the light lies evenly over the angle, as a halo of 1/α does; what blurs it,
+    point spread, pixel, and the source's own image, counts as one Gaussian, round in directions.
+
+    Parameters
+    ----------
+    u_px, v_px, flux_e, image_radius_px
+        The flare: its place, what comes straight of it, and the radius of its image.
+    depth
+        Optical depth of the way from it.
+    box
+        The window.
+    calibration
+        With `forward_light`.
+
+    Returns
+    -------
+    Shape (height, width).
+    """
+    share, angle_rad = forward_share(calibration.forward_light, depth)
+    rows, columns = np.mgrid[box.top : box.top + box.height, box.left : box.left + box.width]
+    places = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    middle = direction_camera(np.array([[u_px, v_px]]), calibration)[0]
+    direction = direction_camera(places, calibration)
+    # The area of a pixel in directions, from its neighbours' places.
+    aside, below = (
+        direction_camera(np.array([[u_px, v_px]]) + step, calibration)[0] - middle
+        for step in ((1.0, 0.0), (0.0, 1.0))
+    )
+    pixel_sr = float(np.linalg.norm(np.cross(aside, below)))
+    px_per_rad = pixel_sr**-0.5
+    off_px = px_per_rad * 2.0 * np.arcsin(0.5 * np.minimum(np.linalg.norm(direction - middle, axis=1), 2.0))
+    sigma_px = np.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0 + 0.25 * image_radius_px**2)
+    profile, at_px = _blurred(share, px_per_rad * angle_rad, float(sigma_px), float(off_px.max()))
+    image = flux_e * np.interp(off_px, at_px, profile)
+    return np.asarray(np.where(np.isnan(image), 0.0, image).reshape(box.height, box.width))
+
+
+def _blurred(share: Array, angle_px: Array, sigma_px: float, most_px: float) -> tuple[Array, Array]:
+    """Return light per square pixel against the distance, rings of it spread by a Gaussian; the distances.
+
+    A ring of radius a and light m gives m exp(−(ρ² + a²)/2σ²) I₀(ρ a/σ²) / 2πσ² at the distance ρ.
+    """
+    from scipy.special import i0e
+
+    most_ring_px = min(float(angle_px[-1]), most_px + 6.0 * sigma_px)
+    edges = np.linspace(0.0, most_ring_px, max(int(most_ring_px / (_RING_SIGMAS * sigma_px)), 1) + 1)
+    light = np.diff(np.interp(edges, angle_px, share))
+    ring = 0.5 * (edges[1:] + edges[:-1])
+    at = np.arange(0.0, most_px + _STEP_SIGMAS * sigma_px, _STEP_SIGMAS * sigma_px)
+    variance = sigma_px**2
+    spread = np.exp(-0.5 * (at[:, None] - ring) ** 2 / variance) * i0e(at[:, None] * ring / variance)
+    return spread @ light / (2.0 * np.pi * variance), at
