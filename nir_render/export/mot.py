@@ -23,7 +23,8 @@ def export_mot(folder: Path, target: Path, overwrite: bool = False) -> dict[str,
     flag, class 1, visible share; the flag is 1 where the source counts for recall (`match.countable`), 0
     where it is to be passed over. `det/NAME.txt` holds what the estimator NAME has found and does not take
     for a mirror image: frame, -1, box, 1, and the place in the robot's body axes in metres, or -1, -1, -1
-    without a range. `seqinfo.ini` says the rest; pictures are linked as `img1`, or copied where there are no links.
+    without a range. `seqinfo.ini` says the rest; pictures are linked as `img1`, or copied where there are no
+    links.
 
     Returns
     -------

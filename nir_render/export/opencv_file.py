@@ -32,6 +32,8 @@ def export_opencv(folder: Path, target: Path, overwrite: bool = False) -> dict[s
         known = read_calibrations(folder)
     except RecordingError as error:
         raise InputError(*error.problems) from None
+    if not known:
+        raise InputError(f"{folder}: its calibration.json names no camera; give the folder of a run")
     with export_folder(target, overwrite) as aside:
         for name, calibration in known.items():
             write_file(aside / f"{name}.yaml", _text(calibration).encode())

@@ -180,6 +180,13 @@ def test_opencv_images_where_perception_does(
     assert (file.getNode("image_width").real(), file.getNode("image_height").real()) == (1280, 960)
 
 
+def test_opencv_refuses_a_calibration_of_nothing(tmp_path: Path) -> None:
+    (tmp_path / "calibration.json").write_text(json.dumps(calibration_document([])))
+    with pytest.raises(InputError, match="names no camera"):
+        export_opencv(tmp_path, tmp_path / "cv")
+    assert not (tmp_path / "cv").exists()
+
+
 def test_a_data_set_has_the_frames_as_they_are_and_their_labels(run: Path) -> None:
     both = RunDataset(run, run)
     frames = list(read_frames(run))
