@@ -97,6 +97,10 @@ def export(
         Path | None,
         typer.Option("-o", "--output", metavar="PATH", help="Where it goes; DIR.mcap by default, and so on."),
     ] = None,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Replace the export that the folder holds (mot, tum, opencv)."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Write a run in another program's format; what its folder holds is written, whatever that is."""
@@ -114,10 +118,10 @@ def export(
             done = export_mcap(folder, place, progress)
         counts, ahead_s = done.messages, done.ahead_s
     else:
-        counts = _exported(form, folder, place)
+        counts = _exported(form, folder, place, overwrite)
     if as_json:
-        clock = {} if ahead_s is None else {"ahead_s": ahead_s}
-        print_json({"format": 1, "file": str(place), **clock, "messages": counts})
+        of_mcap = {} if ahead_s is None else {"ahead_s": ahead_s, "messages": counts}
+        print_json({"format": 1, "file": str(place), **of_mcap, "counts": counts})
         return
     for name, count in counts.items():
         typer.echo(f"{count:8d}  {name}")
@@ -126,7 +130,7 @@ def export(
     typer.echo(f"{'open' if form is Format.MCAP else 'see'} {place}")
 
 
-def _exported(form: Format, folder: Path, place: Path) -> dict[str, int]:
+def _exported(form: Format, folder: Path, place: Path, overwrite: bool) -> dict[str, int]:
     """Write one of the formats that need no clock; return how much of what there is."""
     from nir_render.errors import InputError
     from nir_render.export.coco import export_coco
@@ -136,14 +140,9 @@ def _exported(form: Format, folder: Path, place: Path) -> dict[str, int]:
     from nir_render.export.trajectories import export_tum
     from perception import RecordingError
 
-    write = {
-        Format.COCO: export_coco,
-        Format.MOT: export_mot,
-        Format.TUM: export_tum,
-        Format.OPENCV: export_opencv,
-        Format.HDF5: export_hdf5,
-    }[form]
+    files = {Format.COCO: export_coco, Format.HDF5: export_hdf5}
+    folders = {Format.MOT: export_mot, Format.TUM: export_tum, Format.OPENCV: export_opencv}
     try:
-        return write(folder, place)
+        return files[form](folder, place) if form in files else folders[form](folder, place, overwrite)
     except RecordingError as error:
         raise InputError(*error.problems) from None

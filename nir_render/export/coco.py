@@ -15,9 +15,10 @@ _HALF_PX = 0.5  # COCO counts from the corner of the top left pixel, we from its
 def export_coco(folder: Path, file: Path) -> dict[str, int]:
     """Write the labels of a run's frames as one COCO file; pictures stay where they are.
 
-    Boxes are [left, top, width, height] in pixels from the frame's corner. Beside COCO's own fields an
-    annotation has what a source's truth says: `name`, `range_m`, `center_px` (from the corner, too),
-    `bearing_body`, `visible_fraction`, `on_fraction`, `direct_e`, `peak_snr`, `saturated_px`.
+    `file_name` counts from the run's folder. Boxes are [left, top, width, height] in pixels from the frame's
+    corner. Beside COCO's own fields an annotation has what a source's truth says: `name`, `range_m`,
+    `center_px` (from the corner, too), `bearing_body`, `visible_fraction`, `on_fraction`, `direct_e`,
+    `peak_snr`, `saturated_px`. A lamp has its polygon, cut at the frame's edges, and this one's area.
 
     Returns
     -------
@@ -36,7 +37,7 @@ def export_coco(folder: Path, file: Path) -> dict[str, int]:
         for box in labelled.boxes[record.camera, record.index]:
             annotations.append({"id": len(annotations) + 1, "image_id": number, **_annotation(box)})
     document = {
-        "info": {"description": f"{folder.name}, rendered by nir_render", "version": "1"},
+        "info": {"description": f"{folder.resolve().name}, rendered by nir_render", "version": "1"},
         "licenses": [],
         "images": images,
         "annotations": annotations,
@@ -63,7 +64,7 @@ def _annotation(box: Box) -> dict[str, Any]:
     found: dict[str, Any] = {
         "category_id": KINDS.index(box.kind) + 1,
         "bbox": [*corner, box.width_px, box.height_px],
-        "area": box.width_px * box.height_px,
+        "area": box.area_px2,
         "iscrowd": 0,
         "name": box.name,
     }

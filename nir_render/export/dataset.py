@@ -1,6 +1,7 @@
 """The frames of runs with their labels, for whoever learns from them; as one HDF5 file, too.
 
-`RunDataset` is what PyTorch calls a map-style data set, and needs no PyTorch: `len(runs)`, `runs[3]`.
+`RunDataset` is what PyTorch calls a map-style data set, and needs no PyTorch: `len(runs)`, `runs[3]`. Frames
+hold different numbers of things, so a `DataLoader` wants `collate_fn=collate`.
 """
 
 import bisect
@@ -9,14 +10,14 @@ import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.errors import InputError
+from nir_render.errors import InputError, shown
 from nir_render.export.boxes import KINDS, Box, Kind, Labelled, read_labelled
 from nir_render.run.folder import write_stream
 from perception import RecordingError, read_frame
@@ -28,8 +29,10 @@ class Sample:
 
     Attributes
     ----------
-    camera, index, time_s, exposure_s, gain, black_level_dn
+    camera, index, time_s, exposure_s, line_time_s, gain, black_level_dn
         Of the frame, as in `frames.jsonl`.
+    frame_kind
+        What was taken: `scene`, or `dark`, `flat`, `rail`, `shared` of a calibration.
     data_dn
         Raw counts, uint16, shape (rows, columns).
     boxes_px
@@ -46,15 +49,20 @@ class Sample:
     bearings_body
         Unit vectors in the robot's axes, float32, shape (n, 3); NaN of lamps.
     visible_fraction, on_fraction
-        Share of the disc that is seen, mean drive over the exposure, float32, shape (n,); 1 of lamps.
+        Share of the disc that is seen, mean drive over the exposure, float32, shape (n,); 1 of lamps, whose
+        share is not known.
+    peak_snr
+        Of a flare's brightest pixel, float32, shape (n,); NaN of lamps, infinite where the truth has none.
     """
 
     camera: str
     index: int
     time_s: float
     exposure_s: float
+    line_time_s: float
     gain: float
     black_level_dn: float
+    frame_kind: str
     data_dn: NDArray[np.uint16]
     boxes_px: NDArray[np.float32]
     kinds: NDArray[np.int64]
@@ -64,6 +72,12 @@ class Sample:
     bearings_body: NDArray[np.float32]
     visible_fraction: NDArray[np.float32]
     on_fraction: NDArray[np.float32]
+    peak_snr: NDArray[np.float32]
+
+
+def collate(samples: Sequence[Sample]) -> dict[str, list[Any]]:
+    """Return a batch: a list of each field of `Sample`, by its name, one entry for a frame."""
+    return {field.name: [getattr(sample, field.name) for sample in samples] for field in fields(Sample)}
 
 
 class RunDataset:
@@ -74,13 +88,15 @@ class RunDataset:
     Raises
     ------
     InputError
-        When it is made: a folder has no truth. RecordingError where frames or calibrations are broken, of a
-        picture when it is asked for.
+        When it is made: as `boxes.read_labelled`, or there is no such kind. When a frame is asked for: its
+        picture is of another size than its calibration says. RecordingError where the picture is broken.
     """
 
     def __init__(self, *folders: str | Path, kinds: Sequence[Kind] = KINDS) -> None:
         if not folders:
             raise InputError("a data set wants the folder of a run, or several")
+        if isinstance(kinds, str) or not set(kinds) <= set(KINDS):
+            raise InputError(f"kinds is {shown(kinds)}; wanted a list of some of {', '.join(KINDS)}")
         self._runs = [read_labelled(Path(folder)) for folder in folders]
         self._ends = list(itertools.accumulate(len(run.records) for run in self._runs))
         self._kinds = frozenset(kinds)
@@ -106,6 +122,13 @@ class RunDataset:
 def _sample(run: Labelled, number: int, kinds: frozenset[Kind]) -> Sample:
     record = run.records[number]
     frame = read_frame(run.folder, record)
+    known = run.calibrations[record.camera]
+    rows, columns = frame.data_dn.shape
+    if (rows, columns) != (known.height_px, known.width_px):
+        raise InputError(
+            f"{run.folder / record.file}: has {columns} × {rows} pixels, the calibration of {record.camera} "
+            f"says {known.width_px} × {known.height_px}; give the pictures that were rendered"
+        )
     boxes = [box for box in run.boxes[record.camera, record.index] if box.kind in kinds]
     unknown = (math.nan,) * 3
     return Sample(
@@ -113,8 +136,10 @@ def _sample(run: Labelled, number: int, kinds: frozenset[Kind]) -> Sample:
         index=frame.index,
         time_s=frame.time_s,
         exposure_s=frame.exposure_s,
+        line_time_s=frame.line_time_s,
         gain=frame.gain,
         black_level_dn=frame.black_level_dn,
+        frame_kind=record.kind,
         data_dn=frame.data_dn,
         boxes_px=_array([(box.left_px, box.top_px, box.right_px, box.bottom_px) for box in boxes], 4),
         kinds=np.array([KINDS.index(box.kind) for box in boxes], dtype=np.int64),
@@ -124,6 +149,7 @@ def _sample(run: Labelled, number: int, kinds: frozenset[Kind]) -> Sample:
         bearings_body=_array([unknown if box.truth is None else box.truth.bearing_body for box in boxes], 3),
         visible_fraction=_column([1.0 if box.truth is None else box.truth.visible_fraction for box in boxes]),
         on_fraction=_column([1.0 if box.truth is None else box.truth.on_fraction for box in boxes]),
+        peak_snr=_column([math.nan if box.truth is None else box.truth.peak_snr for box in boxes]),
     )
 
 
@@ -141,12 +167,19 @@ def _array(rows: Sequence[Sequence[float]], columns: int) -> NDArray[np.float32]
     return np.array(rows, dtype=np.float32).reshape(len(rows), columns)
 
 
+_NO_PIXELS = np.empty((0, 0), dtype=np.uint16)
+_OF_THINGS = (
+    "boxes_px", "places_px", "ranges_m", "bearings_body", "visible_fraction", "on_fraction", "peak_snr",
+)  # fmt: skip
+
+
 def export_hdf5(folder: Path, file: Path) -> dict[str, int]:
     """Write a run's frames and labels as one HDF5 file.
 
-    Each camera has a group: `frames` (n, rows, columns) uint16, `index`, `time_s`, `exposure_s`, `gain`,
-    `black_level_dn` (n,); and of all things in all frames `frame` (which of the n), `boxes_px`, `kind`,
-    `name`, `places_px`, `ranges_m`, `bearings_body`, `visible_fraction`, `on_fraction`, as `Sample` has them.
+    Each camera has a group: `frames` (n, rows, columns) uint16, `index`, `time_s`, `exposure_s`,
+    `line_time_s`, `gain`, `black_level_dn`, `frame_kind` (n,); and of all things in all frames `frame` (which
+    of the n), `boxes_px`, `kind`, `name`, `places_px`, `ranges_m`, `bearings_body`, `visible_fraction`,
+    `on_fraction`, `peak_snr`, as `Sample` has them. One frame is held in memory at a time.
 
     Returns
     -------
@@ -202,11 +235,12 @@ def _write_camera(group: Any, run: Labelled, numbers: Sequence[int]) -> None:
     for place, number in enumerate(numbers):
         sample = _sample(run, number, frozenset(KINDS))
         frames[place] = sample.data_dn
-        samples.append(sample)
-    for name in ("index", "time_s", "exposure_s", "gain", "black_level_dn"):
+        samples.append(replace(sample, data_dn=_NO_PIXELS))
+    for name in ("index", "time_s", "exposure_s", "line_time_s", "gain", "black_level_dn"):
         group[name] = np.array([getattr(sample, name) for sample in samples])
+    group["frame_kind"] = [sample.frame_kind for sample in samples]
     group["frame"] = np.repeat(np.arange(len(samples)), [len(sample.names) for sample in samples])
     group["kind"] = np.concatenate([sample.kinds for sample in samples])
     group["name"] = [name for sample in samples for name in sample.names] or np.empty(0, dtype="S1")
-    for name in ("boxes_px", "places_px", "ranges_m", "bearings_body", "visible_fraction", "on_fraction"):
+    for name in _OF_THINGS:
         group[name] = np.concatenate([getattr(sample, name) for sample in samples])

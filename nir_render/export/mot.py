@@ -1,9 +1,11 @@
 """A run as MOTChallenge sequences, one for each camera: truth, and what each estimator has found."""
 
 import math
-import os
+import shutil
 from pathlib import Path
 
+from nir_render.evaluate.match import countable
+from nir_render.export.aside import export_folder
 from nir_render.export.boxes import Labelled, read_labelled
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import write_file
@@ -14,13 +16,15 @@ _OFFSET_PX = 1.5
 _LEAST_PX = 1.0
 
 
-def export_mot(folder: Path, target: Path) -> dict[str, int]:
+def export_mot(folder: Path, target: Path, overwrite: bool = False) -> dict[str, int]:
     """Write a folder for each camera, as MOTChallenge has it.
 
     `gt/gt.txt` holds sources, 1 to a robot's source in the order of their names: frame (from 1), id, box,
-    1, class 1, visible share. `det/NAME.txt` holds what the estimator NAME has found: frame, -1, box,
-    1, and the place in the robot's body axes in metres, or -1, -1, -1 without a range. `seqinfo.ini` says the
-    rest; pictures are linked as `img1`, where the system allows it.
+    flag, class 1, visible share; the flag is 1 where the source counts for recall (`match.countable`), 0
+    where it is to be passed over. `det/NAME.txt` holds what the estimator NAME has found and does not take
+    for a mirror image: frame, -1, box, 1, and the place in the robot's body axes in metres, or -1, -1, -1
+    without a range. `seqinfo.ini` says the rest; pictures are linked as `img1`, or copied where there are no
+    links.
 
     Returns
     -------
@@ -29,7 +33,7 @@ def export_mot(folder: Path, target: Path) -> dict[str, int]:
     Raises
     ------
     InputError
-        As `boxes.read_labelled`; or the disk refuses.
+        As `boxes.read_labelled` and `aside.export_folder`.
     """
     labelled = read_labelled(folder)
     names = sorted({box.name for boxes in labelled.boxes.values() for box in boxes if box.kind == "source"})
@@ -38,6 +42,13 @@ def export_mot(folder: Path, target: Path) -> dict[str, int]:
         name: run_folder.parse_lines(path, parse_detection)
         for name, path in run_folder.detection_files(folder).items()
     }
+    with export_folder(target, overwrite) as aside:
+        return _write_cameras(labelled, aside, numbers, found)
+
+
+def _write_cameras(
+    labelled: Labelled, target: Path, numbers: dict[str, int], found: dict[str, list[Detection]]
+) -> dict[str, int]:
     counts: dict[str, int] = {}
     for camera in dict.fromkeys(record.camera for record in labelled.records):
         place = target / camera
@@ -64,8 +75,9 @@ def _truth_rows(labelled: Labelled, camera: str, order: dict[int, int], numbers:
             if box.kind == "source" and box.truth is not None:
                 corner = f"{box.left_px + _OFFSET_PX:.3f},{box.top_px + _OFFSET_PX:.3f}"
                 size = f"{box.width_px:.3f},{box.height_px:.3f}"
+                flag = int(countable(box.truth, labelled.calibrations[camera]))
                 visible = f"{box.truth.visible_fraction:.4f}"
-                rows.append(f"{frame},{numbers[box.name]},{corner},{size},1,1,{visible}")
+                rows.append(f"{frame},{numbers[box.name]},{corner},{size},{flag},1,{visible}")
     return rows
 
 
@@ -74,9 +86,8 @@ def _found_rows(
 ) -> list[str]:
     known = labelled.calibrations[camera]
     rows = []
-    for one in sorted(
-        (d for d in detections if d.camera == camera and d.index in order), key=lambda d: d.index
-    ):
+    own = (one for one in detections if one.camera == camera and one.index in order and not one.ghost)
+    for one in sorted(own, key=lambda each: each.index):
         # As large as the light that was found is wide, if it were round.
         side_px = max(one.area_px**0.5, _LEAST_PX)
         left, top = one.u_px - 0.5 * side_px + _OFFSET_PX, one.v_px - 0.5 * side_px + _OFFSET_PX
@@ -100,20 +111,16 @@ def _sequence(labelled: Labelled, camera: str, length: int) -> str:
 
 
 def _link_pictures(labelled: Labelled, camera: str, place: Path) -> None:
-    """Name the pictures as MOTChallenge does, without a copy; a system without links has none."""
+    """Name the pictures as MOTChallenge does; a hard link would let who edits one change the run."""
     images = place / "img1"
-    images.mkdir(exist_ok=True)
+    images.mkdir()
     records = [record for record in labelled.records if record.camera == camera]
     for number, record in enumerate(records, start=1):
         link, picture = images / f"{number:06d}.png", (labelled.folder / record.file).resolve()
         try:
-            link.unlink(missing_ok=True)
-            os.link(picture, link)
+            link.symlink_to(picture)
         except OSError:
-            try:
-                link.symlink_to(picture)
-            except OSError:
-                return
+            shutil.copyfile(picture, link)
 
 
 def _write(path: Path, rows: list[str]) -> int:

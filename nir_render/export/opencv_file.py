@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.errors import InputError
+from nir_render.export.aside import export_folder
 from nir_render.run.folder import write_file
-from perception import Calibration, read_calibrations
+from perception import Calibration, RecordingError, read_calibrations
 
 
-def export_opencv(folder: Path, target: Path) -> dict[str, int]:
+def export_opencv(folder: Path, target: Path, overwrite: bool = False) -> dict[str, int]:
     """Write the intrinsics of each camera of a run, and how it stands on its robot.
 
     `model` is `pinhole`, with `distortion_coefficients` for `cv2.projectPoints` and `cv2.undistort`, or
@@ -24,15 +26,18 @@ def export_opencv(folder: Path, target: Path) -> dict[str, int]:
     Raises
     ------
     InputError
-        The folder has no calibration, or a broken one; or the disk refuses.
+        The folder has no calibration, or a broken one; as `aside.export_folder`.
     """
-    known = read_calibrations(folder)
-    counts = {}
-    for name, calibration in known.items():
-        text = _text(calibration)
-        write_file(target / f"{name}.yaml", text.encode())
-        counts[f"{name}.yaml"] = _coefficients(calibration).size
-    return counts
+    try:
+        known = read_calibrations(folder)
+    except RecordingError as error:
+        raise InputError(*error.problems) from None
+    if not known:
+        raise InputError(f"{folder}: its calibration.json names no camera; give the folder of a run")
+    with export_folder(target, overwrite) as aside:
+        for name, calibration in known.items():
+            write_file(aside / f"{name}.yaml", _text(calibration).encode())
+    return {f"{name}.yaml": _coefficients(calibration).size for name, calibration in known.items()}
 
 
 def _coefficients(calibration: Calibration) -> NDArray[np.float64]:

@@ -35,8 +35,10 @@ Item = TypeVar("Item")
 
 
 @contextlib.contextmanager
-def new_run_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
+def new_run_folder(folder: Path, overwrite: bool, sign: str = MANIFEST, of: str = "run") -> Iterator[Path]:
     """Give an empty folder to write a run into; it takes its place when the block ends without an error.
+
+    `sign` is the file that tells a run, or what else is written so, `of`, from what is another's.
 
     Raises
     ------
@@ -44,7 +46,7 @@ def new_run_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
         The place holds another run and `overwrite` is not given, or holds something that is no run, or
         cannot be written.
     """
-    check_free(folder, overwrite)
+    check_free(folder, overwrite, sign, of)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
@@ -113,20 +115,20 @@ def _prepared(aside: Path, digest: str) -> str:
     return "anew" if there else ""
 
 
-def check_free(folder: Path, overwrite: bool) -> None:
+def check_free(folder: Path, overwrite: bool, sign: str = MANIFEST, of: str = "run") -> None:
     """Raise InputError where a run may not be written: see `new_run_folder`."""
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give a folder for the run")
+        raise InputError(f"{folder}: is a file; give a folder for the {of}")
     if not any(folder.iterdir()):
         return
-    if not (folder / MANIFEST).is_file():
+    if not (folder / sign).is_file():
         raise InputError(
-            f"{folder}: holds files that are no run; give a new folder (they are never overwritten)"
+            f"{folder}: holds files that are no {of}; give a new folder (they are never overwritten)"
         )
     if not overwrite:
-        raise InputError(f"{folder}: holds another run; give a new folder, or --overwrite to replace it")
+        raise InputError(f"{folder}: holds another {of}; give a new folder, or --overwrite to replace it")
 
 
 @contextlib.contextmanager
