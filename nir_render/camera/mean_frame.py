@@ -183,11 +183,15 @@ def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
     drive = np.array([drives.index(of_group) for of_group in of_groups], dtype=np.int64)
     windows = tuple(_windows(light, snapshot, camera))
     images = images_of(light, snapshot, drive, len(drives), windows)
-    parts = [window.values for window in windows] + ([] if images is None else [images])
-    if not all(np.isfinite(part).all() for part in parts):
-        raise InputError(
-            f"{snapshot.origin}: the light of {light.camera} is not finite; a body or source is degenerate"
-        )
+    parts = {f"the window of flare {number}": window.values for number, window in enumerate(windows)}
+    parts |= {} if images is None else {"the indirect light": images}
+    for what, part in parts.items():
+        wrong = int((~np.isfinite(part)).sum())
+        if wrong:
+            raise InputError(
+                f"{snapshot.origin}: the light of {light.camera} is not finite, {what} in {wrong} of "
+                f"{part.size} values; a body or source may be degenerate"
+            )
     v_px = intrinsics_of(camera).project(light.direct.direction)[:, 1]
     nearest = np.clip(np.nan_to_num(v_px), 0, camera.sensor.rows - 1)
     return Rates(light, snapshot, drives, drive, images, windows, np.rint(nearest).astype(np.int64))

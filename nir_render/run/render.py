@@ -122,13 +122,20 @@ def _found_words(folder: Path, found: str, frames: int) -> list[str]:
 
 
 def run_digest(scene: Scene, more: str) -> str:
-    """Return the hash of all that decides the files of a run, and of `more`; two of one are the same bits."""
+    """Return the hash of all that decides the files of a run, and of `more`; two of one are the same bits.
+
+    The resolved scene names meshes and pictures; what these hold is in the geometry.
+    """
     from nir_render.transport.backend.variant import backend
+    from nir_render.transport.render import geometry_of
 
     packages = Path(__file__).parents[1], Path(perception.__file__).parent
     code = code_hash(*(matching(package, _CODE) for package in packages))
     made_by = [f"{name} {version}" for name, version in versions().items()]
-    return digest_of((scene.resolved_yaml(), backend().variant, backend().compiler, made_by, code, more))
+    start = scene.at(scene.document.clock.start_s)
+    geometry = [geometry_of(start, camera) for camera in scene.cameras()[:1]]
+    computed_by = (backend().variant, backend().compiler, made_by, code)
+    return digest_of((scene.resolved_yaml(), geometry, *computed_by, more))
 
 
 def _write_times(scene: Scene, folder: Path) -> None:

@@ -8,7 +8,8 @@ straight, at an optical depth τ = σ d, the halo
 
 (ω the albedo, p the phase function) goes with its Hankel transform Q(ν) = 2π ∫ h(α) J₀(2π ν α) α dα, and all
 that is scattered forward, any number of times, with exp(τ Q) − 1: the small-angle approximation of radiative
-transfer (Wells, AGARD LS-9, 1969; Zege, Ivanov & Katsev, Image Transfer Through a Scattering Medium, 1991).
+transfer (Wells, J. Opt. Soc. Am. 59, 686, 1969; Zege, Ivanov & Katsev, Image Transfer Through a Scattering
+Medium, 1991).
 It does not depend on d but by τ.
 """
 

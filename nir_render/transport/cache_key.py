@@ -48,6 +48,7 @@ _CODE = (
     "data/droplets/tables/*.csv",
     "light/enlarge.py",
     "camera/optics/lens.py",
+    "camera/optics/apertures.py",
     "geometry.py",
 )
 

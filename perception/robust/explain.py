@@ -59,8 +59,12 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
         parted = _parted(plain, prepared.shape, camera, cut_short)
+        # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
+        without = _without_spill(plain, prepared, camera)
         for index, line in moving(plain, camera).items():
-            chosen[index] = line
+            spills = index in without and without[index].left_over.share < MOST_LEFT
+            if line.motion_px is None or line.left_over.is_good or not spills:
+                chosen[index] = line
         _drop_beside_lines(chosen, parted, prepared.shape, camera, cut_short)
     _retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
@@ -198,9 +202,19 @@ def _retry_without_spill(
     best: list[Solution | None], parted: Container[int], prepared: PreparedFrame, camera: Camera
 ) -> None:
     """Fit badly fitted clipped flares without the columns of clipped pixels, where charge may spill."""
+    alone = [None if index in parted else one for index, one in enumerate(best)]
+    for index, again in _without_spill(alone, prepared, camera).items():
+        if again.left_over.share < MOST_LEFT:
+            best[index] = again
+
+
+def _without_spill(
+    found: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera
+) -> dict[int, Solution]:
+    """Return by index what badly fitted solutions are without columns of clipped pixels, where there are."""
     tried, problems = [], []
-    for index, solution in enumerate(best):
-        if solution is None or index in parted or solution.left_over.is_good:
+    for index, solution in enumerate(found):
+        if solution is None or solution.left_over.is_good:
             continue
         # Also those of flares that are none of the window's.
         spilled = prepared.clipped_columns(solution.window.box)
@@ -208,6 +222,5 @@ def _retry_without_spill(
             tried.append(index)
             state = np.where(spilled, UNUSABLE, solution.window.state).astype(np.uint8)
             problems.append(solution.again(replace(solution.window, state=state)))
-    for index, again in zip(tried, solve(problems, camera), strict=True):
-        if again is not None and again.left_over.share < MOST_LEFT:
-            best[index] = again
+    fits = zip(tried, solve(problems, camera), strict=True)
+    return {index: again for index, again in fits if again is not None}

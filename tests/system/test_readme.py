@@ -87,7 +87,9 @@ def _fields(document: dict[str, Any]) -> set[str]:
     """Return the keys of a document and of what it holds, but names that a scene or system gives."""
     names = set(document)
     for key, value in document.items():
-        if isinstance(value, dict) and key not in ("versions", "sha256"):
+        if key == "materials":
+            names |= set(value) | {one for record in value["known"].values() for one in record}
+        elif isinstance(value, dict) and key not in ("versions", "sha256"):
             listed = [each if isinstance(each, list) else [each] for each in value.values()]
             records = [record for each in listed for record in each]
             if key == "groups_by_camera":

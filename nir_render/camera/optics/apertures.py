@@ -4,13 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from nir_render.camera.optics.gaussian_fit import BLUR_SIGMAS, LEAST_RADIUS_PX, gaussian_fit
-from nir_render.camera.optics.lens import intrinsics_of
+from nir_render.camera.optics.lens import Intrinsics, intrinsics_of
 from nir_render.camera.optics.otf import core_of
 from nir_render.light.enlarge import Enlargement, weights_of
 from nir_render.light.light import Light
@@ -57,6 +56,11 @@ def flare_aperture(
     u_px, v_px = lens.project(direction)
     image_px = lens.image_radius_px(direction, angular_radius_rad)
     radius_px = max(image_px + BLUR_SIGMAS * gaussian_fit(core_of(camera)).sigma_px, LEAST_RADIUS_PX)
+    return _disc(u_px, v_px, radius_px, lens)
+
+
+def _disc(u_px: float, v_px: float, radius_px: float, lens: Intrinsics) -> Aperture | None:
+    """Return the pixels whose centres lie in a disc; None where there are none."""
     rows, columns = (
         slice(
             min(max(math.ceil(middle_px - radius_px), 0), count),
@@ -103,13 +107,23 @@ def aperture_weights(
 
 
 def pixels_around_flares(light: Light, camera: Camera, reach_px: float) -> NDArray[np.int64]:
-    """Return the numbers, row by row, of the pixels no farther than `reach_px` from a flare's, shape (n,)."""
-    apart = np.ones((camera.sensor.rows, camera.sensor.columns), dtype=np.uint8)
-    for aperture in flare_apertures(light, camera):
-        apart[aperture.pixels()] = 0
-    if apart.all():
-        return np.empty(0, dtype=np.int64)
-    return np.flatnonzero(cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= reach_px)
+    """Return the numbers, row by row, of the pixels near where the lens images what shines, shape (n,).
+
+    Within `reach_px` and the least radius of a flare of the image's edge. The point spread has no say: light
+    is the same whatever blurs it afterwards.
+    """
+    table, lens = light.direct, intrinsics_of(camera)
+    near = np.zeros((camera.sensor.rows, camera.sensor.columns), dtype=np.bool_)
+    for row in table.shining:
+        direction = table.direction[row]
+        if direction[2] <= 0.0:
+            continue
+        u_px, v_px = lens.project(direction)
+        image_px = lens.image_radius_px(direction, float(table.angular_radius_rad[row]))
+        disc = _disc(u_px, v_px, image_px + LEAST_RADIUS_PX + reach_px, lens)
+        if disc is not None:
+            near[disc.pixels()] = True
+    return np.flatnonzero(near)
 
 
 def flare_apertures(light: Light, camera: Camera) -> list[Aperture]:

@@ -84,7 +84,8 @@ class RailLoop:
             random.uniform(-_ASIDE_RAD, _ASIDE_RAD),
         )
         worlds = {lux: self._moved(scene, range_m, aside_rad) for lux, scene in self._scenes.items()}
-        light = render(next(iter(worlds.values())), CAMERA, self.seed)
+        # Where it is brightest render noise weighs most beside the sensor's: samples are planned there.
+        light = render(worlds[max(worlds)], CAMERA, self.seed)
         rows: list[dict[str, Any]] = []
         for number, (lux, world) in enumerate(worlds.items()):
             rates = electron_rates(light, world)

@@ -14,8 +14,9 @@ import yaml
 from nir_render import InputError, Scene, load_scene, parse_scene
 from nir_render.regress.reference import changes_of, document_of
 from nir_render.run.manifest import material_facts
+from nir_render.scene.documents.curves import CurveDocument
 from nir_render.scene.documents.files import preset_names
-from nir_render.scene.documents.materials import Dielectric, Diffuse, texture_of
+from nir_render.scene.documents.materials import Dielectric, Diffuse, Retroreflector, realised, texture_of
 from nir_render.scene.meshes.read import read_mesh
 from nir_render.stress.campaign import load_campaign
 from nir_render.transport.cache_key import Site, geometry_key
@@ -258,6 +259,37 @@ def test_what_a_picture_holds_is_in_the_key_and_the_reference(tmp_path: Path) ->
     assert len(changed) == 1
     assert "materials.m.reflectance.sha256" in changed[0]
     assert document["materials"]["m"]["reflectance"]["texture"] == "a.png"
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in preset_names("materials") if name not in ("black", "water")]
+)
+def test_deviations_are_sigmas_far_from_a_bound_and_never_reach_it(name: str) -> None:
+    material = _scene(name).document.materials["m"]
+    assert material.evidence is not None
+    retro = isinstance(material, Retroreflector)
+
+    def share(deviation: float) -> float:
+        changed = realised(material.model_copy(update={"deviation": deviation}))
+        if isinstance(changed, Retroreflector):
+            return changed.coefficients[0][0]
+        value = getattr(changed, changed.deviates)
+        if isinstance(value, CurveDocument):
+            value = value.curve("it")(940e-9)
+        return float(1.0 if value is None else value)
+
+    plain, evidence = share(0.0), material.evidence
+    shares = [share(step) for step in (-5.0, -2.0, -0.001, 0.0, 0.001, 2.0, 5.0)]
+    assert shares == sorted(shares)
+    assert all(np.isfinite(shares))
+    slope = (share(-0.001) - plain) / (-0.001 * plain)
+    assert slope == pytest.approx(evidence.uncertainty, rel=2e-3)
+    if retro:
+        assert shares[0] > 0.0
+        return
+    low = 0.0 if evidence.least is None else evidence.least
+    high = 1.0 if evidence.most is None else max(evidence.most, plain)
+    assert low <= shares[0] < plain <= shares[-1] <= high * (1.0 + 1e-12)
 
 
 def test_evidence_is_no_part_of_the_key_and_a_deviation_is() -> None:

@@ -1,5 +1,6 @@
 """Where the figures of a material come from, and how far a surface of its kind may be off them."""
 
+import math
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -41,14 +42,17 @@ class Matter(Document):
 def factor(matter: Matter, nominal: float | None) -> float:
     """Return what a surface reflects over what its material's figures say.
 
-    `nominal` is the figure at 940 nm, which stays within the evidence's bounds; None is of any number.
+    `nominal` is the figure at 940 nm. A deviation is as many standard deviations while it is small beside the
+    way to the bound, and comes near the bound without reaching it: room · tanh(deviation · σ / room). Without
+    bounds (`nominal` is None: coefficients of retroreflection) it is the exponential, and never 0.
     """
     if not matter.deviation or matter.evidence is None:
         return 1.0
     evidence = matter.evidence
-    value = max(1.0 + matter.deviation * evidence.uncertainty, 0.0)
+    step = matter.deviation * evidence.uncertainty
     if nominal is None or nominal == 0.0:
-        return value
+        return math.exp(step)
     low = 0.0 if evidence.least is None else min(evidence.least / nominal, 1.0)
     high = (1.0 if evidence.most is None else max(evidence.most, nominal)) / nominal
-    return min(max(value, low), high)
+    room = high - 1.0 if step > 0.0 else 1.0 - low
+    return 1.0 + math.copysign(room * math.tanh(abs(step) / room), step) if room > 0.0 else 1.0

@@ -226,7 +226,8 @@ def _add_unasked_light(
     share = dr.select(in_table, 0.0, share)
     radiance = dr.gather(mi.Float, lights.radiance, light, active)
     radiance = radiance * connect.pattern_factor(lights, light, -state.direction, active)
-    add(weight * radiance * share, state.shares, light, active & (share > 0.0))
+    brings = weight * radiance * share
+    add(brings, state.shares, light, active & (share > 0.0) & dr.isfinite(brings))
 
 
 @dataclass(frozen=True, eq=False)
