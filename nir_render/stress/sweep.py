@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +98,11 @@ def sweep(
         progress(done, len(jobs))
         if missing:
             workers = min(usual_workers() if workers is None else workers, len(missing))
-            kept = (folder / _LIGHT if light is None else light).resolve()
+            # Links are kept: on another machine the same name may lead elsewhere.
+            kept = (folder / _LIGHT if light is None else light).absolute()
             threads = max(cores() // workers, 1) if scheduler is None else None
-            work = Work(
-                campaign.scene, campaign.estimators, parts.resolve(), kept, light_limit_bytes, threads
-            )
+            scene = replace(campaign.scene, folder=campaign.scene.folder.absolute())
+            work = Work(scene, campaign.estimators, parts.absolute(), kept, light_limit_bytes, threads)
             try:
                 with closing(run_jobs(work, missing, workers, folder / _SCRATCH, scheduler)) as ending:
                     for ended in ending:
@@ -120,6 +120,7 @@ def sweep(
 def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[str, Any]:
     """Return what a sweep has to do, as one JSON object: jobs, those that the folder holds, geometries.
 
+    `refined` names the axes along which limits are found more exactly, which adds jobs as they are found.
     Files of jobs are counted, not read: one that is broken counts here, and is done again by the sweep.
 
     Errors as `sweep`.
@@ -130,7 +131,13 @@ def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[s
         held = {path.name for path in (folder / _PARTS).glob("*")}
         done = sum(part_file(folder / _PARTS, job).name in held for job in jobs)
     geometries = len({job.light for job in jobs})
-    return {"campaign": campaign.name, "jobs": len(jobs), "done": done, "geometries": geometries}
+    return {
+        "campaign": campaign.name,
+        "jobs": len(jobs),
+        "done": done,
+        "geometries": geometries,
+        "refined": [axis.name for axis in campaign.axes if axis.refinement is not None],
+    }
 
 
 def sweep_record(result: Sweep) -> dict[str, Any]:
