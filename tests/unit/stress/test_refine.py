@@ -1,19 +1,28 @@
 """Limits found more exactly: where values are added, when that ends, and what they must not change."""
 
+import contextlib
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
+from nir_render.errors import InputError
 from nir_render.randomness import generator
+from nir_render.stress import refine as rounds
 from nir_render.stress.campaign import Campaign
-from nir_render.stress.design.axes import Axis, AxisDocument, with_values
+from nir_render.stress.crossings import Edge
+from nir_render.stress.design.axes import Axis, AxisDocument, Refinement, with_values
 from nir_render.stress.design.points import combinations_of, number_of_points
+from nir_render.stress.jobs import Job
 from nir_render.stress.reach import campaign_reaches
-from nir_render.stress.refine import refined
+from nir_render.stress.refine import _halfway, refined
 from nir_render.stress.summary import summary_of
 from nir_render.stress.sums import job_sums
+from nir_render.stress.sweep import Sweep
 from tests.unit.stress.synthetic import LAMP, Row, campaign, frame, source, table
 
 LIMIT_M = 0.05
@@ -94,16 +103,79 @@ def test_a_limit_that_seeds_leave_open_is_not_divided_further() -> None:
     after = int(np.searchsorted(numbers, end.value))
     assert end.low is not None
     assert end.high is not None
-    assert end.high - end.low > numbers[after] - numbers[after - 1]
+    # Halves of the gap would be narrower than the interval.
+    assert end.high - end.low > 0.5 * (numbers[after] - numbers[after - 1])
+
+
+def test_no_gap_is_made_narrower_than_the_interval() -> None:
+    edge = Edge(3.0, "crossing", gap=1)
+    ranges = replace(axis("1 %", spacing="linear"), numbers=(1.0, 2.0, 4.0))
+    assert _halfway(ranges, edge, width=0.99) == 3.0
+    assert _halfway(ranges, edge, width=1.01) is None
+
+
+def test_limits_below_zero_are_found() -> None:
+    """The error grows with the square of the place, on both sides of 0."""
+    ranges = AxisDocument.model_validate({"from": "-8 m", "to": "8 m", "count": 5, "refine": "4 cm"}).axis(
+        "x"
+    )
+    numbers = np.array(settled(asked((ranges,))).axes[0].numbers)
+    for truth_m in (-((LIMIT_M / PER_SQUARE) ** 0.5), (LIMIT_M / PER_SQUARE) ** 0.5):
+        after = int(np.searchsorted(numbers, truth_m))
+        assert numbers[after] - numbers[after - 1] <= 0.04 * 1.000001
+
+
+class Rounds:
+    """In place of `sweep` and `plan`: rounds in which so many jobs are there before each."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, before: Sequence[int], **faults: object) -> None:
+        self.before, self.faults, self.rounds = list(before), faults, 0
+        monkeypatch.setattr(rounds, "sweep", self.sweep)
+        monkeypatch.setattr(rounds, "plan", self.plan)
+
+    def sweep(self, wanted: Campaign, jobs: Sequence[object], folder: Path, **_: object) -> Sweep:
+        self.rounds += 1
+        failed = cast("dict[str, str]", self.faults.get("failed", {}))
+        return Sweep(wanted, tuple(jobs), rendered(wanted), failed, self.before.pop(0), folder, ())  # type: ignore[arg-type]
+
+    def plan(self, finer: Campaign, *_: object) -> list[object]:
+        if "scene" in self.faults:
+            raise InputError(str(self.faults["scene"]))
+        return [None] * number_of_points(finer.axes, None)
+
+    def result(self, wanted: Campaign) -> Sweep:
+        jobs = cast("list[Job]", [None] * number_of_points(wanted.axes, None))
+        return rounds.sweep_refined(
+            wanted, jobs, Path(), workers=1, bar=lambda _: contextlib.nullcontext(lambda *_: None)
+        )
+
+
+def test_jobs_done_before_are_not_those_of_earlier_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new campaign has none; one that was stopped in its second round has the first and a part of it."""
+    assert Rounds(monkeypatch, [0, 5, 6]).result(asked((axis("20 %"),))).reused == 0
+    assert Rounds(monkeypatch, [5, 6, 6]).result(asked((axis("20 %"),))).reused == 6
+
+
+@pytest.mark.parametrize("fault", ["scene", "failed", "too many"])
+def test_a_refinement_that_cannot_go_on_gives_what_there_is(
+    monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    if fault == "too many":
+        monkeypatch.setattr(rounds, "MOST_JOBS", 5)
+    faults: dict[str, object] = {"scene": "a camera in a wall"} if fault == "scene" else {}
+    played = Rounds(monkeypatch, [0], **({"failed": {"a": "died"}} if fault == "failed" else faults))
+    result = played.result(asked((axis("20 %"),)))
+    assert played.rounds == 1
+    said = {"scene": "this: a camera in a wall", "failed": "", "too many": "write larger steps"}[fault]
+    assert said in " ".join(result.warnings)
+    assert bool(result.warnings) == (fault != "failed")
 
 
 def test_whole_numbers_stay_whole() -> None:
     written = AxisDocument.model_validate({"values": [1, 8], "refine": 1}).axis("robots.r2.x")
     found = settled(asked((written,)))
-    assert found.axes[0].values == (1, 4, 5, 6, 8)[: len(found.axes[0].values)] or all(
-        isinstance(value, int) for value in found.axes[0].values
-    )
-    assert {4, 5} <= set(found.axes[0].values)  # 4.08 lies between
+    assert found.axes[0].values == (1, 4, 5, 6, 8)  # 4.08 lies between
+    assert all(isinstance(value, int) for value in found.axes[0].values)
 
 
 def test_added_values_go_with_the_written_ones_of_other_axes() -> None:
@@ -119,6 +191,7 @@ def test_what_is_written_of_it_is_checked() -> None:
         ("5 s", "a time"),
         ("0 m", "wanted a step"),
         ("fine", "wanted a step"),
+        (0.1, "without a unit"),
     ):
         with pytest.raises(ValueError, match=said):
             axis(refine)
@@ -126,3 +199,18 @@ def test_what_is_written_of_it_is_checked() -> None:
         AxisDocument.model_validate({"values": ["a", "b"], "refine": "1 %"}).axis("x")
     with pytest.raises(ValueError, match="write a step"):
         AxisDocument.model_validate({"values": ["0 m", "1 m"], "refine": "1 %"}).axis("x")
+
+
+def test_a_share_is_one_unless_the_axis_is_written_in_percent() -> None:
+    """10 % of plain numbers is a share of each; on an axis in % it is a step."""
+    for values, step, by_ratio in (
+        ([1, 2], 0.1, True),
+        (["1 m", "2 m"], 0.1, True),
+        (["1 %", "2 %"], 10.0, False),
+    ):
+        found = AxisDocument.model_validate({"values": values, "refine": "10 %"}).axis("x").refinement
+        assert found == Refinement(pytest.approx(step), by_ratio)
+    plain = AxisDocument.model_validate({"values": [1, 2], "refine": 0.1}).axis("x").refinement
+    assert plain == Refinement(0.1, by_ratio=False)
+    with pytest.raises(ValueError, match="without a unit"):
+        AxisDocument.model_validate({"values": ["1 %", "2 %"], "refine": 0.1}).axis("x")
