@@ -19,6 +19,7 @@ from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.design.points import Point, number_of_points, points_of
 from nir_render.transport.backend.cores import usual_workers
+from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.fingerprint import code_hash
 from perception.estimators import OwnEstimator
 from perception.own_code import files_of
@@ -157,6 +158,18 @@ def hashes_of(scene: Scene, settings: Mapping[str, Any]) -> Hashes:
         return Hashes(problems=error.problems)
 
 
+def is_same(job: Job, scene: Scene, made_by: Sequence[str], processor: str) -> bool:
+    """Tell whether a job that was planned elsewhere is the same here: scene, files, `made_by_of`.
+
+    On another processor the last digits of a geometry may be others: there it is not compared.
+    """
+    found = hashes_of(scene, job.settings)
+    geometry = job.light.partition(" ")[2]
+    if processor == cpu_name() and found.geometry != geometry:
+        return False
+    return replace(found, geometry=geometry).key(job.seed, made_by) == job.key
+
+
 def _scene_hash(document: SceneDocument) -> str:
     """Return the hash of a resolved scene; what robots carry is written once, however many carry the same."""
     hashed = hashlib.sha256(document.model_dump_json(exclude={"robots": {"__all__": {"rig"}}}).encode())
@@ -194,8 +207,11 @@ def _geometry(scene: Scene) -> str:
     return hashed.hexdigest()
 
 
-def made_by_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Return what a result follows from besides its scene: estimators, code, versions, machine."""
+def made_by_of(names: Sequence[str], processor: str = "") -> tuple[str, ...]:
+    """Return what a result follows from besides its scene: estimators, code, versions, machine.
+
+    `processor` stands for this machine's own where another one asks for the job.
+    """
     from nir_render.transport.backend.variant import backend
     from nir_render.transport.cache_key import versions
 
@@ -204,7 +220,11 @@ def made_by_of(names: Sequence[str]) -> tuple[str, ...]:
     files = sorted({file for path in own for file in files_of(path)})
     contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
     packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")
-    computed_by = versions(backend().variant, backend().compiler)
+    own = cpu_name()
+    computed_by = (
+        processor if processor and part == own else part
+        for part in versions(backend().variant, backend().compiler)
+    )
     return (*estimators, *contents, results_code_hash(), *packages, *computed_by)
 
 

@@ -20,6 +20,7 @@ from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
 from nir_render.stress.workers.pool import Work, part_file, run_jobs
 from nir_render.transport.backend.cores import cores, usual_workers
+from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.backend.variant import backend
 
 MANIFEST = "campaign.json"
@@ -102,7 +103,9 @@ def sweep(
             kept = (folder / _LIGHT if light is None else light).absolute()
             threads = max(cores() // workers, 1) if scheduler is None else None
             scene = replace(campaign.scene, folder=campaign.scene.folder.absolute())
-            work = Work(scene, campaign.estimators, parts.absolute(), kept, light_limit_bytes, threads)
+            work = Work(
+                scene, campaign.estimators, parts.absolute(), kept, light_limit_bytes, threads, cpu_name()
+            )
             try:
                 with closing(run_jobs(work, missing, workers, folder / _SCRATCH, scheduler)) as ending:
                     for ended in ending:

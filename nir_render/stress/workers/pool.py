@@ -29,7 +29,7 @@ from nir_render.errors import InputError
 from nir_render.run.perceive import frame_estimators
 from nir_render.scene.scene import Scene
 from nir_render.stress.job.execute import execute
-from nir_render.stress.jobs import Job, hashes_of, made_by_of
+from nir_render.stress.jobs import Job, is_same, made_by_of
 from nir_render.stress.table import read_part, write_part
 from nir_render.stress.workers.cluster import (
     RefusedError,
@@ -57,8 +57,8 @@ class Work:
     """What all jobs of a campaign share.
 
     `scene` is what the jobs' settings change; `threads` how many each worker computes with, None where
-    workers of one host share its cores. All paths are absolute, those of the scene and of estimators too:
-    workers have folders of their own.
+    workers of one host share its cores; `processor` that of the machine that asks. All paths are absolute,
+    those of the scene and of estimators too: workers have folders of their own.
     """
 
     scene: Scene
@@ -67,6 +67,7 @@ class Work:
     light: Path
     light_limit_bytes: int
     threads: int | None
+    processor: str
 
 
 @dataclass(frozen=True)
@@ -260,11 +261,11 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
                 limit_bytes=self.work.light_limit_bytes,
                 memory_limit_bytes=_MEMORY_LIMIT_BYTES,
             )
-            self._made_by = made_by_of(self.work.estimators)
+            self._made_by = made_by_of(self.work.estimators, self.work.processor)
         self._share_cores()
         if read_part(part_file(self.work.parts, job)) is not None:
             return  # by a worker that was killed before it could say so
-        if hashes_of(self.work.scene, job.settings).key(job.seed, self._made_by) != job.key:
+        if not is_same(job, self.work.scene, self._made_by, self.work.processor):
             raise RefusedError(
                 f"the worker {get_worker().address} would do another job than was asked for: a file of the "
                 "scene or of an estimator, the code or a version has changed or is another one there; "

@@ -17,11 +17,12 @@ from distributed.scheduler import KilledWorker
 from nir_render import InputError
 from nir_render.stress import sweep as sweeps
 from nir_render.stress.campaign import load_campaign
-from nir_render.stress.jobs import Job, plan
+from nir_render.stress.jobs import Job, is_same, made_by_of, plan
 from nir_render.stress.table import read_part
 from nir_render.stress.workers import cluster, pool
 from nir_render.stress.workers.cluster import RefusedError, check_this_worker, process_facts, terms_of
 from nir_render.stress.workers.pool import Work, _Context, _fault, _tell_workers, part_file, run_jobs
+from nir_render.transport import cache_key
 from tests.system.test_stress import campaign as tiny_campaign
 
 OWN = "def none(frame, calibration):\n    return []\n"
@@ -85,6 +86,17 @@ def test_a_worker_needs_no_working_directory_and_does_what_was_asked_for(
     assert all(path.is_absolute() for path in (work.parts, work.light))
     _Context(work, None).do(jobs[0])
     assert read_part(part_file(work.parts, jobs[0])) is not None
+    # Another processor makes other light of the same statistics: that is no other job.
+    monkeypatch.setattr("nir_render.stress.jobs.cpu_name", lambda: "another")
+    monkeypatch.setattr("nir_render.transport.cache_key.cpu_name", lambda: "another")
+    cache_key._versions.cache_clear()
+    try:
+        assert is_same(jobs[1], work.scene, made_by_of(work.estimators, work.processor), work.processor)
+        assert not is_same(jobs[1], work.scene, made_by_of(work.estimators), work.processor)
+    finally:
+        monkeypatch.undo()
+        cache_key._versions.cache_clear()
+    monkeypatch.setattr(pool, "get_worker", worker)
     (tmp_path / "mine.py").write_text(OWN + "# edited after the plan\n")
     with pytest.raises(RefusedError, match="another job than was asked for"):
         _Context(work, None).do(jobs[1])
