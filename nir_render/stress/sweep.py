@@ -18,6 +18,7 @@ from nir_render.stress.campaign import Campaign
 from nir_render.stress.jobs import Job
 from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
+from nir_render.stress.workers.cluster import MARK
 from nir_render.stress.workers.pool import Work, part_file, run_jobs
 from nir_render.transport.backend.cores import cores, usual_workers
 from nir_render.transport.backend.llvm.choice import cpu_name
@@ -116,7 +117,8 @@ def sweep(
             except KeyboardInterrupt:
                 raise StoppedError(done - len(failed), len(jobs)) from None
         for place in (folder, parts, folder / _LIGHT):
-            _remove_abandoned(place)
+            _remove_abandoned(place, ".*.partial-*")
+        _remove_abandoned(parts, f"{MARK}*")
         return _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
 
 
@@ -185,9 +187,9 @@ def _claim(folder: Path, campaign: Campaign) -> None:
         raise disk_error(folder, error) from None
 
 
-def _remove_abandoned(folder: Path) -> None:
-    """Remove what killed writers have left beside the files that they did not come to rename."""
-    for path in folder.glob(".*.partial-*"):
+def _remove_abandoned(folder: Path, names: str) -> None:
+    """Remove what killed programs have left: files that they did not come to rename, or to remove."""
+    for path in folder.glob(names):
         path.unlink(missing_ok=True)
 
 

@@ -25,7 +25,7 @@ from nir_render.transport.backend.variant import backend
 _ANSWERS_WITHIN_S = 10
 _STARTS_WITHIN_S = 120
 _MAY_DIFFER = ("platform",)  # the processor: its bits may differ, its statistics do not
-_MARK = ".seen.partial-"  # what is left of it is cleared away like any file of a killed writer
+MARK = ".seen-"  # not one of the names that a cache takes for a killed writer's, and removes in time
 _THREADS = "start workers with '--nthreads 1', and '--nworkers' for more"
 
 
@@ -87,7 +87,7 @@ def terms_of(folders: Sequence[Path]) -> Iterator[Terms]:
         A folder cannot be written.
     """
     token = secrets.token_hex(16)
-    marks = tuple(folder / f"{_MARK}{token[:8]}" for folder in dict.fromkeys(folders))
+    marks = tuple(folder / f"{MARK}{token[:8]}" for folder in dict.fromkeys(folders))
     try:
         for mark in marks:
             try:
