@@ -220,9 +220,9 @@ def made_by_of(names: Sequence[str], processor: str = "") -> tuple[str, ...]:
     files = sorted({file for path in own for file in files_of(path)})
     contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
     packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")
-    own = cpu_name()
+    own_processor = cpu_name()
     computed_by = (
-        processor if processor and part == own else part
+        processor if processor and part == own_processor else part
         for part in versions(backend().variant, backend().compiler)
     )
     return (*estimators, *contents, results_code_hash(), *packages, *computed_by)

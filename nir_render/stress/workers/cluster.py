@@ -154,7 +154,7 @@ def check_this_worker(terms: Terms) -> None:
 def workers_beside() -> int:
     """Return how many workers the host of this one has now, itself among them."""
     worker = get_worker()
-    known = sync(worker.loop, worker.scheduler.identity)["workers"]
+    known: Mapping[str, Any] = sync(worker.loop, worker.scheduler.identity)["workers"]
     own_host = get_address_host(worker.address)
     return max(sum(get_address_host(address) == own_host for address in known), 1)
 

@@ -328,7 +328,9 @@ def test_a_file_is_read_again_whatever_it_is_called(tmp_path: Path, name: str) -
         rig = {"preset": "infra_swarm", "cameras": {"front": {"sensor": sensor}}}
         document = {"format": 1, "name": "one", "observe": ["r1.front"], "robots": {"r1": {"rig": rig}}}
         robots = parse_scene(document, tmp_path).document.robots
-        seen.append(robots["r1"].rig.cameras["front"].sensor.quantum_efficiency.points[0][1])
+        points = robots["r1"].rig.cameras["front"].sensor.quantum_efficiency.points
+        assert points is not None
+        seen.append(points[0][1])
     assert seen == [0.1, 0.2]
 
 

@@ -62,8 +62,8 @@ def work_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Work, list[J
 
     def run(work: Work, *_: object) -> Iterator[pool.Done]:
         given.append(work)
+        yield pool.Done(jobs[0])
         raise InputError("enough")
-        yield
 
     monkeypatch.setattr(sweeps, "run_jobs", run)
     campaign = load_campaign(file.name)
@@ -170,7 +170,7 @@ def test_a_scheduler_that_is_gone_is_told_in_words(
 
 
 def test_as_many_deaths_are_told_as_the_scheduler_allows() -> None:
-    killed = KilledWorker("a", None, 5)  # type: ignore[arg-type]
+    killed = KilledWorker("a", None, 5)
     assert (_fault(cast("Future", SimpleNamespace(exception=lambda: killed))) or "").startswith(
         "6 workers died"
     )

@@ -135,14 +135,26 @@ def test_no_gap_is_made_narrower_than_the_interval() -> None:
     assert _halfway(ranges, edge, width=1.01) is None
 
 
-def test_limits_below_zero_are_found() -> None:
-    """The error grows with the square of the place, on both sides of 0."""
-    ranges = AxisDocument.model_validate({"from": "-8 m", "to": "8 m", "count": 5, "refine": "4 cm"}).axis(
-        "x"
+@pytest.mark.parametrize("unranged", [False, True])
+def test_limits_below_zero_are_found(unranged: bool) -> None:
+    """On both sides of 0 the error grows with the square of the place; or there is no range from there on.
+
+    Then a span ends at its last value itself, in which gap must be known all the same.
+    """
+    truth_m = (LIMIT_M / PER_SQUARE) ** 0.5
+    wanted = asked(
+        (AxisDocument.model_validate({"from": "-8 m", "to": "7 m", "count": 6, "refine": "4 cm"}).axis("x"),)
     )
-    numbers = np.array(settled(asked((ranges,))).axes[0].numbers)
-    for truth_m in (-((LIMIT_M / PER_SQUARE) ** 0.5), (LIMIT_M / PER_SQUARE) ** 0.5):
-        after = int(np.searchsorted(numbers, truth_m))
+
+    def rows(at: dict[str, int], seed: int, name: str) -> list[Row]:
+        place_m = (wanted.axes[0].values_si or ())[at["x"]]
+        return [frame(), source(None if unranged and abs(place_m) > truth_m else PER_SQUARE * place_m**2)]
+
+    for _ in range(20):
+        wanted = refined(wanted, table(wanted.axes, 1, rows, ["robust"]))
+    numbers = np.array(wanted.axes[0].numbers)
+    for limit_m in (-truth_m, truth_m):
+        after = int(np.searchsorted(numbers, limit_m))
         assert numbers[after] - numbers[after - 1] <= 0.04 * 1.000001
 
 
@@ -230,7 +242,8 @@ def test_a_share_is_one_unless_the_axis_is_written_in_percent() -> None:
         (["1 %", "2 %"], 10.0, False),
     ):
         found = AxisDocument.model_validate({"values": values, "refine": "10 %"}).axis("x").refinement
-        assert found == Refinement(pytest.approx(step), by_ratio)
+        assert found is not None
+        assert (found.step, found.by_ratio) == (pytest.approx(step), by_ratio)
     plain = AxisDocument.model_validate({"values": [1, 2], "refine": 0.1}).axis("x").refinement
     assert plain == Refinement(0.1, by_ratio=False)
     with pytest.raises(ValueError, match="without a unit"):
