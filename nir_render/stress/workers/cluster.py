@@ -155,8 +155,8 @@ def workers_beside() -> int:
     """Return how many workers the host of this one has now, itself among them."""
     worker = get_worker()
     known: Mapping[str, Any] = sync(worker.loop, worker.scheduler.identity)["workers"]
-    own_host = get_address_host(worker.address)
-    return max(sum(get_address_host(address) == own_host for address in known), 1)
+    hosts: list[str] = [get_address_host(address) for address in known]
+    return max(hosts.count(get_address_host(worker.address)), 1)
 
 
 def _check(client: Client, terms: Terms) -> None:
