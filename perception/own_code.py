@@ -7,7 +7,11 @@ import traceback
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+
+_BESIDE: dict[Path, tuple[Path, ...]] = {}
+"""By file of the user's: the files that lie beside it and that it has imported."""
 
 
 def load_function(
@@ -56,6 +60,11 @@ def load_function(
     return name, path, function
 
 
+def files_of(path: Path) -> tuple[Path, ...]:
+    """Return the files that a loaded one follows from: itself, and what it has imported from beside it."""
+    return (path.resolve(), *_BESIDE.get(path.resolve(), ()))
+
+
 def _import_file(path: Path, reference: str, error: type[ValueError]) -> dict[str, Any]:
     """Import a file and return what it defines."""
     # A name that no other module has: a file may be called numpy.py.
@@ -67,8 +76,9 @@ def _import_file(path: Path, reference: str, error: type[ValueError]) -> dict[st
     # Dataclasses with annotations look their module up while it is being imported.
     sys.modules[module_name] = module
     try:
-        with _importing_from(path.parent):
+        with _importing_from(path.parent.resolve()) as beside:
             spec.loader.exec_module(module)
+        _BESIDE[path.resolve()] = tuple(beside)
     except (Exception, SystemExit) as raised:
         raise error(f"{reference}: importing it failed: {error_line(raised, path)}") from raised
     finally:
@@ -77,22 +87,38 @@ def _import_file(path: Path, reference: str, error: type[ValueError]) -> dict[st
 
 
 @contextmanager
-def _importing_from(folder: Path) -> Iterator[None]:
-    """Let modules that lie in a folder be imported; installed ones come first.
+def _importing_from(folder: Path) -> Iterator[list[Path]]:
+    """Let modules that lie in a folder be imported, anew; installed ones come first.
 
-    Those of the same names that lay beside another user's file are forgotten: two versions of one's own code
-    may be loaded one after the other, each with its own modules.
+    Modules of that folder, and those of the same names that lay beside another user's file, are set aside:
+    versions of one's own code may be loaded one after the other, each with its own modules, in a process that
+    lives long. Yields a list that holds the files imported from the folder, once the block has ended.
     """
-    entry = str(folder.resolve())
-    for beside in folder.resolve().glob("*.py"):
-        known = getattr(sys.modules.get(beside.stem), "__file__", None)
-        if known is not None and str(Path(known).parent) not in {entry, *sys.path}:
-            del sys.modules[beside.stem]
-    sys.path.append(entry)
+    imported: list[Path] = []
+    names = {beside.name for beside in folder.glob("*.py")}
+    aside = {
+        name: module
+        for name, module, file in _plain_modules()
+        if file.parent == folder or (file.name in names and str(file.parent) not in sys.path)
+    }
+    for name in aside:
+        del sys.modules[name]
+    sys.path.append(str(folder))
     try:
-        yield
+        yield imported
     finally:
-        sys.path.remove(entry)
+        sys.path.remove(str(folder))
+        imported += sorted({file for _, _, file in _plain_modules() if file.parent == folder})
+        for name, module in aside.items():
+            sys.modules.setdefault(name, module)
+
+
+def _plain_modules() -> Iterator[tuple[str, ModuleType, Path]]:
+    """Yield modules of one file each, called after it, by name; not those of packages."""
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if file is not None and Path(file).name == f"{name}.py" and name != "__main__":
+            yield name, module, Path(file).resolve()
 
 
 def error_line(error: BaseException, path: Path) -> str:

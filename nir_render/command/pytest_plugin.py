@@ -49,19 +49,29 @@ class Suites:
         if problems:  # not while the error is handled: pytest would show it twice
             pytest.fail("\n".join(problems), pytrace=False)
         if not result.holds:
-            self._pages.mkdir(parents=True, exist_ok=True)
-            page = self._pages / f"{folder.name}.html"
+            page = self._page(folder)
+            page.parent.mkdir(parents=True, exist_ok=True)
             write_file(page, check_page(result).encode())
             pytest.fail(_drift_text(result, str(suite), page), pytrace=False)
         return result
+
+    def _page(self, folder: Path) -> Path:
+        """Return where the page of a suite goes: each folder has its own."""
+        whole, root = folder.resolve(), self._root.resolve()
+        inside = whole.is_relative_to(root) and whole != root
+        within = whole.relative_to(root if inside else whole.anchor)
+        return self._pages / within.parent / f"{within.name}.html"
 
 
 @pytest.fixture(scope="session")
 def regress(pytestconfig: pytest.Config) -> Suites:
     """Give regression suites: `regress.check("suite")` in a test."""
     # The cache may be switched off; its folder is still where no one commits anything.
-    pages = pytestconfig.rootpath / pytestconfig.getini("cache_dir") / "nir_render"
-    return Suites(pytestconfig.rootpath, pages)
+    try:
+        cache = pytestconfig.getini("cache_dir")
+    except ValueError:  # with `-p no:cacheprovider` nobody knows of it
+        cache = ".pytest_cache"
+    return Suites(pytestconfig.rootpath, pytestconfig.rootpath / cache / "nir_render")
 
 
 def _drift_text(result: "Check", suite: str, page: Path) -> str:

@@ -281,6 +281,8 @@ def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: b
             f"{campaign.name}: {record['jobs']} jobs in {record['geometries']} geometries; "
             f"{record['done']} are done in {folder}"
         )
+        if record["refined"]:
+            typer.echo(f"limits along {', '.join(record['refined'])} are refined: that adds jobs")
 
 
 def _show(result: "Sweep", as_json: bool) -> None:

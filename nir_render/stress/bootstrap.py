@@ -5,6 +5,9 @@ seed. So jobs are drawn again within their own corner, and intervals say what th
 seeds would give. A campaign of one seed has nothing to draw from within a corner: there all jobs of one value
 of the axis are drawn from, so that intervals hold the differences between corners too, and are too wide
 rather than too narrow.
+
+The points of a campaign of samples are drawn themselves: what varies is which points, and each carries its
+seeds along. So points are drawn again within their part of the axis, each with all of its seeds.
 """
 
 from collections.abc import Sequence
@@ -69,12 +72,15 @@ def along_axes(
     axes: Sequence[Axis], sums: JobSums, seed: int, *, sampled: bool = False
 ) -> tuple[AlongAxis, ...]:
     """Return the jobs and the repetitions for each axis; `seed` keys them, as in `draw_repetitions`."""
+    if sampled:
+        drawn = draw_points(sums.place, sums.points(), seed)
+        return tuple(AlongAxis(sums, one, has_corners=False) for one in drawn)
     if not any(any(axis.added) for axis in axes):
-        return tuple(AlongAxis(sums, drawn, not sampled) for drawn in draw_repetitions(sums.place, seed))
+        return tuple(AlongAxis(sums, drawn, has_corners=True) for drawn in draw_repetitions(sums.place, seed))
     found = []
     for index in range(len(axes)):
         own = along(axes, sums, index)
-        found.append(AlongAxis(own, draw_repetitions(own.place, seed)[index], not sampled))
+        found.append(AlongAxis(own, draw_repetitions(own.place, seed)[index], has_corners=True))
     return tuple(found)
 
 
@@ -109,6 +115,30 @@ def draw_repetitions(place: NDArray[np.int64], seed: int) -> tuple[Repetitions, 
         repetitions if len(slices(place, axis)[0]) > 1 else Repetitions(repetitions.weight, none)
         for axis, repetitions in enumerate(drawn)
     )
+
+
+def draw_points(place: NDArray[np.int64], point: NDArray[np.int64], seed: int) -> tuple[Repetitions, ...]:
+    """Draw the points of a campaign of samples again, within their part of each axis, as `draw_repetitions`.
+
+    Parameters
+    ----------
+    place, seed
+        As in `draw_repetitions`.
+    point
+        The point of each job, numbers from 0 up, shape (jobs,): its jobs are drawn together.
+
+    Returns
+    -------
+    One for each axis; none drawn for an axis whose parts hold too few points (`LEAST_OF_ONE`).
+    """
+    _, first = np.unique(point, return_index=True)
+    of_points = place[first]
+    found = []
+    for axis in range(place.shape[1]):
+        drawn = _drawn(of_points[:, axis], seed, f"points {axis}", _number(place.size))
+        enough = repeated_in_corners(of_points[:, [axis]], LEAST_OF_ONE)
+        found.append(Repetitions(drawn.weight[:, point], drawn.repeated[point] & enough))
+    return tuple(found)
 
 
 def repeated_in_corners(place: NDArray[np.int64], least: int = 2) -> bool:

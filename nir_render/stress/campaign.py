@@ -131,6 +131,12 @@ def load_campaign(path: str | Path) -> Campaign:
             f"{file}: {points} and {len(seeds)} seeds are {number} jobs; at most {MOST_JOBS} are taken at "
             "once: split the campaign"
         )
+    if not document.bounds:
+        problems += [
+            places.tell(("axes", axis.name), ("axes", axis.name), "'refine' finds limits: state 'bounds' too")
+            for axis in axes
+            if axis.refinement is not None
+        ]
     if document.sample is not None and all(axis.edges is None for axis in axes):
         problems.append(f"{file}: sample: no axis is a range: there is nothing to draw from; leave it out")
     if problems:
@@ -278,10 +284,14 @@ def _clashes(axes: list[Axis], settings: Mapping[str, Any]) -> list[str]:
 
 
 def _beside(file: Path, estimator: str) -> str:
-    """Return an estimator's name; one's own, `file.py:function`, counts from the campaign's folder."""
+    """Return an estimator's name; one's own, `file.py:function`, counts from the campaign's folder.
+
+    Its path is absolute: workers may have another working directory.
+    """
     from perception.command_estimator import is_command
 
-    return str(file.parent / estimator) if ".py" in estimator and not is_command(estimator) else estimator
+    own = ".py" in estimator and not is_command(estimator)
+    return str((file.parent / estimator).absolute()) if own else estimator
 
 
 def _not_estimators(names: Sequence[str]) -> list[str]:

@@ -1,6 +1,6 @@
 """One metric along one axis: where it crosses its bound, between which values it keeps it, and how sure."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -21,7 +21,8 @@ class Edge:
     that holds. `low` and `high` hold 68 of 100 repetitions, and `value`; None where nothing was repeated.
     `within` are the axis's values between which repetitions were searched for this crossing: those of no
     other span. An end of the interval is infinite where a repetition has none there: it keeps the bound
-    through them, or breaks it.
+    through them, or breaks it. `gap` is the index of the value before the gap that the edge lies in; None at
+    the axis's end.
     """
 
     value: float
@@ -29,6 +30,7 @@ class Edge:
     low: float | None = None
     high: float | None = None
     within: tuple[float, float] | None = None
+    gap: int | None = None
 
 
 @dataclass(frozen=True)
@@ -141,8 +143,8 @@ def _edge(
     place = float(np.exp(places[left]) if log else places[left])
     for outside, inside in ((left, right), (right, left)):
         if not np.isfinite(value[outside]):
-            return Edge(float(x[inside]), "not defined" if asked[outside] else "nothing there")
-    return Edge(place, "crossing")
+            return Edge(float(x[inside]), "not defined" if asked[outside] else "nothing there", gap=left)
+    return Edge(place, "crossing", gap=left)
 
 
 def _with_interval(
@@ -171,6 +173,6 @@ def _with_interval(
     beyond = np.where(kept[:, -1] if falls else ~kept[:, 0], np.inf, -np.inf)
     low, high = interval(np.where(np.isfinite(away[rows, nearest]), crossings[rows, nearest], beyond))
     low, high = (float(np.exp(end)) if log and np.isfinite(end) else end for end in (low, high))
-    return Edge(
-        edge.value, edge.reason, min(low, edge.value), max(high, edge.value), (float(x[0]), float(x[-1]))
+    return replace(
+        edge, low=min(low, edge.value), high=max(high, edge.value), within=(float(x[0]), float(x[-1]))
     )

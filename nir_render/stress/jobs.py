@@ -2,7 +2,6 @@
 
 import hashlib
 import itertools
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,8 +19,10 @@ from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.design.points import Point, number_of_points, points_of
 from nir_render.transport.backend.cores import usual_workers
+from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.fingerprint import code_hash
 from perception.estimators import OwnEstimator
+from perception.own_code import files_of
 
 # What shows results, and what is asked for, do not change them.
 _NOT_IN_A_RESULT = (
@@ -73,7 +74,7 @@ def plan(
         A point that makes no scene, or one whose camera cannot see.
     """
     number = number_of_points(campaign.axes, campaign.sample)
-    made_by = _made_by(campaign)
+    made_by = made_by_of(campaign.estimators)
     known: dict[tuple[float | str, ...], list[Job]] = {}
     for job in planned:
         known.setdefault(job.point.written, []).append(job)
@@ -100,9 +101,15 @@ def plan(
             )
         place_of_scene[found.scene] = place
         for seed in campaign.seeds:
-            parts = (found.scene, f"seed {seed}", found.geometry, *made_by)
-            key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:_DIGITS]
-            jobs.append(Job(key, point, seed, {**point.settings, "seed": seed}, f"{seed} {found.geometry}"))
+            jobs.append(
+                Job(
+                    found.key(seed, made_by),
+                    point,
+                    seed,
+                    {**point.settings, "seed": seed},
+                    f"{seed} {found.geometry}",
+                )
+            )
     progress(number, number)
     if problems:
         raise InputError(*_first_of(problems))
@@ -110,22 +117,27 @@ def plan(
 
 
 @dataclass(frozen=True)
-class _Hashes:
+class Hashes:
     """The hashes of a scene and of its geometry; or what is wrong with it."""
 
     scene: str = ""
     geometry: str = ""
     problems: tuple[str, ...] = ()
 
+    def key(self, seed: int, made_by: Sequence[str]) -> str:
+        """Return the key of the job that renders the scene with a seed (`made_by_of`)."""
+        parts = (self.scene, f"seed {seed}", self.geometry, *made_by)
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:_DIGITS]
 
-def _hashes(scene: Scene, settings: Sequence[Mapping[str, Any]]) -> Iterator[_Hashes]:
+
+def _hashes(scene: Scene, settings: Sequence[Mapping[str, Any]]) -> Iterator[Hashes]:
     """Yield what a scene is with each of the settings, in their order.
 
     Building one takes a millisecond or some: many are shared among processes.
     """
     workers = usual_workers()
     if len(settings) < _MANY or workers == 1:
-        yield from (_hashes_of(scene, one) for one in settings)
+        yield from (hashes_of(scene, one) for one in settings)
         return
     chunks = [settings[first : first + _CHUNK] for first in range(0, len(settings), _CHUNK)]
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
@@ -133,16 +145,29 @@ def _hashes(scene: Scene, settings: Sequence[Mapping[str, Any]]) -> Iterator[_Ha
             yield from found
 
 
-def _hashes_of_all(scene: Scene, settings: Sequence[Mapping[str, Any]]) -> list[_Hashes]:
-    return [_hashes_of(scene, one) for one in settings]
+def _hashes_of_all(scene: Scene, settings: Sequence[Mapping[str, Any]]) -> list[Hashes]:
+    return [hashes_of(scene, one) for one in settings]
 
 
-def _hashes_of(scene: Scene, settings: Mapping[str, Any]) -> _Hashes:
+def hashes_of(scene: Scene, settings: Mapping[str, Any]) -> Hashes:
+    """Return what a scene is with settings, whatever its seed."""
     try:
         changed = scene.with_({**settings, "seed": 0})
-        return _Hashes(_scene_hash(changed.document), _geometry(changed))
+        return Hashes(_scene_hash(changed.document), _geometry(changed))
     except InputError as error:
-        return _Hashes(problems=error.problems)
+        return Hashes(problems=error.problems)
+
+
+def is_same(job: Job, scene: Scene, made_by: Sequence[str], processor: str) -> bool:
+    """Tell whether a job that was planned elsewhere is the same here: scene, files, `made_by_of`.
+
+    On another processor the last digits of a geometry may be others: there it is not compared.
+    """
+    found = hashes_of(scene, job.settings)
+    geometry = job.light.partition(" ")[2]
+    if processor == cpu_name() and found.geometry != geometry:
+        return False
+    return replace(found, geometry=geometry).key(job.seed, made_by) == job.key
 
 
 def _scene_hash(document: SceneDocument) -> str:
@@ -182,29 +207,25 @@ def _geometry(scene: Scene) -> str:
     return hashed.hexdigest()
 
 
-def _made_by(campaign: Campaign) -> tuple[str, ...]:
-    """Return what a result follows from besides its scene: estimators, code, versions, machine."""
+def made_by_of(names: Sequence[str], processor: str = "") -> tuple[str, ...]:
+    """Return what a result follows from besides its scene: estimators, code, versions, machine.
+
+    `processor` stands for this machine's own where another one asks for the job.
+    """
     from nir_render.transport.backend.variant import backend
     from nir_render.transport.cache_key import versions
 
-    estimators = frame_estimators(campaign.estimators)
-    own_files = [
-        estimator.path.resolve() for estimator in estimators.values() if isinstance(estimator, OwnEstimator)
-    ]
-    contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in _with_imports(own_files))
+    estimators = frame_estimators(names)
+    own = (one.path for one in estimators.values() if isinstance(one, OwnEstimator))
+    files = sorted({file for path in own for file in files_of(path)})
+    contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
     packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")
-    computed_by = versions(backend().variant, backend().compiler)
+    own_processor = cpu_name()
+    computed_by = (
+        processor if processor and part == own_processor else part
+        for part in versions(backend().variant, backend().compiler)
+    )
     return (*estimators, *contents, results_code_hash(), *packages, *computed_by)
-
-
-def _with_imports(estimators: list[Path]) -> list[Path]:
-    """Return files of estimators, and what they have imported from beside them."""
-    if not estimators:
-        return []
-    folders = {file.parent for file in estimators}
-    files = (getattr(module, "__file__", None) for module in list(sys.modules.values()))
-    imported = {Path(file).resolve() for file in files if file is not None}
-    return sorted({*estimators, *(file for file in imported if file.parent in folders and file.is_file())})
 
 
 @cache

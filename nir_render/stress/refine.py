@@ -46,9 +46,10 @@ def sweep_refined(
     Raises
     ------
     InputError, StoppedError
-        As `sweep`; or the values added make more than `MOST_JOBS` jobs.
+        As `sweep`. Values between those written that make no scene, or more than `MOST_JOBS` jobs, end the
+        refinement with a warning instead.
     """
-    round_name = "stress"
+    round_name, reused, known = "stress", 0, 0
     while True:
         with bar(round_name) as progress:
             result = sweep(
@@ -61,27 +62,39 @@ def sweep_refined(
                 light_limit_bytes=light_limit_bytes,
                 scheduler=scheduler,
             )
+        reused, known = reused + result.reused - known, len(jobs)  # what earlier rounds did is not counted
+        result = replace(result, reused=reused)
+        if result.failed:
+            return result
         finer = refined(campaign, result.table)
         if finer is campaign:
             return result
-        number = number_of_points(finer.axes, None) * len(finer.seeds)
-        if number > MOST_JOBS:
-            raise InputError(
-                f"{campaign.path}: limits as exact as 'refine' wants take {number} jobs; at most {MOST_JOBS} "
-                "are taken: write larger steps"
-            )
-        with bar("check") as progress:
-            jobs = plan(finer, progress, jobs)
+        try:
+            with bar("check") as progress:
+                jobs = _planned(finer, progress, jobs)
+        except InputError as error:
+            unrefined = f"limits are not found more exactly than this: {error.problems[0]}"
+            return replace(result, warnings=(*result.warnings, unrefined))
         campaign, round_name = finer, "refine"
+
+
+def _planned(finer: Campaign, progress: Progress, planned: Sequence[Job]) -> list[Job]:
+    number = number_of_points(finer.axes, None) * len(finer.seeds)
+    if number > MOST_JOBS:
+        raise InputError(
+            f"{finer.path}: limits as exact as 'refine' wants take {number} jobs; at most {MOST_JOBS} "
+            "are taken: write larger steps"
+        )
+    return plan(finer, progress, planned)
 
 
 def refined(campaign: Campaign, table: pa.Table) -> Campaign:
     """Return a campaign with a value halfway in each gap that a bound is crossed in and that is too wide.
 
     Gaps of both are looked at: all corners together, and the worst one. Where the crossing's own interval is
-    wider than the gap, no value is added: more seeds would tell more (of one seed there is no such interval,
-    see `bootstrap`). Returns the campaign itself where there
-    is nothing to add.
+    wider than the halves would be, no value is added: more seeds would tell more (of one seed there is no
+    such interval, nor of a single corner of few, see `bootstrap`). Returns the campaign itself where there is
+    nothing to add.
     """
     if all(axis.refinement is None for axis in campaign.axes):
         return campaign
@@ -103,31 +116,25 @@ def _wanted(axis: Axis, reach: Reach, *, by_seeds: bool) -> Iterator[float]:
         return
     for extent in (reach.pooled, reach.worst):
         for span in () if extent is None else extent.spans:
-            for edge, end in ((span.start, False), (span.end, True)):
+            for edge in (span.start, span.end):
                 width = 0.0
                 if by_seeds and edge.low is not None and edge.high is not None:
                     width = edge.high - edge.low
-                value = _halfway(axis, edge, width, end=end)
+                value = _halfway(axis, edge, width)
                 if value is not None:
                     yield value
 
 
-def _halfway(axis: Axis, edge: Edge, width: float, *, end: bool) -> float | None:
+def _halfway(axis: Axis, edge: Edge, width: float) -> float | None:
     """Return the middle of the gap that an edge lies in; None where it is exact enough, or cannot be more.
 
     `width` is that of the edge's own interval by seeds, in the axis's unit.
     """
     numbers = axis.numbers or ()
-    if edge.reason not in _REASONS or axis.refinement is None:
+    if edge.reason not in _REASONS or edge.gap is None or axis.refinement is None:
         return None
-    # A span ends in the gap behind its last value, and starts in the gap before its first.
-    inside = max(i for i, number in enumerate(numbers) if number <= edge.value * (1.0 + 1e-12)) if end else 0
-    if not end:
-        inside = min(i for i, number in enumerate(numbers) if number >= edge.value * (1.0 - 1e-12)) - 1
-    low, high = numbers[inside], numbers[min(inside + 1, len(numbers) - 1)]
-    if not low < high or axis.refinement.is_kept(low, high):
-        return None
-    if width > high - low:
+    low, high = numbers[edge.gap : edge.gap + 2]
+    if axis.refinement.is_kept(low, high) or width > 0.5 * (high - low):
         return None
     middle = math.sqrt(low * high) if axis.log else 0.5 * (low + high)
     if all(isinstance(value, int) for value in axis.values):

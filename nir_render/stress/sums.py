@@ -40,6 +40,8 @@ class JobSums:
         Their seeds, shape (jobs,).
     place
         Index into each axis's values, shape (jobs, axes).
+    written
+        What the table holds for each axis: a number in SI units, or a label, shape (jobs, axes).
     estimators
         In the order in which the table has them.
     by_metric
@@ -49,15 +51,24 @@ class JobSums:
     jobs: tuple[str, ...]
     seeds: NDArray[np.int64]
     place: NDArray[np.int64]
+    written: tuple[tuple[float | str, ...], ...]
     estimators: tuple[str, ...]
     by_metric: Mapping[tuple[str, str], Values]
 
+    def points(self) -> NDArray[np.int64]:
+        """Return the point of each job, those of all seeds alike, as numbers from 0 up, shape (jobs,)."""
+        number = {values: index for index, values in enumerate(dict.fromkeys(self.written))}
+        return np.array([number[values] for values in self.written], dtype=np.int64)
+
     def subset(self, chosen: NDArray[np.bool_]) -> "JobSums":
         """Return the sums of some of the jobs; `chosen` has the shape (jobs,)."""
-        jobs = tuple(itertools.compress(self.jobs, chosen))
-        by_metric = {key: sums[:, chosen] for key, sums in self.by_metric.items()}
         return replace(
-            self, jobs=jobs, seeds=self.seeds[chosen], place=self.place[chosen], by_metric=by_metric
+            self,
+            jobs=tuple(itertools.compress(self.jobs, chosen)),
+            seeds=self.seeds[chosen],
+            place=self.place[chosen],
+            written=tuple(itertools.compress(self.written, chosen)),
+            by_metric={key: sums[:, chosen] for key, sums in self.by_metric.items()},
         )
 
 
@@ -103,22 +114,24 @@ def job_sums(axes: Sequence[Axis], table: pa.Table) -> JobSums:
     index = job.indices.to_numpy(zero_copy_only=False).astype(np.int64)
     _, first = np.unique(index, return_index=True)
     of_job = table.select(["seed", *(f"axis.{axis.name}" for axis in axes)]).take(pa.array(first))
-    places = [_place(axis, of_job[f"axis.{axis.name}"].to_pylist()) for axis in axes]
+    columns = [of_job[f"axis.{axis.name}"].to_pylist() for axis in axes]
+    places = [_place(axis, column) for axis, column in zip(axes, columns, strict=True)]
+    written = tuple(zip(*columns, strict=True)) if columns else ((),) * len(jobs)
     estimators = tuple(pc.unique(table["estimator"]).to_pylist())
     sums: dict[tuple[str, str], Values] = {}
     for name in estimators:
-        for kind, columns in _COLUMNS.items():
+        for kind, of_kind in _COLUMNS.items():
             chosen = pc.and_(pc.equal(table["estimator"], name), pc.equal(table["kind"], kind))
             if kind == "source":
                 chosen = pc.and_(chosen, pc.fill_null(table["countable"], False))
             mask = chosen.to_numpy()
-            rows = {column: _numbers(table[column]).compress(mask) for column in columns}
+            rows = {column: _numbers(table[column]).compress(mask) for column in of_kind}
             at = index[mask]
             for metric in METRICS.values():
                 if metric.kind == kind:
                     sums[name, metric.name] = _sums(metric, rows, at, len(jobs))
     place = np.stack(places, axis=1) if places else np.zeros((len(jobs), 0), dtype=np.int64)
-    return JobSums(jobs, of_job["seed"].to_numpy(), place, estimators, sums)
+    return JobSums(jobs, of_job["seed"].to_numpy(), place, written, estimators, sums)
 
 
 def pooled(sums: Values, index: NDArray[np.int64], size: int) -> Values:

@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,10 @@ from nir_render.stress.campaign import Campaign
 from nir_render.stress.jobs import Job
 from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
+from nir_render.stress.workers.cluster import MARK
 from nir_render.stress.workers.pool import Work, part_file, run_jobs
 from nir_render.transport.backend.cores import cores, usual_workers
+from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.backend.variant import backend
 
 MANIFEST = "campaign.json"
@@ -98,10 +100,12 @@ def sweep(
         progress(done, len(jobs))
         if missing:
             workers = min(usual_workers() if workers is None else workers, len(missing))
-            kept = (folder / _LIGHT if light is None else light).resolve()
+            # Links are kept: on another machine the same name may lead elsewhere.
+            kept = (folder / _LIGHT if light is None else light).absolute()
             threads = max(cores() // workers, 1) if scheduler is None else None
+            scene = replace(campaign.scene, folder=campaign.scene.folder.absolute())
             work = Work(
-                campaign.scene, campaign.estimators, parts.resolve(), kept, light_limit_bytes, threads
+                scene, campaign.estimators, parts.absolute(), kept, light_limit_bytes, threads, cpu_name()
             )
             try:
                 with closing(run_jobs(work, missing, workers, folder / _SCRATCH, scheduler)) as ending:
@@ -113,13 +117,15 @@ def sweep(
             except KeyboardInterrupt:
                 raise StoppedError(done - len(failed), len(jobs)) from None
         for place in (folder, parts, folder / _LIGHT):
-            _remove_abandoned(place)
+            _remove_abandoned(place, ".*.partial-*")
+        _remove_abandoned(parts, f"{MARK}*")
         return _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
 
 
 def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[str, Any]:
     """Return what a sweep has to do, as one JSON object: jobs, those that the folder holds, geometries.
 
+    `refined` names the axes along which limits are found more exactly, which adds jobs as they are found.
     Files of jobs are counted, not read: one that is broken counts here, and is done again by the sweep.
 
     Errors as `sweep`.
@@ -130,7 +136,13 @@ def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[s
         held = {path.name for path in (folder / _PARTS).glob("*")}
         done = sum(part_file(folder / _PARTS, job).name in held for job in jobs)
     geometries = len({job.light for job in jobs})
-    return {"campaign": campaign.name, "jobs": len(jobs), "done": done, "geometries": geometries}
+    return {
+        "campaign": campaign.name,
+        "jobs": len(jobs),
+        "done": done,
+        "geometries": geometries,
+        "refined": [axis.name for axis in campaign.axes if axis.refinement is not None],
+    }
 
 
 def sweep_record(result: Sweep) -> dict[str, Any]:
@@ -175,9 +187,9 @@ def _claim(folder: Path, campaign: Campaign) -> None:
         raise disk_error(folder, error) from None
 
 
-def _remove_abandoned(folder: Path) -> None:
-    """Remove what killed writers have left beside the files that they did not come to rename."""
-    for path in folder.glob(".*.partial-*"):
+def _remove_abandoned(folder: Path, names: str) -> None:
+    """Remove what killed programs have left: files that they did not come to rename, or to remove."""
+    for path in folder.glob(names):
         path.unlink(missing_ok=True)
 
 

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from nir_render import regress
+from nir_render.command.pytest_plugin import Suites
 from tests.paths import ROOT
 from tests.unit.regress.cases import suite
 
@@ -28,11 +29,11 @@ def test_no_suite(regress):
 """
 
 
-def run_pytest(folder: Path) -> str:
+def run_pytest(folder: Path, *more: str) -> str:
     (folder / "pytest.ini").write_text("[pytest]\ncache_dir = kept\n")
     (folder / "test_frames.py").write_text(TESTS)
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "nir_render.command.pytest_plugin", "-rA", "--no-header"],
+        [sys.executable, "-m", "pytest", "-p", "nir_render.command.pytest_plugin", "-rA", "--no-header", *more],
         cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     return done.stdout + done.stderr
@@ -59,6 +60,19 @@ def test_a_drift_fails_the_test_and_says_what_where_and_how_to_accept_it(tmp_pat
     ):
         assert line in said, said
     assert (tmp_path / "kept" / "nir_render" / "suite.html").read_text().startswith("<!doctype html>")
+    said = run_pytest(tmp_path, "-p", "no:cacheprovider")
+    page = tmp_path / ".pytest_cache" / "nir_render" / "suite.html"
+    assert f"open {page}" in said
+    assert page.exists()
+
+
+def test_suites_of_one_name_have_pages_of_their_own(tmp_path: Path) -> None:
+    suites = Suites(tmp_path, tmp_path / "pages")
+    folders = ("suite", "a/suite", "b/suite", "a-suite", ".", "../suite")
+    pages = [suites._page(tmp_path / folder).resolve() for folder in folders]
+    assert len(set(pages)) == len(pages)
+    assert all(page.is_relative_to(tmp_path / "pages") for page in pages)
+    assert pages[1] == tmp_path / "pages" / "a" / "suite.html"
 
 
 def test_the_action_runs_its_check(tmp_path: Path) -> None:

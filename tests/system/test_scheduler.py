@@ -13,6 +13,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+import yaml
 
 from tests.paths import ROOT
 from tests.system.test_stress import campaign, contents, finished, left_over, start, times_of, workers_of
@@ -23,11 +24,11 @@ HERE = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 @contextlib.contextmanager
-def process(*words: str, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
+def process(*words: str, folder: Path, **more: str) -> Iterator["subprocess.Popen[bytes]"]:
     """Run a command of Dask's in a folder; it, and what it has started, end with the block."""
     with (folder / "said.txt").open("ab") as said:
         running = subprocess.Popen(
-            [sys.executable, "-m", "dask", *words], cwd=folder, env=HERE, stdout=said, stderr=said
+            [sys.executable, "-m", "dask", *words], cwd=folder, env={**HERE, **more}, stdout=said, stderr=said
         )
         try:
             yield running
@@ -67,10 +68,10 @@ def scheduler(folder: Path) -> Iterator[str]:
         yield json.loads(file.read_text())["address"]
 
 
-def by(address: str, file: Path, output: Path, *more: str) -> "subprocess.Popen[str]":
+def by(address: str, file: Path, output: Path, *more: str, folder: Path = ROOT) -> "subprocess.Popen[str]":
     command = [sys.executable, "-m", "nir_render.command.main", "stress", str(file), "-o", str(output)]
     return subprocess.Popen(
-        [*command, "--scheduler", address, *more], cwd=ROOT, text=True, env=HERE,
+        [*command, "--scheduler", address, *more], cwd=folder, text=True, env=HERE,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
 
@@ -93,6 +94,30 @@ def test_workers_of_a_scheduler_give_the_same_table(tmp_path: Path) -> None:
             assert json.loads(out)["done_before"] == 0
     assert contents(tmp_path / "out") == contents(tmp_path / "own")
     assert left_over(tmp_path / "out") == []
+
+
+@pytest.mark.verify
+def test_a_worker_that_joins_late_and_differs_ends_the_campaign(tmp_path: Path) -> None:
+    """Named by relative paths, with an estimator of one's own: workers are in a folder of their own."""
+    file = campaign(tmp_path, ranges=20, exposures=5)
+    (tmp_path / "mine.py").write_text("def none(frame, calibration):\n    return []\n")
+    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "estimators": ["mine.py:none"]}))
+    words = ("--nthreads", "1", "--no-dashboard")
+    with scheduler(tmp_path / "dask") as address, contextlib.ExitStack() as stack:
+        stack.enter_context(process("worker", address, *words, folder=tmp_path / "dask"))
+        running = by(address, Path(file.name), Path("out"), folder=tmp_path)
+        until = time.monotonic() + 120
+        while len(times_of(tmp_path / "out")) < 2 and running.poll() is None:
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        late = process("worker", address, *words, folder=tmp_path / "dask", NIR_RENDER_VARIANT="scalar_rgb")
+        stack.enter_context(late)
+        _, err = running.communicate(timeout=120)
+    assert running.returncode == 2, err
+    assert "has variant scalar_rgb, here it is" in " ".join(err.split())
+    assert "Traceback" not in err
+    assert len(times_of(tmp_path / "out")) >= 2
+    assert list((tmp_path / "out" / "jobs").glob(".seen*")) == []
 
 
 def test_what_is_no_scheduler_is_told(tmp_path: Path) -> None:

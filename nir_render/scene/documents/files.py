@@ -2,9 +2,9 @@
 
 import copy
 import difflib
-import json
-import re
+import marshal
 from collections.abc import Mapping
+from contextvars import ContextVar
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
@@ -17,8 +17,8 @@ from nir_render.scene.documents.base import Document
 from nir_render.scene.text.yaml_text import parse_yaml, read_yaml
 
 _MOST_READ = 1024
-_READ: dict[tuple[type, str, str], "PresetDocument"] = {}
-_NAMES_A_FILE = re.compile(r'\.[A-Za-z]\w*\s*"')
+_READ: dict[tuple[type, bytes], "PresetDocument"] = {}
+_FILES_FOUND: ContextVar[int] = ContextVar("_FILES_FOUND", default=0)  # by this thread so far
 _MOST_NAME_BYTES = 255  # of a file, in the file systems in use
 # Keys of which a document has one: a change that writes another replaces the first.
 _ALTERNATIVES = (
@@ -50,21 +50,25 @@ class PresetDocument(Document):
     """A part that may be named instead of written: a preset of `data/`, or a `.yaml` file beside the scene.
 
     `sensor: mt9m031` takes a preset whole; `sensor: {preset: mt9m031, read_noise: 5 e}` changes a part. Parts
-    that are written alike are read once: thirty robots with one rig, or a campaign's scenes, share them.
+    that are written alike are read once: thirty robots with one rig, or a campaign's scenes, share them. Not
+    so what follows from a file beside the scene, however it is named there: it may have changed since.
     """
 
     preset_folder: ClassVar[str]
 
     @model_validator(mode="wrap")
     @classmethod
-    def _read_once(cls, data: Any, read: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
-        written = _written_alike(data)
-        if written is None:
+    def _read_once(cls, data: Any, read: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            key = cls, marshal.dumps(data, 2)  # by type: {None: 1} is not {"null": 1}
+        except ValueError:  # of more than plain data
             return read(data)
-        key = cls, str(_folder_of(info)), written
         known = _READ.get(key)
         if known is None:
+            before = _FILES_FOUND.get()
             known = read(data)
+            if _FILES_FOUND.get() != before:
+                return known
             if len(_READ) >= _MOST_READ:
                 _READ.pop(next(iter(_READ)), None)
             _READ[key] = known
@@ -75,16 +79,6 @@ class PresetDocument(Document):
     @classmethod
     def _expand_preset(cls, data: Any, info: ValidationInfo) -> Any:
         return expand_preset(data, cls.preset_folder, _folder_of(info))
-
-
-def _written_alike(data: Any) -> str | None:
-    """Return the text that tells a part from all others; None where it may follow from files beside it."""
-    try:
-        written = json.dumps(data)
-    except (TypeError, ValueError, RecursionError):
-        return None
-    # Quotes in the text are written \\", so a name of a file ends before one.
-    return None if _NAMES_A_FILE.search(written) else written
 
 
 def _folder_of(info: ValidationInfo) -> Path:
@@ -106,6 +100,7 @@ def find_file(name: str, folder: Path) -> Path:
     """Return the path of a file beside a scene, in `folder`; raise ValueError where there is none."""
     path = folder / name
     if exists(path):
+        _FILES_FOUND.set(_FILES_FOUND.get() + 1)
         return path
     if any(len(part.encode(errors="replace")) > _MOST_NAME_BYTES for part in path.parts):
         raise ValueError(f"{shown(name)} is too long for the name of a file; give one that exists")

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import Document, KeyProblem
-from nir_render.scene.text.units import FRACTION, Reading, read_quantity
+from nir_render.scene.text.units import Reading, read_quantity
 from nir_render.stress.design.draws import Distribution, drawn_units
 
 MOST_VALUES = 1000
@@ -99,6 +99,15 @@ class Axis:
         """Return in which part of a range that is drawn from a value lies, as index into its values."""
         return min(max(bisect.bisect_right(self.edges_si or (), value_si) - 1, 0), len(self.labels) - 1)
 
+    def label_of(self, written: float | str) -> str:
+        """Return how a value of the table is called: where a range is drawn from, by its own number."""
+        if self.edges is None or isinstance(written, str):
+            values = self.labels if self.values_si is None else self.values_si
+            return self.labels[values.index(written)]
+        unit = read_quantity(f"1 {self.unit}" if self.unit else 1)
+        assert unit is not None  # it was read before
+        return f"{written / unit.value_si:.6g} {self.unit}".rstrip()
+
     def settings(self, index: int) -> dict[str, Any]:
         """Return what the value of this index sets, by dotted path."""
         if self.units is not None:
@@ -110,10 +119,10 @@ class AxisDocument(Document):
     """An axis as written: a list of values, a range `from` … `to` of `count` values, or units that are drawn.
 
     `path` is the dotted path, or several that get the same value; without it the axis's name is the path.
-    `labels` name the values, one for each. `refine` says how exactly limits along the axis are wanted, in its
-    unit or as a share of the value: values are added where a bound is crossed. `draw` holds distributions by
-    dotted path; each of `count` units draws all of them, keyed by `seed`. In a campaign of samples a range is
-    drawn from evenly, and `count` is in how many parts its page shows it.
+    `labels` name the values, one for each. `refine` says how exactly limits along the axis are wanted, as a
+    step in its unit or as a share of the value (2 %): values are added where a bound is crossed. `draw` holds
+    distributions by dotted path; each of `count` units draws all of them, keyed by `seed`. In a campaign of
+    samples a range is drawn from evenly, and `count` is in how many parts its page shows it.
     """
 
     example: ClassVar[str] = "{path: robots.r2.position.x, from: 1 m, to: 6 m, count: 6}"
@@ -214,12 +223,15 @@ class AxisDocument(Document):
         )
 
     def _refinement(self, like: Reading, least_si: float) -> Refinement:
-        """Return how near neighbours are brought: a length of an axis of lengths, or a share of the value."""
+        """Return how near neighbours are brought: "%" is a share of the value, but on an axis in %."""
         step = read_quantity(self.refine)
-        wanted = f"wanted a step, such as {_like(like, 0.1)}, or a share of the value, such as 2 %"
+        wanted = f"wanted a step, such as {_like(like, 0.1)}"
+        wanted += "" if like.unit == "%" else ", or a share of the value, such as 2 %"
         if step is None or not step.value_si > 0.0:
             raise ValueError(f"'refine' is {shown(self.refine)}; {wanted}")
-        by_ratio = step.quantity is FRACTION and like.quantity is not FRACTION
+        by_ratio = step.unit == "%" and like.unit != "%"
+        if not by_ratio and not step.unit and like.unit:
+            raise ValueError(f"'refine' is {shown(self.refine)}, without a unit; {wanted}")
         if not by_ratio and step.quantity is not like.quantity:
             raise ValueError(f"'refine' is {shown(self.refine)}, a {step.quantity.name}; {wanted}")
         if by_ratio and least_si <= 0.0:

@@ -77,9 +77,10 @@ def campaign_html(campaign: Campaign, rows: pa.Table, facts: Mapping[str, Any]) 
         sampled=campaign.sample is not None,
         metrics=metric_sections(campaign, sums, told),
         worst=_worst(campaign, sums, facts),
-        false_alarms=false_alarms_table(rows, sums),
+        false_alarms=false_alarms_table(rows, written),
         render_noise={"sentence": noise_sentence, "warning": noise_warning},
         axes=axes_table(axes),
+        refined=any(any(axis.added) for axis in axes),
         seeds=", ".join(map(str, campaign.seeds[:_MOST_SEEDS]))
         + (", …" if len(campaign.seeds) > _MOST_SEEDS else ""),
         facts=_facts(facts),

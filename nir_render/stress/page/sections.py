@@ -88,7 +88,7 @@ def metrics_shown(campaign: Campaign) -> list[str]:
 def _small_pairs(axes: Sequence[Axis]) -> list[tuple[int, int]]:
     """Return the pairs of axes that a map has room for."""
     pairs = itertools.combinations(range(len(axes)), 2)
-    return [pair for pair in pairs if all(len(axes[i].labels) <= MOST_VALUES for i in pair)]
+    return [pair for pair in pairs if all(len(axes[i].written()) <= MOST_VALUES for i in pair)]
 
 
 def _drawings(

@@ -56,7 +56,7 @@ def worst_table(
                 break  # no metric, or none better
             command = commands.get(sums.jobs[job], "")
             row: list[str] = [named_mark(name, sums.estimators)]
-            row += [axis.labels[sums.place[job, i]] for i, axis in enumerate(axes)]
+            row += [axis.label_of(value) for axis, value in zip(axes, sums.written[job], strict=True)]
             row += [str(sums.seeds[job]), metric_text(metric.name, value[job], bound)]
             row += [metric_text(metric.name, limit[job])] if metric.limit else []
             row += [_count_text(metric, int(totals[COUNT, job]), int(totals[ASKED, job]))]
@@ -70,8 +70,9 @@ def worst_table(
 
 
 def false_alarms_table(rows: pa.Table, sums: JobSums) -> Table:
-    """Return how often each estimator reported what is no source."""
+    """Return how often each estimator reported what is no source, in the jobs of `sums`."""
     lines = []
+    rows = rows.filter(pc.is_in(rows["job"], pa.array(sums.jobs, pa.string())))
     for name in sums.estimators:
         of_frames = rows.filter(pc.and_(pc.equal(rows["kind"], "frame"), pc.equal(rows["estimator"], name)))
         alarms = pc.fill_null(of_frames["frame_false_alarms"], 0)

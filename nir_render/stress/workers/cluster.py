@@ -5,16 +5,19 @@ else would fill a campaign with what it is not; so they are refused before the f
 """
 
 import contextlib
-from collections import Counter
-from collections.abc import Iterator, Mapping
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from distributed import Client
+from distributed import Client, get_worker
 from distributed.comm.addressing import get_address_host
+from distributed.utils import sync
 
 from nir_render.errors import InputError
 from nir_render.report.wording import counted
+from nir_render.run.folder import disk_error
 from nir_render.run.manifest import versions
 from nir_render.stress.jobs import results_code_hash
 from nir_render.transport.backend.variant import backend
@@ -22,18 +25,93 @@ from nir_render.transport.backend.variant import backend
 _ANSWERS_WITHIN_S = 10
 _STARTS_WITHIN_S = 120
 _MAY_DIFFER = ("platform",)  # the processor: its bits may differ, its statistics do not
+MARK = ".seen-"  # not one of the names that a cache takes for a killed writer's, and removes in time
+_THREADS = "start workers with '--nthreads 1', and '--nworkers' for more"
+
+
+class RefusedError(InputError):
+    """A worker that computes other than this program does; no job may go to it."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What each worker is held against, by itself: facts of this program, and a file in each shared folder.
+
+    The files hold the token: a folder of the same name may be another one there.
+    """
+
+    facts: Mapping[str, str]
+    marks: tuple[Path, ...]
+    token: str
+
+    def problems(self) -> list[str]:
+        """Return what is wrong with this process as a worker, such as "has numpy 1, here it is 2"."""
+        found = [
+            f"does not see {mark.parent}; give -o, and --light-cache, a folder that all share"
+            for mark in self.marks
+            if _content(mark) != self.token
+        ]
+        own = process_facts()
+        return found + [
+            f"has {key} {own.get(key)}, here it is {value}; make them alike"
+            for key, value in self.facts.items()
+            if own.get(key) != value
+        ]
+
+
+def process_facts() -> dict[str, str]:
+    """Return what results of this process follow from."""
+    facts = {
+        **versions(),
+        "code": results_code_hash(),
+        "variant": backend().variant,
+        "compiler": backend().compiler,
+    }
+    return {key: value for key, value in facts.items() if key not in _MAY_DIFFER}
+
+
+def _content(file: Path) -> str:
+    try:
+        return file.read_text()
+    except (OSError, ValueError):
+        return ""
 
 
 @contextlib.contextmanager
-def connected(address: str, shared: Path) -> Iterator[tuple[Client, dict[str, int]]]:
-    """Connect to the cluster whose scheduler is at an address; yield its client, and workers by host.
+def terms_of(folders: Sequence[Path]) -> Iterator[Terms]:
+    """Mark folders until the end of the block; yield the terms of workers that share them.
+
+    Raises
+    ------
+    InputError
+        A folder cannot be written.
+    """
+    token = secrets.token_hex(16)
+    marks = tuple(folder / f"{MARK}{token[:8]}" for folder in dict.fromkeys(folders))
+    try:
+        for mark in marks:
+            try:
+                mark.parent.mkdir(parents=True, exist_ok=True)
+                mark.write_text(token)
+            except OSError as error:
+                raise disk_error(mark.parent, error) from None
+        yield Terms(process_facts(), marks, token)
+    finally:
+        for mark in marks:
+            with contextlib.suppress(OSError):
+                mark.unlink()
+
+
+@contextlib.contextmanager
+def connected(address: str, terms: Terms) -> Iterator[Client]:
+    """Connect to the cluster whose scheduler is at an address; yield its client.
 
     Parameters
     ----------
     address
         As Dask writes it: tcp://host:8786.
-    shared
-        The folder that all workers write to.
+    terms
+        What all workers are held against.
 
     Raises
     ------
@@ -55,52 +133,49 @@ def connected(address: str, shared: Path) -> Iterator[tuple[Client, dict[str, in
                 f"--scheduler {address}: has no workers after {_STARTS_WITHIN_S} s; start some with "
                 f"'dask worker {address} --nthreads 1'"
             ) from None
-        _check(client, shared)
-        hosts = Counter(get_address_host(worker) for worker in _workers(client))
-        yield client, dict(hosts)
+        _check(client, terms)
+        yield client
 
 
-def worker_facts(shared: str) -> dict[str, str]:
-    """Return what results of this process follow from, and whether it sees a folder; runs on a worker."""
-    return {
-        **versions(),
-        "code": results_code_hash(),
-        "variant": backend().variant,
-        "folder": "seen" if Path(shared).is_dir() else "not seen",
-    }
+def check_this_worker(terms: Terms) -> None:
+    """Hold the worker that this runs in against the terms: it may have come after the start.
+
+    Raises
+    ------
+    RefusedError
+        It is not of one mind with the program that asks.
+    """
+    worker = get_worker()
+    several = [] if worker.state.nthreads == 1 else [f"has several threads: {_THREADS}"]
+    if problems := several + terms.problems():
+        raise RefusedError(*(f"--scheduler: the worker {worker.address} {problem}" for problem in problems))
 
 
-def _workers(client: Client) -> Mapping[str, Any]:
-    workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
-    return workers
+def workers_beside() -> int:
+    """Return how many workers the host of this one has now, itself among them."""
+    worker = get_worker()
+    known: Mapping[str, Any] = sync(worker.loop, worker.scheduler.identity)["workers"]
+    hosts: list[str] = [get_address_host(address) for address in known]
+    return max(hosts.count(get_address_host(worker.address)), 1)
 
 
-def _check(client: Client, shared: Path) -> None:
+def _check(client: Client, terms: Terms) -> None:
     """Refuse workers with several threads, without this program, or with another one."""
-    several = [name for name, worker in _workers(client).items() if worker["nthreads"] != 1]
+    workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
+    several = [name for name, worker in workers.items() if worker["nthreads"] != 1]
     if several:
         raise InputError(
             f"--scheduler: {counted(len(several), 'worker')} with several threads, {several[0]} the first; "
-            "a job wants a process of its own: start workers with '--nthreads 1', and '--nworkers' for more"
+            f"a job wants a process of its own: {_THREADS}"
         )
-    own = worker_facts(str(shared))
-    found = client.run(worker_facts, str(shared), on_error="return")
     problems = []
-    for name, facts in sorted(found.items()):
-        if isinstance(facts, BaseException):
+    for name, found in sorted(client.run(terms.problems, on_error="return").items()):
+        if isinstance(found, BaseException):
             problems.append(
-                f"--scheduler: the worker {name} cannot load nir_render ({type(facts).__name__}: {facts}); "
+                f"--scheduler: the worker {name} cannot load nir_render ({type(found).__name__}: {found}); "
                 "install the same nir_render there"
             )
-            continue
-        if facts["folder"] != "seen":
-            problems.append(
-                f"--scheduler: the worker {name} does not see {shared}; give -o a folder that all share"
-            )
-        problems += [
-            f"--scheduler: the worker {name} has {key} {facts.get(key)}, here it is {value}; make them alike"
-            for key, value in own.items()
-            if key not in ("folder", *_MAY_DIFFER) and facts.get(key) != value
-        ]
+        else:
+            problems += [f"--scheduler: the worker {name} {problem}" for problem in found]
     if problems:
         raise InputError(*problems)

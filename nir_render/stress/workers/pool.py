@@ -10,7 +10,8 @@ import logging
 import multiprocessing
 import shutil
 import signal
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
@@ -19,7 +20,8 @@ from pathlib import Path
 import cv2
 import dask
 from distributed import Client, Future, LocalCluster, as_completed, get_worker
-from distributed.comm.addressing import get_address_host
+from distributed.client import ClosedClientError
+from distributed.comm import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.scheduler import KilledWorker
 
@@ -27,9 +29,16 @@ from nir_render.errors import InputError
 from nir_render.run.perceive import frame_estimators
 from nir_render.scene.scene import Scene
 from nir_render.stress.job.execute import execute
-from nir_render.stress.jobs import Job
+from nir_render.stress.jobs import Job, is_same, made_by_of
 from nir_render.stress.table import read_part, write_part
-from nir_render.stress.workers.cluster import connected
+from nir_render.stress.workers.cluster import (
+    RefusedError,
+    Terms,
+    check_this_worker,
+    connected,
+    terms_of,
+    workers_beside,
+)
 from nir_render.transport.backend.cores import cores, thread_settings
 from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
@@ -40,6 +49,7 @@ _STARTS = 4
 _MEMORY_LIMIT_BYTES = 256 * 2**20
 _ENDS_WITHIN_S = 5
 _PLUGIN = "nir_render"
+_GONE = "the scheduler is gone; what is done stays done, and the same command goes on"
 
 
 @dataclass(frozen=True)
@@ -47,7 +57,8 @@ class Work:
     """What all jobs of a campaign share.
 
     `scene` is what the jobs' settings change; `threads` how many each worker computes with, None where
-    workers of one host share its cores. `parts` and `light` are absolute: workers have folders of their own.
+    workers of one host share its cores; `processor` that of the machine that asks. All paths are absolute,
+    those of the scene and of estimators too: workers have folders of their own.
     """
 
     scene: Scene
@@ -56,6 +67,7 @@ class Work:
     light: Path
     light_limit_bytes: int
     threads: int | None
+    processor: str
 
 
 @dataclass(frozen=True)
@@ -78,26 +90,32 @@ def run_jobs(
 
     The first job of those that share light renders it; the others begin when it has ended, and find it in the
     cache. When the generator is closed, or an exception goes through it, the workers end.
+
+    Raises
+    ------
+    InputError
+        There is no scheduler, or none any more; or a worker is refused, at the start or later.
     """
     # `scratch` may hold what a killed run has left.
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     settings = {
-        "distributed.scheduler.allowed-failures": _DEATHS,
+        "distributed.scheduler.allowed-failures": _DEATHS - 1,
         "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
         "distributed.nanny.pre-spawn-environ": thread_settings(work.threads or 1),
         "temporary-directory": str(scratch),
     }
     try:
-        hosts: dict[str, int] = {}
+        terms: Terms | None = None
         with contextlib.ExitStack() as stack:
             stack.enter_context(dask.config.set(settings))
             if scheduler is None:
                 client = stack.enter_context(_client(workers))
             else:
-                client, hosts = stack.enter_context(connected(scheduler, work.parts))
+                terms = stack.enter_context(terms_of((work.parts, work.light)))
+                client = stack.enter_context(connected(scheduler, terms))
             plugin = _plugin_name(work)
-            _tell_workers(client, _Context(work, hosts), plugin)
+            _tell_workers(client, _Context(work, terms), plugin)
             if scheduler is not None:  # it outlives this campaign
                 stack.callback(_forget, client, plugin)
             order = {job.key: number for number, job in enumerate(jobs)}
@@ -120,11 +138,15 @@ def run_jobs(
 
             ending = as_completed([submitted(job) for job in first])
             for future in ending:
+                if future.cancelled():
+                    raise InputError(_GONE)
                 job = job_of.pop(future)
                 # However it has ended: one that takes its workers along must not take the others along.
                 for follower in followers.pop(job.light, ()):
                     ending.add(submitted(follower))
                 yield Done(job, _fault(future))
+    except (ClosedClientError, CommClosedError, CancelledError):
+        raise InputError(_GONE) from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
@@ -165,7 +187,7 @@ def _plugin_name(work: Work) -> str:
 
 def _forget(client: Client, plugin: str) -> None:
     """Take from workers what this campaign told them; a scheduler that is gone has forgotten it."""
-    with contextlib.suppress(OSError, TimeoutError):
+    with contextlib.suppress(OSError, TimeoutError, RuntimeError, ValueError, ClosedClientError):
         client.unregister_worker_plugin(plugin)
 
 
@@ -210,36 +232,58 @@ def _interrupts_held() -> Iterator[None]:
 
 
 class _Context(WorkerPlugin):  # type: ignore[misc]
-    """What a worker keeps from job to job: estimators, light, and how many threads it has."""
+    """What a worker keeps from job to job: estimators, light, and how many threads it has.
 
-    def __init__(self, work: Work, hosts: Mapping[str, int]) -> None:
-        self.work, self.hosts = work, hosts
+    `terms` are those of workers that someone else has started; None for this program's own.
+    """
+
+    def __init__(self, work: Work, terms: Terms | None) -> None:
+        self.work, self.terms = work, terms
         self._estimators: dict[str, Estimator] | None = None
+        self._made_by: tuple[str, ...] = ()
         self._cache: LightCache | None = None
+        self._threads = 0
 
     def do(self, job: Job) -> None:
-        """Do a job, and leave its file."""
+        """Do a job, and leave its file.
+
+        Raises
+        ------
+        RefusedError
+            Here the job would be another one than was asked for.
+        """
         if self._estimators is None:  # here, not at the start: Mitsuba's variant belongs to this thread
-            threads = self._threads()
-            set_threads(threads)
-            cv2.setNumThreads(threads)
+            if self.terms is not None:
+                check_this_worker(self.terms)
             self._estimators = frame_estimators(self.work.estimators)
             self._cache = LightCache(
                 self.work.light,
                 limit_bytes=self.work.light_limit_bytes,
                 memory_limit_bytes=_MEMORY_LIMIT_BYTES,
             )
+            self._made_by = made_by_of(self.work.estimators, self.work.processor)
+        self._share_cores()
         if read_part(part_file(self.work.parts, job)) is not None:
             return  # by a worker that was killed before it could say so
+        if not is_same(job, self.work.scene, self._made_by, self.work.processor):
+            raise RefusedError(
+                f"the worker {get_worker().address} would do another job than was asked for: a file of the "
+                "scene or of an estimator, the code or a version has changed or is another one there; "
+                "the same command goes on"
+            )
         scene = self.work.scene.with_(job.settings)
         rows, frames_sha256 = execute(scene, self._estimators, self._cache)
         write_part(part_file(self.work.parts, job), rows, frames_sha256)
 
-    def _threads(self) -> int:
-        if self.work.threads is not None:
-            return self.work.threads
-        beside = self.hosts.get(get_address_host(get_worker().address), 1)
-        return max(cores() // beside, 1)
+    def _share_cores(self) -> None:
+        """Take this worker's share of the cores; others may have come or gone since the last job."""
+        threads = self.work.threads
+        if threads is None:
+            threads = max(cores() // workers_beside(), 1)
+        if threads != self._threads:
+            set_threads(threads)
+            cv2.setNumThreads(threads)
+            self._threads = threads
 
 
 def _do(job: Job, plugin: str) -> str | None:
@@ -247,6 +291,8 @@ def _do(job: Job, plugin: str) -> str | None:
     context = get_worker().plugins[plugin]
     try:
         context.do(job)
+    except RefusedError:
+        raise
     except Exception as error:  # one job that fails must not take the others along
         return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     return None
@@ -257,6 +303,9 @@ def _fault(future: Future) -> str | None:
     if error is None:
         problem: str | None = future.result()
         return problem
+    if isinstance(error, RefusedError):
+        raise error
     if isinstance(error, KilledWorker):
-        return f"{_DEATHS + 1} workers died with it, perhaps for want of memory: fewer --workers need less"
+        deaths = error.allowed_failures + 1  # a scheduler that someone else has started has its own limit
+        return f"{deaths} workers died with it, perhaps for want of memory: fewer on a machine need less"
     return f"{type(error).__name__}: {error}"

@@ -9,6 +9,7 @@ import pytest
 
 import perception
 from perception import EstimatorError, load_estimator
+from perception.own_code import files_of
 from perception.paper import detect_paper
 from perception.robust.detect import detect_robust
 from tests.paths import SCENES
@@ -296,3 +297,23 @@ def test_two_versions_of_ones_own_code_each_have_their_own_helper(tmp_path: Path
         )
     loaded = [load_estimator(f"{tmp_path / version / 'mine.py'}:find") for version in ("old", "new")]
     assert [one.function.__globals__["NAME"] for one in loaded] == ["old", "new"]
+
+
+def test_a_helper_that_was_edited_is_imported_anew(tmp_path: Path) -> None:
+    """A worker of a cluster lives longer than a version of its user's code; each file has its own helpers."""
+    for name in ("mine", "yours"):
+        (tmp_path / f"{name}.py").write_text(
+            f"from helper_of_{name} import NAME\ndef find(frame, calibration):\n    return NAME\n"
+        )
+    (tmp_path / "helper_of_yours.py").write_text("NAME = 'yours'\n")
+    seen = []
+    for version in ("old", "newer"):
+        (tmp_path / "helper_of_mine.py").write_text(f"NAME = {version!r}\n")
+        seen.append(load_estimator(f"{tmp_path / 'mine.py'}:find").function.__globals__["NAME"])
+        load_estimator(f"{tmp_path / 'yours.py'}:find")
+    assert seen == ["old", "newer"]
+    for name in ("mine", "yours"):
+        assert files_of(tmp_path / f"{name}.py") == (
+            tmp_path / f"{name}.py",
+            tmp_path / f"helper_of_{name}.py",
+        )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from nir_render import InputError, Scene, load_scene
+from nir_render.scene.documents.camera import Rig
 from nir_render.scene.scene import parse_scene
 from tests.paths import SCENES
 
@@ -316,6 +317,28 @@ def test_parts_that_are_written_alike_are_read_once_but_not_those_that_follow_fr
     other = parse_scene(document, tmp_path).with_({"robots.r2.rig.sources.top.flux": "0.3 W"})
     assert other.document.robots["r2"].rig.sources["top"].flux_w == 0.3
     assert other.document.robots["r1"].rig is seen[0]["r1"].rig
+
+
+@pytest.mark.parametrize("name", ["qe", "qe.csv.2", "qe-2.0", "qe.csv"])
+def test_a_file_is_read_again_whatever_it_is_called(tmp_path: Path, name: str) -> None:
+    seen = []
+    for value in (0.1, 0.2):
+        (tmp_path / name).write_text(f"wavelength_nm,value\n800,{value}\n1100,{value}\n")
+        sensor = {"preset": "mt9m031", "quantum_efficiency": {"file": name}}
+        rig = {"preset": "infra_swarm", "cameras": {"front": {"sensor": sensor}}}
+        document = {"format": 1, "name": "one", "observe": ["r1.front"], "robots": {"r1": {"rig": rig}}}
+        robots = parse_scene(document, tmp_path).document.robots
+        points = robots["r1"].rig.cameras["front"].sensor.quantum_efficiency.points
+        assert points is not None
+        seen.append(points[0][1])
+    assert seen == [0.1, 0.2]
+
+
+def test_parts_whose_keys_only_look_alike_are_two() -> None:
+    rig = {"sources": {"null": {"preset": "infra_swarm", "position": "[0, 0, 0.2] m"}}}
+    Rig.model_validate(rig)
+    with pytest.raises(ValueError, match="None"):
+        Rig.model_validate({"sources": {None: rig["sources"]["null"]}})
 
 
 def test_an_override_inside_a_preset_changes_that_part_only(scene: Scene) -> None:

@@ -12,6 +12,7 @@ from jsonschema import Draft202012Validator
 from nir_render import InputError
 from nir_render.stress.campaign import Campaign, campaign_schema, load_campaign
 from nir_render.stress.jobs import Job, plan
+from nir_render.stress.sweep import plan_record
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.mitsuba
@@ -189,6 +190,15 @@ def test_two_combinations_that_are_one_scene_are_refused(tmp_path: Path) -> None
         InputError, match=r"at a = \{extinction: 100 /km\}: the same scene as at a = \{extinction"
     ):
         planned(tmp_path, axes=axes)
+
+
+def test_limits_are_refined_where_there_are_bounds_and_a_plan_says_so(tmp_path: Path) -> None:
+    axes = {"range": {"path": "robots.r2.position.x", "values": ["1 m", "2 m", "4 m"], "refine": "2 %"}}
+    with pytest.raises(InputError, match="'refine' finds limits: state 'bounds' too"):
+        load_campaign(written(tmp_path, axes=axes, bounds={}))
+    campaign, jobs = planned(tmp_path, axes=axes)
+    assert plan_record(campaign, jobs, tmp_path / "out")["refined"] == ["range"]
+    assert plan_record(*planned(tmp_path), tmp_path / "out")["refined"] == []
 
 
 def test_a_scene_is_no_campaign() -> None:

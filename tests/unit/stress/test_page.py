@@ -11,13 +11,15 @@ from matplotlib.figure import Figure as MatplotlibFigure
 from nir_render.report.drawing import ratio_ticks
 from nir_render.stress.bootstrap import along_axes
 from nir_render.stress.crossings import Edge, Span
-from nir_render.stress.design.axes import Axis
+from nir_render.stress.design.axes import Axis, with_values
 from nir_render.stress.metrics import METRICS, Bound
 from nir_render.stress.page import plots as campaign_plots
 from nir_render.stress.page.page import campaign_html
+from nir_render.stress.page.sections import _small_pairs
+from nir_render.stress.page.tables import false_alarms_table
 from nir_render.stress.page.words import bound_text, extent_text, metric_text, tick_text
 from nir_render.stress.reach import Extent
-from nir_render.stress.sums import job_sums
+from nir_render.stress.sums import at_written_values, job_sums
 from tests.unit.report.cases import Page
 from tests.unit.stress.synthetic import FOG, LAMP, RANGE, Row, campaign, frame, source, table
 
@@ -111,6 +113,30 @@ def test_a_campaign_without_a_source_is_no_pass(bounds: dict[str, Any]) -> None:
     assert ("has nothing to be judged by." in text) is bool(bounds)
     assert ("states no bounds" in text) is not bool(bounds)
     assert ("along lamp throughout" in text) is bool(bounds)  # no false alarms in three frames
+
+
+def test_values_added_at_limits_are_told_and_change_no_figure_of_the_whole() -> None:
+    """An alarm in each job at the added value alone: none of the written ones has any."""
+    ranges = with_values(RANGE, [2.2])
+    added = ranges.added.index(True)
+    asked = campaign([ranges, LAMP], {"range_rmse": "5 cm"}, 1)
+    rows = table(
+        [ranges, LAMP],
+        1,
+        lambda at, seed, name: [frame(int(at[RANGE.name] == added)), source(0.01)],
+        ["robust"],
+    )
+    text = Page(campaign_html(asked, rows, {})).text
+    assert (
+        "Every combination of the values written was rendered with each of the seeds 1; a value added" in text
+    )
+    table_ = false_alarms_table(rows, at_written_values([ranges, LAMP], job_sums([ranges, LAMP], rows))[1])
+    assert table_.rows[0][1:4] == ["0", "0.000", "0 of 15"]
+
+
+def test_a_map_has_room_for_written_values_however_many_were_added() -> None:
+    ranges = with_values(RANGE, [2.0 + 0.01 * step for step in range(60)])
+    assert _small_pairs([ranges, FOG]) == [(0, 1)]
 
 
 def test_a_large_campaign_stays_a_small_page() -> None:
