@@ -131,18 +131,28 @@ def halo_e(
     places = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
     middle = direction_camera(np.array([[u_px, v_px]]), calibration)[0]
     direction = direction_camera(places, calibration)
-    # The area of a pixel in directions, from its neighbours' places.
-    aside, below = (
-        direction_camera(np.array([[u_px, v_px]]) + step, calibration)[0] - middle
-        for step in ((1.0, 0.0), (0.0, 1.0))
-    )
-    pixel_sr = float(np.linalg.norm(np.cross(aside, below)))
-    px_per_rad = pixel_sr**-0.5
-    off_px = px_per_rad * 2.0 * np.arcsin(0.5 * np.minimum(np.linalg.norm(direction - middle, axis=1), 2.0))
-    sigma_px = np.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0 + 0.25 * image_radius_px**2)
-    profile, at_px = _blurred(share, px_per_rad * angle_rad, float(sigma_px), float(off_px.max()))
-    image = flux_e * np.interp(off_px, at_px, profile)
-    return np.asarray(np.where(np.isnan(image), 0.0, image).reshape(box.height, box.width))
+    px_per_rad = _pixel_sr(u_px, v_px, calibration) ** -0.5
+    chord = np.minimum(np.linalg.norm(direction - middle, axis=1), 2.0)
+    # Beyond a fisheye's image circle pixels see no direction.
+    seen = np.isfinite(chord)
+    image = np.zeros(len(places))
+    if math.isfinite(px_per_rad) and seen.any():
+        off_px = px_per_rad * 2.0 * np.arcsin(0.5 * chord[seen])
+        sigma_px = np.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0 + 0.25 * image_radius_px**2)
+        profile, at_px = _blurred(share, px_per_rad * angle_rad, float(sigma_px), float(off_px.max()))
+        image[seen] = flux_e * np.interp(off_px, at_px, profile)
+    return image.reshape(box.height, box.width)
+
+
+def _pixel_sr(u_px: float, v_px: float, calibration: Calibration) -> float:
+    """Return the area of a pixel in directions, from its neighbours' places; NaN where there is none."""
+    place = np.array([u_px, v_px])
+    steps = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    middle, right, below, left, above = direction_camera(place + steps, calibration)
+    # Right at the edge of the image circle the neighbours on one side alone have directions.
+    aside = np.where(np.isfinite(right), right - middle, middle - left)
+    down = np.where(np.isfinite(below), below - middle, middle - above)
+    return float(np.linalg.norm(np.cross(aside, down)))
 
 
 def _blurred(share: Array, angle_px: Array, sigma_px: float, most_px: float) -> tuple[Array, Array]:

@@ -63,6 +63,30 @@ def test_a_halo_is_the_sum_of_many_points_about_the_flare(u_px: float, v_px: flo
     assert found.sum() == pytest.approx(expected.sum(), rel=0.01)
 
 
+@pytest.mark.parametrize("inside_px", [0.5, 5.0])
+def test_a_halo_ends_at_the_edge_of_an_image_circle(inside_px: float) -> None:
+    """180° of a fisheye end within the window: beyond is no halo, and within it is that of a window that ends there.
+
+    Right at the edge it is that of a flare five pixels farther in, to the 2 % by which pixels differ.
+    """
+    camera = calibration(
+        lens_model="fisheye", distortion=(0.0, 0.0, 0.0, 0.0), fx_px=240.0, fy_px=240.0,
+        forward_light=(_light(1.0),),
+    )  # fmt: skip
+    edge_px = camera.cx_px + 240.0 * 0.5 * math.pi
+    u_px, v_px = edge_px - inside_px, 479.7
+    box = PixelBox(470, round(u_px) - 10, 21, 21)
+    within = math.floor(edge_px) - box.left - 1
+    found = halo_e(u_px, v_px, 1e4, 0.0, 0.8, box, camera)
+    cut = halo_e(u_px, v_px, 1e4, 0.0, 0.8, PixelBox(470, box.left, 21, within), camera)
+    np.testing.assert_allclose(found[:, :within], cut, rtol=2e-3)
+    assert cut.min() > 0.0
+    assert (found[:, box.left + np.arange(21) > edge_px] == 0.0).all()
+    shifted = halo_e(u_px - 5.0, v_px, 1e4, 0.0, 0.8, PixelBox(470, box.left - 5, 21, 21), camera)
+    own = np.s_[8:12, 6:within]
+    assert found[own].sum() == pytest.approx(shifted[own].sum(), rel=0.02)
+
+
 def test_ranges_know_the_forward_light_of_fog() -> None:
     """A source in fog of 0.08 /m at 7 m, its halo in the frame by points as above but drawn on a finer grid, 24 frames.
 
