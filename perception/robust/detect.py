@@ -13,10 +13,10 @@ from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
-from perception.robust.reason import reason_of_none
 from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.prepare import PreparedFrame, prepare
+from perception.robust.search.reason import reason_of_none
 from perception.types import Calibration, Detection, Detections, RawFrame
 
 CONTRAST_SIGMAS = 6.03

@@ -13,9 +13,10 @@ from perception.robust.deblend import asks_for_more, deblend, of_free_width
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
+from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.solve import Problem, Solution, solve
-from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
+from perception.robust.search.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
+from perception.robust.solve import Solution, solve
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 HALO_SEEMS_SIGMAS = 1.5

@@ -15,8 +15,8 @@ from perception.model.flare import PixelBox
 from perception.model.fog import extinction_sigma_per_m, forward_sigma, may_be_in_fog, range_in_fog_m
 from perception.model.layout import Structure
 from perception.model.window import Camera
-from perception.robust.solve import Solution, Window, solve
-from perception.robust.structure import joined
+from perception.robust.problem import Window
+from perception.robust.solve import Solution, solve
 from perception.types import Calibration, ForwardLight
 
 Array = NDArray[np.float64]
@@ -36,10 +36,9 @@ def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> Non
     calibration = camera.calibration
     if not (calibration.forward_light and may_be_in_fog(calibration)):
         return
-    first = {index: one for index, one in enumerate(best) if one is not None and bool(one.ranged.all())}
-    going = dict(first)
+    going = {index: one for index, one in enumerate(best) if one is not None and bool(one.ranged.all())}
     for _ in range(_ROUNDS):
-        problems = [one.again(_with_halos(one, first[index], camera)) for index, one in going.items()]
+        problems = [one.again(_with_halos(one, camera)) for one in going.values()]
         again = dict(zip(going, solve(problems, camera), strict=True))
         moved = {}
         for index, now in again.items():
@@ -53,11 +52,8 @@ def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> Non
             return
 
 
-def _with_halos(solution: Solution, first: Solution, camera: Camera) -> Window:
-    """Return a solution's window with the halos of its flares as known light.
-
-    What is not known of their strength is structure of it, on what the first had.
-    """
+def _with_halos(solution: Solution, camera: Camera) -> Window:
+    """Return a solution's window with the halos of its flares, and those alone, as known light."""
     calibration, window = camera.calibration, solution.window
     ranges_m = range_in_fog_m(np.exp(solution.log_photometric_range), calibration.extinction_per_m)
     unsure_per_m = extinction_sigma_per_m(calibration)
@@ -72,11 +68,11 @@ def _with_halos(solution: Solution, first: Solution, camera: Camera) -> Window:
         )
         for k in range(solution.count)
     ]  # fmt: skip
-    halo, structure = np.sum(halos, axis=0), first.window.structure
+    halo, unsure = np.sum(halos, axis=0), None
     sigma = math.hypot(unsure_per_m / per_m, forward_sigma(calibration))
     if sigma > 0.0:
-        structure = joined(structure, Structure(halo.reshape(1, -1), np.array([[1.0 / sigma**2]])))
-    return replace(window, known_e=halo if known else None, structure=structure)
+        unsure = Structure(halo.reshape(1, -1), np.array([[1.0 / sigma**2]]))
+    return replace(window, known_e=halo if known else None, unsure=unsure)
 
 
 def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array, Array]:
