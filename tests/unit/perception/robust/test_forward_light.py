@@ -170,3 +170,16 @@ def test_a_halo_stays_unsure_on_uneven_ground() -> None:
         (hit,) = detect(frame, unknown, estimator="robust")
         pulls.append((hit.range_m - range_m) / hit.range_sigma_m)
     assert abs(np.mean(pulls)) < 1.5
+
+
+@pytest.mark.parametrize(("apart_px", "ranges_m"), [(2.0, (7.0, 7.0)), (3.0, (7.0, 9.0))])
+def test_each_of_two_flares_in_fog_has_its_own_halo(apart_px: float, ranges_m: tuple[float, float]) -> None:
+    """One blob of two flares, 16 frames, halos known. Expected: pulls of the ranges of 1, to what chance allows."""
+    camera = _foggy()
+    sources = [(49.3 - apart_px, 46.6, ranges_m[0]), (49.3, 46.6, ranges_m[1])]
+    pulls = []
+    for frame in _frames(camera, _foggy_e(camera, sources), 16):
+        hits = sorted(detect(frame, camera, estimator="robust"), key=lambda hit: hit.u_px)
+        assert len(hits) == 2
+        pulls += [(hit.range_m - r) / hit.range_sigma_m for hit, r in zip(hits, ranges_m, strict=True)]
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.0 + 2.5 / math.sqrt(2.0 * len(pulls))
