@@ -116,12 +116,15 @@ def _in_fog(
     found: Sequence[tuple[Blob, MeasuredFlare]], frame: RawFrame, calibration: Calibration
 ) -> Iterator[tuple[Blob, MeasuredFlare]]:
     """Yield flares that were fitted with any size, with ranges as fog allows; bounds stay as they are."""
-    u_px, v_px, flux_e, flux_sigma_e, both_m, both_sigma_m = np.array(
+    u_px, v_px, flux_e, flux_sigma_e, both_m, both_sigma_m, doubt, doubt_common = np.array(
         [
-            (one.u_px, one.v_px, one.flux_e, one.flux_sigma_e, one.range_m, one.range_sigma_m)
+            (
+                one.u_px, one.v_px, one.flux_e, one.flux_sigma_e, one.range_m, one.range_sigma_m,
+                one.log_range_doubt, one.log_range_doubt_common,
+            )
             for _, one in found
         ]
-    ).T
+    ).T  # fmt: skip
     at_1_m_dn = flux_at_one_metre_dn(u_px, v_px, frame.exposure_s, frame.gain, calibration)
     with np.errstate(invalid="ignore"):
         by_flux_m = np.sqrt(at_1_m_dn / (flux_e * gain_dn_per_e(frame, calibration)))
@@ -131,6 +134,8 @@ def _in_fog(
     both_m, both_sigma_m = np.where(known, both_m, 1.0), np.where(known, both_sigma_m, 1.0)
     size_m, size_sigma_m = size_alone(both_m, both_sigma_m, by_flux_m, share_sigma)
     ranges = ranged_in_fog(by_flux_m, share_sigma, size_m, size_sigma_m, calibration)
+    slope = 1.0 / (1.0 + 0.5 * calibration.extinction_per_m * ranges.range_m)
+    ranges = ranges.doubted(slope * doubt, slope * doubt_common)
     for k, (blob, one) in enumerate(found):
         if not known[k]:
             yield blob, one

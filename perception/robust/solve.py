@@ -48,6 +48,8 @@ class Solution:
     log_range, log_range_sigma, log_range_common
         Range by flux and size together, its standard deviation, and the part of that which every measurement
         of the source shares (`Camera.log_range`), same shape.
+    log_range_hidden
+        Part of these that comes of the background hidden behind each, same shape.
     ranged
         Whether a range can be had there, same shape.
     image_radius_px
@@ -82,6 +84,7 @@ class Solution:
     log_range: Array
     log_range_sigma: Array
     log_range_common: Array
+    log_range_hidden: Array
     ranged: NDArray[np.bool_]
     image_radius_px: Array
     background_e: float
@@ -297,6 +300,7 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     slack = own[:, 3] if fits[0].layout.has_slack else None
     log_range, log_range_sigma, log_range_common = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
+    hidden = np.zeros(len(own))
     if unsure := camera.calibration.sigma.get("hidden_background", 0.0):
         background_e = np.maximum(np.concatenate([fit.background_e for fit in fits]), 0.0)
         behind_e = covered_px_at_1_m(own[:, :2], camera.calibration) * background_e
@@ -335,6 +339,7 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
                 log_range=log_range[these],
                 log_range_sigma=log_range_sigma[these],
                 log_range_common=log_range_common[these],
+                log_range_hidden=hidden[these],
                 ranged=ranged[these],
                 image_radius_px=radius_px,
                 background_e=background_e,
