@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from perception.model.bearing import bearing_body
-from perception.model.fog import loosened, may_be_in_fog, ranged_in_fog, size_alone
+from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
 from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
@@ -115,7 +115,7 @@ def _measured(
 def _in_fog(
     found: Sequence[tuple[Blob, MeasuredFlare]], frame: RawFrame, calibration: Calibration
 ) -> Iterator[tuple[Blob, MeasuredFlare]]:
-    """Yield flares that were fitted with any size, with ranges as fog allows; bounds stay as they are."""
+    """Yield flares that were fitted with any size, with ranges as fog allows; bounds are those of the flux."""
     u_px, v_px, flux_e, flux_sigma_e, both_m, both_sigma_m, doubt, doubt_common = np.array(
         [
             (
@@ -130,6 +130,7 @@ def _in_fog(
         by_flux_m = np.sqrt(at_1_m_dn / (flux_e * gain_dn_per_e(frame, calibration)))
     share_sigma = flux_sigma_e / flux_e
     known = np.isfinite(both_sigma_m) & np.isfinite(by_flux_m)
+    bound_m = range_in_fog_m(np.where(known, 1.0, by_flux_m), calibration.extinction_per_m)
     by_flux_m = np.where(known, by_flux_m / (1.0 + 0.375 * np.minimum(share_sigma, 1.0) ** 2), 1.0)
     both_m, both_sigma_m = np.where(known, both_m, 1.0), np.where(known, both_sigma_m, 1.0)
     size_m, size_sigma_m = size_alone(both_m, both_sigma_m, by_flux_m, share_sigma)
@@ -138,7 +139,7 @@ def _in_fog(
     ranges = ranges.doubted(slope * doubt, slope * doubt_common)
     for k, (blob, one) in enumerate(found):
         if not known[k]:
-            yield blob, one
+            yield blob, replace(one, range_m=float(bound_m[k]))
             continue
         yield (
             blob,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.fog import may_be_in_fog
 from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
@@ -173,7 +174,11 @@ def _measurement(
     if clips.any() and len(prepared.bad_at):
         clips &= ~prepared.bad[blob.box.slices]
     saturated = bool(clips.any())
-    bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
+    told_sigma = log_sigma
+    if may_be_in_fog(prepared.calibration):
+        # The range that this fit states is loosely tied to the flux, which tells it in fog.
+        told_sigma = math.hypot(0.5 * flux_sigma_e / flux_e, hidden / math.sqrt(3.0))
+    bound_only = saturated and not told_sigma < CLIPPED_RANGE_SIGMA
     return MeasuredFlare(
         u_px=u_px,
         v_px=v_px,
