@@ -115,7 +115,7 @@ def _measured(
 def _in_fog(
     found: Sequence[tuple[Blob, MeasuredFlare]], frame: RawFrame, calibration: Calibration
 ) -> Iterator[tuple[Blob, MeasuredFlare]]:
-    """Yield flares that were fitted with any size, with ranges as fog allows; bounds are those of the flux."""
+    """Yield flares that were fitted with any size, with ranges as fog allows; bounds by flux."""
     u_px, v_px, flux_e, flux_sigma_e, both_m, both_sigma_m, doubt, doubt_common = np.array(
         [
             (

@@ -6,6 +6,7 @@ source's image and within it: a fit that does not know of it takes a part for th
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,9 @@ from perception.types import Calibration, ForwardLight
 Array = NDArray[np.float64]
 
 _ROUNDS = 3
-_SETTLED = 1e-3  # of a flux
+_SETTLED = 0.2  # of a flux's σ
 _RING_SIGMAS, _STEP_SIGMAS = 0.5, 0.25
+_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
 def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> None:
@@ -45,7 +47,7 @@ def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> Non
             if now is None:
                 continue
             best[index] = now
-            if np.any(np.abs(np.log(now.flux_e / going[index].flux_e)) > _SETTLED):
+            if np.any(np.abs(now.flux_e - going[index].flux_e) > _SETTLED * now.flux_sigma_e):
                 moved[index] = now
         going = moved
         if not going:
@@ -89,13 +91,22 @@ def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array
     -------
     Shares and angles in rad, shape (n,) each; the first of both is 0.
     """
+    depths, rates, angle_rad = _rates(lights)
+    after = int(np.clip(np.searchsorted(depths, depth), 1, max(len(depths) - 1, 1)))
+    before, after = after - 1, min(after, len(depths) - 1)
+    apart = depths[after] - depths[before]
+    part = np.clip((depth - depths[before]) / apart, 0.0, 1.0) if apart > 0.0 else 0.0
+    return depth * (rates[before] + part * (rates[after] - rates[before])), angle_rad
+
+
+@lru_cache(maxsize=32)
+def _rates(lights: tuple[ForwardLight, ...]) -> tuple[Array, Array, Array]:
+    """Return tabulated depths, light within angles per depth, shape (depths, angles), and these angles."""
     angle_rad = np.unique(np.concatenate([[0.0], *(light.angle_rad for light in lights)]))
     rates = np.array(
         [np.interp(angle_rad, [0.0, *one.angle_rad], [0.0, *one.share]) / one.depth for one in lights]
     )
-    depths = [one.depth for one in lights]
-    rate = [np.interp(depth, depths, rates[:, k]) for k in range(len(angle_rad))]
-    return depth * np.array(rate), angle_rad
+    return np.array([one.depth for one in lights]), rates, angle_rad
 
 
 def halo_e(
@@ -124,14 +135,14 @@ def halo_e(
     """
     share, angle_rad = forward_share(calibration.forward_light, depth)
     rows, columns = np.mgrid[box.top : box.top + box.height, box.left : box.left + box.width]
-    places = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    middle = direction_camera(np.array([[u_px, v_px]]), calibration)[0]
-    direction = direction_camera(places, calibration)
-    px_per_rad = _pixel_sr(u_px, v_px, calibration) ** -0.5
+    own = np.array([[u_px, v_px]]) + _STEPS
+    places = np.concatenate([own, np.stack([columns.ravel(), rows.ravel()], axis=1)])
+    near, direction = np.split(direction_camera(places, calibration), [len(own)])
+    px_per_rad, middle = _pixel_sr(near) ** -0.5, near[0]
     chord = np.minimum(np.linalg.norm(direction - middle, axis=1), 2.0)
     # Beyond a fisheye's image circle pixels see no direction.
     seen = np.isfinite(chord)
-    image = np.zeros(len(places))
+    image = np.zeros(len(direction))
     if math.isfinite(px_per_rad) and seen.any():
         off_px = px_per_rad * 2.0 * np.arcsin(0.5 * chord[seen])
         sigma_px = np.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0 + 0.25 * image_radius_px**2)
@@ -140,14 +151,12 @@ def halo_e(
     return image.reshape(box.height, box.width)
 
 
-def _pixel_sr(u_px: float, v_px: float, calibration: Calibration) -> float:
-    """Return the area of a pixel in directions, from its neighbours' places; NaN where there is none."""
-    place = np.array([u_px, v_px])
-    steps = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    middle, right, below, left, above = direction_camera(place + steps, calibration)
+def _pixel_sr(near: Array) -> float:
+    """Return the area of a pixel in directions, of those at `_STEPS` from its place; NaN where none is."""
+    middle, right, below, left, above = near
     # Right at the edge of the image circle the neighbours on one side alone have directions.
-    aside = np.where(np.isfinite(right), right - middle, middle - left)
-    down = np.where(np.isfinite(below), below - middle, middle - above)
+    aside = right - middle if np.isfinite(right[0]) else middle - left
+    down = below - middle if np.isfinite(below[0]) else middle - above
     return float(np.linalg.norm(np.cross(aside, down)))
 
 
