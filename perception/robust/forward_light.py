@@ -157,7 +157,7 @@ def _pixel_sr(near: Array) -> float:
     # Right at the edge of the image circle the neighbours on one side alone have directions.
     aside = right - middle if np.isfinite(right[0]) else middle - left
     down = below - middle if np.isfinite(below[0]) else middle - above
-    return float(np.linalg.norm(np.cross(aside, down)))
+    return math.sqrt(max(float((aside @ aside) * (down @ down) - (aside @ down) ** 2), 0.0))
 
 
 def _blurred(share: Array, angle_px: Array, sigma_px: float, most_px: float) -> tuple[Array, Array]:
