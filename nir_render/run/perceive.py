@@ -39,7 +39,7 @@ from perception.messages.own import DecoderError
 from perception.rig.frame_sets import robot_of
 from perception.rig.overlap import finest, overlap_warnings
 from perception.robust.detect import detect_robust
-from perception.robust.reason import NO_FAULT
+from perception.robust.search.reason import NO_FAULT
 from perception.track.own import TrackerError
 from perception.types import FrameKey, Odometry
 

@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from nir_render.errors import InputError
 from nir_render.scattering.forward import scattered_forward
@@ -69,6 +70,11 @@ def forward_light(droplets: tuple[str, ...]) -> tuple[ForwardLight, ...]:
     """Return what fog of one of some droplets scatters forward: their mean, and what they differ by as σ.
 
     The σ is that of the light within half a degree, about what the window of a flare holds.
+
+    Raises
+    ------
+    InputError
+        No droplets of such a name are known.
     """
     tables = np.stack([_shares(name) for name in droplets])
     mean, spread = tables.mean(axis=0), tables.std(axis=0)
@@ -87,6 +93,9 @@ def forward_light(droplets: tuple[str, ...]) -> tuple[ForwardLight, ...]:
 @lru_cache(maxsize=32)
 def _shares(name: str) -> NDArray[np.float64]:
     """Return the forward light of a preset's droplets, shape (depths, angles)."""
-    optics = Droplets.model_validate(name).optics
+    try:
+        optics = Droplets.model_validate(name).optics
+    except ValidationError as error:
+        raise InputError(f"droplets {name!r}: {error.errors()[0]['msg']}") from error
     albedo = 1.0 - optics.absorbed_share
     return scattered_forward(ANGLE_RAD, optics.phase_per_sr, albedo, np.array(_ANGLES_RAD), np.array(_DEPTHS))

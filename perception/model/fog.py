@@ -28,6 +28,16 @@ class RangeInFog:
     range_sigma_m: Array
     range_sigma_common_m: Array
 
+    def doubted(self, log_sigma: Array, log_sigma_common: Array) -> "RangeInFog":
+        """Return the ranges, the σ of their logarithms wider by so much, whatever fog, flux and size say.
+
+        Of `log_sigma`, that of all measurements together is `log_sigma_common`.
+        """
+        sigma_m = np.hypot(self.range_sigma_m, self.range_m * log_sigma)
+        return RangeInFog(
+            self.range_m, sigma_m, np.hypot(self.range_sigma_common_m, self.range_m * log_sigma_common)
+        )
+
 
 def may_be_in_fog(calibration: Calibration) -> bool:
     """Tell whether a calibration knows of fog, or does not exclude it: an extinction that is not 0 ± 0."""

@@ -18,10 +18,9 @@ from perception.model.normal import NORMAL, REACH_SIGMAS, STEP
 
 Array = NDArray[np.float64]
 
-MOST_STEPS = 50
 SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
-LEAST_PIVOT = 1e-10
+MOST_STEPS, LEAST_PIVOT = 50, 1e-10
 LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
 
 _SQRT_HALF, _LOG_SQRT_2_PI = math.sqrt(0.5), 0.5 * math.log(2.0 * math.pi)

@@ -138,7 +138,13 @@ def corrected(
         size_m, size_sigma_m = np.array([[hit.range_by_size_m, hit.range_by_size_sigma_m] for hit in found]).T
         share = np.array([hit.flux_sigma_dn / hit.flux_dn for hit in found])
         usable = np.isfinite(by_flux_m) & np.isfinite([hit.range_sigma_m for hit in found])
-        ranges = ranged_in_fog(np.where(usable, by_flux_m, 1.0), share, size_m, size_sigma_m, known)
+        by_flux_m = np.where(usable, by_flux_m, 1.0)
+        before = ranged_in_fog(by_flux_m, share, size_m, size_sigma_m, calibration)
+        stated_m, common_m = np.array([[hit.range_sigma_m, hit.range_sigma_common_m] for hit in found]).T
+        ranges = ranged_in_fog(by_flux_m, share, size_m, size_sigma_m, known).doubted(
+            _beyond(stated_m, before.range_sigma_m, before.range_m, usable),
+            _beyond(common_m, before.range_sigma_common_m, before.range_m, usable),
+        )
         result.append(
             [
                 replace(
@@ -153,3 +159,11 @@ def corrected(
             ]
         )
     return result
+
+
+def _beyond(stated_m: Array, of_fog_m: Array, range_m: Array, usable: NDArray[np.bool_]) -> Array:
+    """Return what stated σ hold, relatively, beyond what comes of fog, flux and size: what sources hide."""
+    beyond2 = np.where(usable & np.isfinite(stated_m), stated_m**2 - of_fog_m**2, 0.0)
+    return np.asarray(
+        np.where(beyond2 > 1e-9 * of_fog_m**2, np.sqrt(np.maximum(beyond2, 0.0)), 0.0) / range_m
+    )

@@ -12,11 +12,11 @@ from perception.model.flare import PixelBox
 from perception.model.lens import stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
 from perception.model.sensor import clip_level_e
+from perception.robust.problem import Start, Window
 from perception.robust.search.blobs import Blob, near_groups
 from perception.robust.search.cutout import cut, light_of
 from perception.robust.search.frame import excess_at
 from perception.robust.search.prepare import MOST_STRUCTURED_PX, PreparedFrame
-from perception.robust.solve import Start, Window
 
 Array = NDArray[np.float64]
 

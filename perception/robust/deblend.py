@@ -13,7 +13,8 @@ import numpy as np
 
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR
-from perception.robust.solve import Problem, Solution, Start, solve
+from perception.robust.problem import Problem, Start
+from perception.robust.solve import Solution, solve
 
 MOST_FLARES = 8
 """So many flares one window is divided into at most."""

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from perception.model.bearing import bearing_body
-from perception.model.fog import loosened, may_be_in_fog, ranged_in_fog, size_alone
+from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
 from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
-from perception.robust.reason import reason_of_none
 from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.prepare import PreparedFrame, prepare
+from perception.robust.search.reason import reason_of_none
 from perception.types import Calibration, Detection, Detections, RawFrame
 
 CONTRAST_SIGMAS = 6.03
@@ -115,25 +115,31 @@ def _measured(
 def _in_fog(
     found: Sequence[tuple[Blob, MeasuredFlare]], frame: RawFrame, calibration: Calibration
 ) -> Iterator[tuple[Blob, MeasuredFlare]]:
-    """Yield flares that were fitted with any size, with ranges as fog allows; bounds stay as they are."""
-    u_px, v_px, flux_e, flux_sigma_e, both_m, both_sigma_m = np.array(
+    """Yield flares that were fitted with any size, with ranges as fog allows; bounds by flux."""
+    u_px, v_px, flux_e, flux_sigma_e, both_m, both_sigma_m, doubt, doubt_common = np.array(
         [
-            (one.u_px, one.v_px, one.flux_e, one.flux_sigma_e, one.range_m, one.range_sigma_m)
+            (
+                one.u_px, one.v_px, one.flux_e, one.flux_sigma_e, one.range_m, one.range_sigma_m,
+                one.log_range_doubt, one.log_range_doubt_common,
+            )
             for _, one in found
         ]
-    ).T
+    ).T  # fmt: skip
     at_1_m_dn = flux_at_one_metre_dn(u_px, v_px, frame.exposure_s, frame.gain, calibration)
     with np.errstate(invalid="ignore"):
         by_flux_m = np.sqrt(at_1_m_dn / (flux_e * gain_dn_per_e(frame, calibration)))
     share_sigma = flux_sigma_e / flux_e
     known = np.isfinite(both_sigma_m) & np.isfinite(by_flux_m)
+    bound_m = range_in_fog_m(np.where(known, 1.0, by_flux_m), calibration.extinction_per_m)
     by_flux_m = np.where(known, by_flux_m / (1.0 + 0.375 * np.minimum(share_sigma, 1.0) ** 2), 1.0)
     both_m, both_sigma_m = np.where(known, both_m, 1.0), np.where(known, both_sigma_m, 1.0)
     size_m, size_sigma_m = size_alone(both_m, both_sigma_m, by_flux_m, share_sigma)
     ranges = ranged_in_fog(by_flux_m, share_sigma, size_m, size_sigma_m, calibration)
+    slope = 1.0 / (1.0 + 0.5 * calibration.extinction_per_m * ranges.range_m)
+    ranges = ranges.doubted(slope * doubt, slope * doubt_common)
     for k, (blob, one) in enumerate(found):
         if not known[k]:
-            yield blob, one
+            yield blob, replace(one, range_m=float(bound_m[k]))
             continue
         yield (
             blob,

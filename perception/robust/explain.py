@@ -13,9 +13,10 @@ from perception.robust.deblend import asks_for_more, deblend, of_free_width
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
+from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.solve import Problem, Solution, solve
-from perception.robust.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
+from perception.robust.search.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
+from perception.robust.solve import Solution, solve
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 HALO_SEEMS_SIGMAS = 1.5
@@ -132,10 +133,15 @@ def _parted(
     tried = [(index, one) for index, one in enumerate(plain) if one is not None]
     more = deblend([one for _, one in tried], camera)
     cut_short.update(index for (index, _), several in zip(tried, more, strict=True) if several.may_be_more)
+    divided: list[Solution | None] = [
+        several if several.count > one.count else None for (_, one), several in zip(tried, more, strict=True)
+    ]
+    # What was divided had the halo of the flares that were there before.
+    fit_beside_forward_light(divided, camera)
     return {
         index: several
-        for (index, one), several in zip(tried, more, strict=True)
-        if several.count > one.count
+        for (index, _), several in zip(tried, divided, strict=True)
+        if several is not None
         and several.most_motion_px <= MOST_MOTION_PX
         and several.left_over.is_good
         and several.left_over.structure_e == 0.0

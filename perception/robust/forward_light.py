@@ -6,6 +6,7 @@ source's image and within it: a fit that does not know of it takes a part for th
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +16,16 @@ from perception.model.flare import PixelBox
 from perception.model.fog import extinction_sigma_per_m, forward_sigma, may_be_in_fog, range_in_fog_m
 from perception.model.layout import Structure
 from perception.model.window import Camera
-from perception.robust.solve import Solution, Window, solve
-from perception.robust.structure import joined
+from perception.robust.problem import Window
+from perception.robust.solve import Solution, solve
 from perception.types import Calibration, ForwardLight
 
 Array = NDArray[np.float64]
 
 _ROUNDS = 3
-_SETTLED = 1e-3  # of a flux
+_SETTLED = 0.2  # of a flux's σ
 _RING_SIGMAS, _STEP_SIGMAS = 0.5, 0.25
+_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
 def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> None:
@@ -36,28 +38,24 @@ def fit_beside_forward_light(best: list[Solution | None], camera: Camera) -> Non
     calibration = camera.calibration
     if not (calibration.forward_light and may_be_in_fog(calibration)):
         return
-    first = {index: one for index, one in enumerate(best) if one is not None and bool(one.ranged.all())}
-    going = dict(first)
+    going = {index: one for index, one in enumerate(best) if one is not None and bool(one.ranged.all())}
     for _ in range(_ROUNDS):
-        problems = [one.again(_with_halos(one, first[index], camera)) for index, one in going.items()]
+        problems = [one.again(_with_halos(one, camera)) for one in going.values()]
         again = dict(zip(going, solve(problems, camera), strict=True))
         moved = {}
         for index, now in again.items():
             if now is None:
                 continue
             best[index] = now
-            if np.any(np.abs(np.log(now.flux_e / going[index].flux_e)) > _SETTLED):
+            if np.any(np.abs(now.flux_e - going[index].flux_e) > _SETTLED * now.flux_sigma_e):
                 moved[index] = now
         going = moved
         if not going:
             return
 
 
-def _with_halos(solution: Solution, first: Solution, camera: Camera) -> Window:
-    """Return a solution's window with the halos of its flares as known light.
-
-    What is not known of their strength is structure of it, on what the first had.
-    """
+def _with_halos(solution: Solution, camera: Camera) -> Window:
+    """Return a solution's window with the halos of its flares, and those alone, as known light."""
     calibration, window = camera.calibration, solution.window
     ranges_m = range_in_fog_m(np.exp(solution.log_photometric_range), calibration.extinction_per_m)
     unsure_per_m = extinction_sigma_per_m(calibration)
@@ -72,11 +70,11 @@ def _with_halos(solution: Solution, first: Solution, camera: Camera) -> Window:
         )
         for k in range(solution.count)
     ]  # fmt: skip
-    halo, structure = np.sum(halos, axis=0), first.window.structure
+    halo, unsure = np.sum(halos, axis=0), None
     sigma = math.hypot(unsure_per_m / per_m, forward_sigma(calibration))
     if sigma > 0.0:
-        structure = joined(structure, Structure(halo.reshape(1, -1), np.array([[1.0 / sigma**2]])))
-    return replace(window, known_e=halo if known else None, structure=structure)
+        unsure = Structure(halo.reshape(1, -1), np.array([[1.0 / sigma**2]]))
+    return replace(window, known_e=halo if known else None, unsure=unsure)
 
 
 def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array, Array]:
@@ -93,13 +91,22 @@ def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array
     -------
     Shares and angles in rad, shape (n,) each; the first of both is 0.
     """
+    depths, rates, angle_rad = _rates(lights)
+    after = int(np.clip(np.searchsorted(depths, depth), 1, max(len(depths) - 1, 1)))
+    before, after = after - 1, min(after, len(depths) - 1)
+    apart = depths[after] - depths[before]
+    part = np.clip((depth - depths[before]) / apart, 0.0, 1.0) if apart > 0.0 else 0.0
+    return depth * (rates[before] + part * (rates[after] - rates[before])), angle_rad
+
+
+@lru_cache(maxsize=32)
+def _rates(lights: tuple[ForwardLight, ...]) -> tuple[Array, Array, Array]:
+    """Return tabulated depths, light within angles per depth, shape (depths, angles), and these angles."""
     angle_rad = np.unique(np.concatenate([[0.0], *(light.angle_rad for light in lights)]))
     rates = np.array(
         [np.interp(angle_rad, [0.0, *one.angle_rad], [0.0, *one.share]) / one.depth for one in lights]
     )
-    depths = [one.depth for one in lights]
-    rate = [np.interp(depth, depths, rates[:, k]) for k in range(len(angle_rad))]
-    return depth * np.array(rate), angle_rad
+    return np.array([one.depth for one in lights]), rates, angle_rad
 
 
 def halo_e(
@@ -128,21 +135,29 @@ def halo_e(
     """
     share, angle_rad = forward_share(calibration.forward_light, depth)
     rows, columns = np.mgrid[box.top : box.top + box.height, box.left : box.left + box.width]
-    places = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    middle = direction_camera(np.array([[u_px, v_px]]), calibration)[0]
-    direction = direction_camera(places, calibration)
-    # The area of a pixel in directions, from its neighbours' places.
-    aside, below = (
-        direction_camera(np.array([[u_px, v_px]]) + step, calibration)[0] - middle
-        for step in ((1.0, 0.0), (0.0, 1.0))
-    )
-    pixel_sr = float(np.linalg.norm(np.cross(aside, below)))
-    px_per_rad = pixel_sr**-0.5
-    off_px = px_per_rad * 2.0 * np.arcsin(0.5 * np.minimum(np.linalg.norm(direction - middle, axis=1), 2.0))
-    sigma_px = np.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0 + 0.25 * image_radius_px**2)
-    profile, at_px = _blurred(share, px_per_rad * angle_rad, float(sigma_px), float(off_px.max()))
-    image = flux_e * np.interp(off_px, at_px, profile)
-    return np.asarray(np.where(np.isnan(image), 0.0, image).reshape(box.height, box.width))
+    own = np.array([[u_px, v_px]]) + _STEPS
+    places = np.concatenate([own, np.stack([columns.ravel(), rows.ravel()], axis=1)])
+    near, direction = np.split(direction_camera(places, calibration), [len(own)])
+    px_per_rad, middle = _pixel_sr(near) ** -0.5, near[0]
+    chord = np.minimum(np.linalg.norm(direction - middle, axis=1), 2.0)
+    # Beyond a fisheye's image circle pixels see no direction.
+    seen = np.isfinite(chord)
+    image = np.zeros(len(direction))
+    if math.isfinite(px_per_rad) and seen.any():
+        off_px = px_per_rad * 2.0 * np.arcsin(0.5 * chord[seen])
+        sigma_px = np.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0 + 0.25 * image_radius_px**2)
+        profile, at_px = _blurred(share, px_per_rad * angle_rad, float(sigma_px), float(off_px.max()))
+        image[seen] = flux_e * np.interp(off_px, at_px, profile)
+    return image.reshape(box.height, box.width)
+
+
+def _pixel_sr(near: Array) -> float:
+    """Return the area of a pixel in directions, of those at `_STEPS` from its place; NaN where none is."""
+    middle, right, below, left, above = near
+    # Right at the edge of the image circle the neighbours on one side alone have directions.
+    aside = right - middle if np.isfinite(right[0]) else middle - left
+    down = below - middle if np.isfinite(below[0]) else middle - above
+    return math.sqrt(max(float((aside @ aside) * (down @ down) - (aside @ down) ** 2), 0.0))
 
 
 def _blurred(share: Array, angle_px: Array, sigma_px: float, most_px: float) -> tuple[Array, Array]:

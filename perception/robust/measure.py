@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.fog import may_be_in_fog
 from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
@@ -32,7 +33,11 @@ MOST_LEFT_ON_EDGES = 0.1
 
 @dataclass(frozen=True)
 class MeasuredFlare:
-    """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel."""
+    """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
+
+    `log_range_doubt` is the part of the relative σ of its range that comes of what sources hide, of each
+    other and of the background; `log_range_doubt_common` that of the background alone.
+    """
 
     u_px: float
     v_px: float
@@ -46,6 +51,8 @@ class MeasuredFlare:
     range_sigma_common_m: float = math.nan
     range_by_size_m: float = math.nan
     range_by_size_sigma_m: float = math.nan
+    log_range_doubt: float = 0.0
+    log_range_doubt_common: float = 0.0
     saturated: bool = False
     misfit: bool = False
     is_doubtful: bool = False
@@ -156,6 +163,7 @@ def _measurement(
     flux_sigma_e = float(solution.flux_sigma_e[index]) * widening
     hidden = _hidden_log_range(solution, index)
     log_sigma = math.hypot(float(solution.log_range_sigma[index]) * widening, hidden / math.sqrt(3.0))
+    of_background = float(solution.log_range_hidden[index])
     # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.
     range_m = math.nan
     if solution.ranged[index]:
@@ -166,7 +174,11 @@ def _measurement(
     if clips.any() and len(prepared.bad_at):
         clips &= ~prepared.bad[blob.box.slices]
     saturated = bool(clips.any())
-    bound_only = saturated and not log_sigma < CLIPPED_RANGE_SIGMA
+    told_sigma = log_sigma
+    if may_be_in_fog(prepared.calibration):
+        # The range that this fit states is loosely tied to the flux, which tells it in fog.
+        told_sigma = math.hypot(0.5 * flux_sigma_e / flux_e, hidden / math.sqrt(3.0))
+    bound_only = saturated and not told_sigma < CLIPPED_RANGE_SIGMA
     return MeasuredFlare(
         u_px=u_px,
         v_px=v_px,
@@ -178,6 +190,8 @@ def _measurement(
         range_m=range_m,
         range_sigma_m=math.nan if bound_only else range_m * log_sigma,
         range_sigma_common_m=math.nan if bound_only else range_m * float(solution.log_range_common[index]),
+        log_range_doubt=math.hypot(of_background * widening, hidden / math.sqrt(3.0)),
+        log_range_doubt_common=of_background,
         saturated=saturated,
         misfit=misfit,
         is_doubtful=solution.is_doubtful or hidden > log_sigma,

@@ -11,7 +11,8 @@ from perception.model.flare import PixelBox
 from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.deblend import asks_for_more
 from perception.robust.goodness import drawn_out
-from perception.robust.solve import Motion, Problem, Solution, solve
+from perception.robust.problem import Motion, Problem
+from perception.robust.solve import Solution, solve
 
 Array = NDArray[np.float64]
 

@@ -12,14 +12,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.flare import PixelBox
-from perception.model.layout import UNUSABLE, Sources, Structure, View, even
+from perception.model.layout import Sources, View
 from perception.model.pixels import maximise
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import MOTION_PX, Camera, lay_out
 from perception.model.window import motion_cost as cost_of_motion
 from perception.robust.goodness import LeftOver, left_over, residual_e
+from perception.robust.problem import Motion, Problem, Start, Window
 
 Array = NDArray[np.float64]
 
@@ -31,59 +31,6 @@ _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
 _PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
 _NEIGHBOURS = 20.0 * 50.0 / (1280.0 * 960.0)  # of twenty flares in a frame, how many lie in those 50 px²
-
-Start = tuple[float, float, float]
-"""First guess of (u_px, v_px, ln range) of a flare, its range as the flux alone says."""
-
-Motion = tuple[float, float]
-"""How far a flare moves along u and v during the exposure, in pixels; m and -m are the same."""
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """A square part of a frame to be explained by flares, in electrons.
-
-    Attributes
-    ----------
-    box
-        Where it is; it may reach beyond the frame.
-    image_e, state
-        Shape (height, width); the state of a pixel is one of `model.layout`'s.
-    floor_e2, clip_e, prnu
-        Variance of a dark pixel, electrons at which one clips, relative spread of the pixels' responses.
-    structure, structure_e
-        What may lie on the background beside flares, and its standard deviation; None and 0 where it is even.
-    on_edges
-        Whether that structure is not the frame's texture but something sharper, found in the window itself.
-    known_e
-        Light that is there beside flares and background, shape (height, width); None where there is none.
-    """
-
-    box: PixelBox
-    image_e: Array
-    state: NDArray[np.uint8]
-    floor_e2: float
-    clip_e: float
-    prnu: float
-    structure: Structure | None = None
-    structure_e: float = 0.0
-    on_edges: bool = False
-    known_e: Array | None = None
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """Which pixels count, clipped ones too."""
-        return np.not_equal(self.state, UNUSABLE)
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A window, first guesses of its flares, of its background, and of how each moves; None: none does."""
-
-    window: Window
-    starts: Sequence[Start]
-    background_e: float
-    motions: Sequence[Motion] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +48,8 @@ class Solution:
     log_range, log_range_sigma, log_range_common
         Range by flux and size together, its standard deviation, and the part of that which every measurement
         of the source shares (`Camera.log_range`), same shape.
+    log_range_hidden
+        Part of these that comes of the background hidden behind each, same shape.
     ranged
         Whether a range can be had there, same shape.
     image_radius_px
@@ -135,6 +84,7 @@ class Solution:
     log_range: Array
     log_range_sigma: Array
     log_range_common: Array
+    log_range_hidden: Array
     ranged: NDArray[np.bool_]
     image_radius_px: Array
     background_e: float
@@ -244,7 +194,7 @@ class _Fit:
     def __init__(self, problem: Problem, camera: Camera) -> None:
         window = problem.window
         self.window, self.known = window, camera.known(window.clip_e)
-        self.structure = even(window.image_e.size) if window.structure is None else window.structure
+        self.structure = window.beside
         self.layout = self.known.layout(len(problem.starts), len(self.structure.columns))
         self.values = np.zeros(self.layout.size)
         self.own[:, :3] = problem.starts
@@ -350,6 +300,7 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     slack = own[:, 3] if fits[0].layout.has_slack else None
     log_range, log_range_sigma, log_range_common = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
+    hidden = np.zeros(len(own))
     if unsure := camera.calibration.sigma.get("hidden_background", 0.0):
         background_e = np.maximum(np.concatenate([fit.background_e for fit in fits]), 0.0)
         behind_e = covered_px_at_1_m(own[:, :2], camera.calibration) * background_e
@@ -388,6 +339,7 @@ def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
                 log_range=log_range[these],
                 log_range_sigma=log_range_sigma[these],
                 log_range_common=log_range_common[these],
+                log_range_hidden=hidden[these],
                 ranged=ranged[these],
                 image_radius_px=radius_px,
                 background_e=background_e,

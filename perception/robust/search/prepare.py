@@ -28,7 +28,7 @@ from perception.robust.search.frame import (
     without,
 )
 from perception.robust.search.limit import limit_mesh_of, point_filter
-from perception.robust.structure import autocorrelation, structure_of
+from perception.robust.search.structure import autocorrelation, structure_of
 from perception.types import Calibration, RawFrame
 
 MOST_STRUCTURED_PX = 129

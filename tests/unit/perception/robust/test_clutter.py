@@ -10,7 +10,7 @@ import perception
 from perception.robust.search.frame import Pixels
 from perception.robust.search.limit import point_kernel
 from perception.robust.search.prepare import bad_pixels
-from perception.robust.structure import autocorrelation, structure_of
+from perception.robust.search.structure import autocorrelation, structure_of
 from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, frame_of, textured
 from tests.unit.perception.simulation import random
 

@@ -13,7 +13,8 @@ from perception.model.flare import PixelBox
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE
 from perception.model.sensor import clip_level_e, noise_floor_e2
 from perception.model.window import Camera
-from perception.robust.solve import Problem, Solution, Window, solve
+from perception.robust.problem import Problem, Window
+from perception.robust.solve import Solution, solve
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, random
 

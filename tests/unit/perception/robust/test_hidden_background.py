@@ -8,6 +8,7 @@ import pytest
 
 from perception import RawFrame, detect
 from perception.model.ranging import range_from_flux
+from perception.rig.extinction import Extinction, corrected
 from perception.types import Calibration
 from tests.unit.perception.simulation import calibration, expected_e
 
@@ -58,15 +59,22 @@ def test_what_a_white_source_sends_back_is_not_hidden() -> None:
     )
 
 
-def test_who_does_not_know_how_white_says_so() -> None:
-    """At ± 0.5 the ranges at 0 and 1 lie two σ apart, of one so far that its size says nothing."""
+@pytest.mark.parametrize("fog", [{}, {"extinction_per_m": 1e-6}])
+def test_who_does_not_know_how_white_says_so(fog: dict[str, float]) -> None:
+    """Also where there may be fog, of which σ is 1e-6 /m. At ± 0.5 the ranges at 0 and 1 lie two σ apart, of one so far that its size says nothing."""
     frame = _frame((600.3, 460.7, 8.0), 0.0)
-    plain, unsure = (replace(CAMERA, sigma=sigma) for sigma in ({}, {"hidden_background": 0.5}))
+    plain, unsure = (replace(CAMERA, sigma=sigma) for sigma in (fog, {**fog, "hidden_background": 0.5}))
     near, far = _range_m(frame, CAMERA), _range_m(frame, replace(CAMERA, hidden_background=0.0))
     (exact,), (told,) = detect(frame, plain), detect(frame, unsure)
     added_m = math.sqrt(told.range_sigma_m**2 - exact.range_sigma_m**2)
     assert added_m == pytest.approx(0.5 * (far - near), rel=0.05)
     assert told.range_sigma_common_m == pytest.approx(added_m, rel=0.01)
+    if fog:
+        # Fog that is found afterwards leaves it as it is.
+        found = Extinction(0.0, 1e-6)
+        ((again,),) = corrected([frame], [[told]], {"r1.front": unsure}, found)
+        assert again.range_sigma_m == pytest.approx(told.range_sigma_m, rel=1e-6)
+        assert again.range_sigma_common_m == pytest.approx(told.range_sigma_common_m, rel=1e-6)
 
 
 def test_by_aperture_likewise() -> None:
@@ -76,3 +84,15 @@ def test_by_aperture_likewise() -> None:
     flux_dn = (at_1_m_dn - hidden_dn) / 9.0
     found = range_from_flux(flux_dn, 0.0, 639.5, 479.5, EXPOSURE_S, 1.0, CAMERA, background_dn=100.0)
     assert found.range_m == pytest.approx(3.0, rel=1e-6)
+
+
+def test_sources_that_hide_each_other_are_as_unsure_in_fog() -> None:
+    """At 3 m and 5 m, 2.5 px apart: much of the farther one may be hidden. Claims in clear air and in hardly any fog."""
+    pair_e = expected_e(CAMERA, [(600.2, 460.1, 3.0), (602.7, 460.4, 5.0)], EXPOSURE_S, 5.0)
+    counts = np.rint(CAMERA.system_gain_dn_per_e * pair_e + CAMERA.black_level_dn).astype(np.uint16)
+    frame = RawFrame("r1.front", 0, 0.0, EXPOSURE_S, counts, 64.0)
+    known = replace(CAMERA, hidden_background=0.0, read_noise_e=10.0)
+    unsure = replace(known, extinction_per_m=1e-6, sigma={"extinction_per_m": 1e-6})
+    clear, foggy = (sorted(detect(frame, one), key=lambda hit: hit.u_px)[-1] for one in (known, unsure))
+    assert clear.range_sigma_m > 0.1
+    assert foggy.range_sigma_m == pytest.approx(clear.range_sigma_m, rel=0.1)

@@ -1,0 +1,75 @@
+"""What is to be fitted: a window, what may lie in it, and first guesses of its flares."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.flare import PixelBox
+from perception.model.layout import UNUSABLE, Structure, even
+from perception.robust.search.structure import joined
+
+Array = NDArray[np.float64]
+
+Start = tuple[float, float, float]
+"""First guess of (u_px, v_px, ln range) of a flare, its range as the flux alone says."""
+
+Motion = tuple[float, float]
+"""How far a flare moves along u and v during the exposure, in pixels; m and -m are the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A square part of a frame to be explained by flares, in electrons.
+
+    Attributes
+    ----------
+    box
+        Where it is; it may reach beyond the frame.
+    image_e, state
+        Shape (height, width); the state of a pixel is one of `model.layout`'s.
+    floor_e2, clip_e, prnu
+        Variance of a dark pixel, electrons at which one clips, relative spread of the pixels' responses.
+    structure, structure_e
+        What may lie on the background beside flares, and its standard deviation; None and 0 where it is even.
+    on_edges
+        Whether that structure is not the frame's texture but something sharper, found in the window itself.
+    known_e, unsure
+        Light that is there beside flares and background, shape (height, width); None where there is none. And
+        what is not known of it, which lies on top of any structure; None where nothing is.
+    """
+
+    box: PixelBox
+    image_e: Array
+    state: NDArray[np.uint8]
+    floor_e2: float
+    clip_e: float
+    prnu: float
+    structure: Structure | None = None
+    structure_e: float = 0.0
+    on_edges: bool = False
+    known_e: Array | None = None
+    unsure: Structure | None = None
+
+    @property
+    def beside(self) -> Structure:
+        """All that may lie beside flares and even background."""
+        if self.unsure is not None:
+            return joined(self.structure, self.unsure)
+        return even(self.image_e.size) if self.structure is None else self.structure
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Which pixels count, clipped ones too."""
+        return np.not_equal(self.state, UNUSABLE)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A window, first guesses of its flares, of its background, and of how each moves; None: none does."""
+
+    window: Window
+    starts: Sequence[Start]
+    background_e: float
+    motions: Sequence[Motion] | None = None
