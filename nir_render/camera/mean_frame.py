@@ -183,9 +183,11 @@ def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
     drive = np.array([drives.index(of_group) for of_group in of_groups], dtype=np.int64)
     windows = tuple(_windows(light, snapshot, camera))
     images = images_of(light, snapshot, drive, len(drives), windows)
-    parts = {f"the window of flare {number}": window.values for number, window in enumerate(windows)}
-    parts |= {} if images is None else {"the indirect light": images}
-    for what, part in parts.items():
+    parts: list[tuple[str, NDArray[np.floating]]] = [
+        (f"the window of flare {number}", window.values) for number, window in enumerate(windows)
+    ]
+    parts += [] if images is None else [("the indirect light", images)]
+    for what, part in parts:
         wrong = int((~np.isfinite(part)).sum())
         if wrong:
             raise InputError(

@@ -115,9 +115,9 @@ def test_a_recording_without_flares_is_told_why(recording: Path) -> None:
     (recording / "r1.left-0.png").write_bytes(encode_png16(FRAME.data_dn))
     assert perceive_run(recording, estimators=chosen, progress=lambda *_: None).warnings == ()
     hasty = chosen_estimators(["robust"], 1e-9)
-    said = perceive_run(recording, estimators=hasty, progress=lambda *_: None).warnings
-    assert "time was up before any flare was measured" in said[0]
-    assert said[-1].startswith("robust saw more in 2 frames than it measures")
+    warned = perceive_run(recording, estimators=hasty, progress=lambda *_: None).warnings
+    assert "time was up before any flare was measured" in warned[0]
+    assert warned[-1].startswith("robust saw more in 2 frames than it measures")
 
 
 def test_an_estimator_of_sets_gets_its_robot_s_odometry(recording: Path) -> None:
