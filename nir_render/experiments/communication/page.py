@@ -43,7 +43,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
     title = f"communication, {plan.level}, seed {slowest.seed}"
     shown = show_run(folder, slowest.seed, plan, title)
     html = render_page(
-        "experiments/communication/page.html",
+        "experiments/loop/page.html",
         title=f"communication: {plan.robots} robots, {plan.level}",
         subtitle=[counted(len(outcome.runs), "seed"), f"{plan.lasts_s:g} s each", outcome.scene],
         sentence=sentence(outcome),
@@ -51,6 +51,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
         why=_WHY,
         timetable=_timetable(outcome),
         shown=slowest.seed,
+        which="the slowest",
         files=shown,
         drawing=formation_plot(slowest),
         seeds=_seeds(outcome),

@@ -44,12 +44,14 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
     title = f"flocking, {plan.level}, law {plan.law}, seed {middle.seed}"
     shown = show_run(folder, middle.seed, plan, title)
     html = render_page(
-        "experiments/flocking/page.html",
+        "experiments/loop/page.html",
         title=f"flocking: law {plan.law}, {plan.level}",
         subtitle=[counted(len(outcome.runs), "seed"), f"{plan.lasts_s:g} s each", outcome.scene],
         sentence=sentence(outcome),
         beside=_beside(outcome),
+        timetable=None,
         shown=middle.seed,
+        which="in the middle of all",
         files=shown,
         drawing=flock_plot(middle, plan),
         seeds=_seeds(outcome),
