@@ -54,7 +54,9 @@ SAMPLING = {
     "glossy corridor": Sampling(8, 32, 32),
     "mirror room": Sampling(128, 32, 256),
     "occluders": Sampling(64, 48, 64),
-    "thin fog": Sampling(64, 48, 128),
+    # Mitsuba meets the lamp in the fog by chance alone: its tiles are skewed, and 48 batches may hold none of the
+    # bright ones (a tile 4.5 % darker than 144 others had it).
+    "thin fog": Sampling(64, 96, 128),
     "dense fog": Sampling(32, 64, 64),
 }
 
@@ -175,11 +177,7 @@ def test_the_sum_of_the_groups_is_mitsubas_frame(case: Case) -> None:
     assert aside.frame_drift < 0.005, aside
 
 
-def test_each_group_is_the_scene_with_that_group_alone(case: Case, request: pytest.FixtureRequest) -> None:
-    if request.node.callspec.id == "thin fog":
-        # Open: since paths that turn in fog meet lamps, one tile of one group is at p = 6e-6 (frame -0.07 %, of
-        # which 0.2 % would be seen). Whether that is a fault or the tail of its noise is not settled.
-        request.applymarker(pytest.mark.xfail(strict=False, reason="one tile in thin fog: not settled"))
+def test_each_group_is_the_scene_with_that_group_alone(case: Case) -> None:
     results = [_compare(case, case.ours[:, g], case.stock_groups[:, g]) for g in range(case.ours.shape[1])]
     assert all(comparison.same for both in results for comparison in both), results
 
