@@ -313,16 +313,25 @@ def test_planes_under_an_even_sky_are_as_bright_as_their_files_say() -> None:
 
 
 def test_a_deviation_is_counted_in_the_material_s_own_uncertainty() -> None:
-    """Concrete: 12 % of 0.349 each, at all wavelengths alike, kept from 0.2 to 0.5; of tape the coefficients."""
+    """Concrete: 12 % of 0.349 each, at all wavelengths alike, between 0.2 and 0.5 by tanh; tape by exp."""
     base = load_scene(SCENES / "one_source.yaml")
     wall = rectangle_document((9, 0, 0), (1, 1), (-1, 0, 0), "concrete")
-    for deviation, factor in ((1.0, 1.12), (-2.0, 0.76), (4.0, 0.5 / 0.349), (-5.0, 0.2 / 0.349)):
+    for deviation, at_940_nm in (
+        (0.1, 0.3531869),
+        (1, 0.3898382),
+        (-2, 0.2730742),
+        (4, 0.4703816),
+        (-5, 0.2169105),
+    ):
+        factor = at_940_nm / 0.349
         scene = base.with_({"shapes.wall": wall, "materials.concrete.deviation": deviation})
         for wavelength_nm in (500.0, 940.0):
             seen = scene.at(0.0).at_wavelength(1e-9 * wavelength_nm).materials["concrete"]
             expected = factor * _at(_written("concrete")["reflectance"], wavelength_nm)
-            assert seen.reflectance == pytest.approx(expected, rel=1e-9)  # type: ignore[union-attr]
+            assert seen.reflectance == pytest.approx(expected, rel=1e-6)  # type: ignore[union-attr]
     tape = base.with_({"shapes.wall": {**wall, "material": TAPE}, f"materials.{TAPE}.deviation": -1})
     seen = tape.at(0.0).materials[TAPE]
     assert isinstance(seen, Retroreflector)
-    np.testing.assert_allclose(seen.coefficients, 0.7 * np.array(_written(TAPE)["coefficients"]), rtol=1e-12)
+    np.testing.assert_allclose(
+        seen.coefficients, math.exp(-0.3) * np.array(_written(TAPE)["coefficients"]), rtol=1e-12
+    )

@@ -111,7 +111,8 @@ def test_every_field_of_a_manifest_is_explained(checkout: Path) -> None:
     }
     changes = ["clock.frames=1", "materials.white={type: diffuse, reflectance: 0.5}", f"shapes.wall={wall}"]
     sensor = "robots.r1.rig.cameras.front.sensor"
-    changes += [f"{sensor}.columns=160", f"{sensor}.rows=120", f"{sensor}.pixel_pitch=30 um"]
+    changes += [f"{sensor}.columns=40", f"{sensor}.rows=30", f"{sensor}.pixel_pitch=120 um"]
+    changes += ["render.indirect.samples=16"]
     changes += [f"{path}={value}" for path, value in ambient.items()]
     settings = [word for change in changes for word in ("--set", change)]
     done = nir_render("render", "scenes/one_source.yaml", "-o", "one", *settings, cwd=checkout)

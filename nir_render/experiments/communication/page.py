@@ -10,12 +10,11 @@ from nir_render.experiments.communication.loop import ORDER, PACKET_S, PAPERS_IN
 from nir_render.experiments.communication.outcome import Outcome, Run, off_by_timetable_m
 from nir_render.experiments.loop.controllers import COMMANDED_M
 from nir_render.experiments.loop.ending import LEVEL_RULE, base_rows, frame_rows, show_run, write_ending
+from nir_render.experiments.loop.plots import COLOURS, draw_distances, draw_ways
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.parts import Table, render_page
 from nir_render.report.style import FAINT, INK, MATPLOTLIB
 from nir_render.report.wording import counted, metres, share
-
-_COLOURS = ("#ffd166", "#5e9bff", "#2ec27e", "#f72585", "#b392f0", "#ff9f1c", "#4cc9f0")
 
 RULES = {
     "met": (
@@ -185,27 +184,14 @@ def _conditions(outcome: Outcome) -> Table:
 def formation_plot(run: Run) -> Drawing:
     """Draw the ways of all robots from above, and the distances of neighbours over time, with the words."""
     places_m, times_s = np.array(run.record["places_m"]), np.array(run.record["time_s"])
-    names = run.record["robots"]
     with mpl.rc_context(MATPLOTLIB):
         figure = sheet(5.4)
         above, apart = figure.subplots(1, 2, width_ratios=[1.0, 1.4])
-        for number, name in enumerate(names):
-            colour = _COLOURS[number % len(_COLOURS)]
-            above.plot(*places_m[:, number].T, color=colour, linewidth=1.0, label=name)
-            above.plot(*places_m[0, number], "o", color="none", markeredgecolor=colour, markersize=7)
-            above.plot(*places_m[-1, number], "*", color=colour, markersize=9)
-        above.set_aspect("equal")
-        above.set_xlabel("x in m")
-        above.set_ylabel("y in m")
-        above.legend(fontsize=8, loc="best")
-        for one in range(len(names)):
-            for other in range(one):
-                d_m = np.hypot(*(places_m[:, one] - places_m[:, other]).T)
-                near = d_m[0] < 1.35
-                apart.plot(times_s, d_m, color=_COLOURS[1] if near else FAINT, linewidth=0.9)
+        draw_ways(above, places_m, run.record["robots"], [-1], "*")
+        draw_distances(apart, times_s, places_m, lambda d_m: bool(d_m[0] < 1.35))
         for packet in run.record["sent"]:
             commands = packet["command"] in COMMANDED_M
-            colour = _COLOURS[0] if commands else FAINT
+            colour = COLOURS[0] if commands else FAINT
             apart.axvspan(packet["start_s"], packet["end_s"], color=colour, alpha=0.3, linewidth=0.0)
             if commands:
                 apart.text(packet["start_s"], 0.06, packet["command"], fontsize=8, color=INK)
@@ -218,7 +204,6 @@ def formation_plot(run: Run) -> Drawing:
                 )  # fmt: skip
         apart.set_xlim(0.0, times_s[-1])
         apart.set_xlabel("time in s; packets are shaded, dashes begin where the last has read")
-        apart.set_ylabel("distance of each pair in m; neighbours are blue")
         apart.set_ylim(0.0, None)
         return Drawing(svg_of(figure), "ways of the robots from above; distances of pairs over time")
 

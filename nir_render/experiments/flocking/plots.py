@@ -5,10 +5,10 @@ import numpy as np
 
 from nir_render.experiments.flocking.loop import Flocking, Run
 from nir_render.experiments.flocking.spacing import COUNTED_S, NEIGHBOURS
+from nir_render.experiments.loop.plots import draw_distances, draw_ways
 from nir_render.report.drawing import Drawing, sheet, svg_of
 from nir_render.report.style import FAINT, INK, MATPLOTLIB
 
-_COLOURS = ("#ffd166", "#5e9bff", "#2ec27e", "#f72585", "#b392f0", "#ff9f1c", "#4cc9f0", "#c8553d")
 _MARKS_EVERY_S = 30.0
 
 
@@ -28,24 +28,14 @@ def flock_plot(run: Run, plan: Flocking) -> Drawing:
                     ends = places_m[at, [one, other]]
                     if np.hypot(*(ends[0] - ends[1])) < NEIGHBOURS * plan.spacing_m:
                         above.plot(*ends.T, color=FAINT, linewidth=0.5, zorder=1)
-        for number, name in enumerate(names):
-            colour = _COLOURS[number % len(_COLOURS)]
-            above.plot(*places_m[:, number].T, color=colour, linewidth=1.0, label=name)
-            above.plot(*places_m[0, number], "o", color="none", markeredgecolor=colour, markersize=7)
-            above.plot(*places_m[marked[1:], number].T, "o", color=colour, markersize=5)
-        above.set_aspect("equal")
-        above.set_xlabel("x in m")
-        above.set_ylabel("y in m")
-        above.legend(fontsize=8, loc="best")
-        for one in range(len(names)):
-            for other in range(one):
-                d_m = np.hypot(*(places_m[:, one] - places_m[:, other]).T)
-                near = d_m[times_s > times_s[-1] - COUNTED_S].mean() < NEIGHBOURS * plan.spacing_m
-                apart.plot(times_s, d_m, color=_COLOURS[1] if near else FAINT, linewidth=0.9)
+        draw_ways(above, places_m, names, marked[1:], "o")
+        counted = times_s > times_s[-1] - COUNTED_S
+        draw_distances(
+            apart, times_s, places_m, lambda d_m: bool(d_m[counted].mean() < NEIGHBOURS * plan.spacing_m)
+        )
         apart.axhline(plan.spacing_m, color=INK, linewidth=0.9, linestyle="--")
         apart.axvline(times_s[-1] - COUNTED_S, color=FAINT, linewidth=0.8)
         apart.set_xlabel("time in s; what lies right of the line counts")
-        apart.set_ylabel("distance of each pair in m; neighbours are blue")
         apart.set_ylim(0.0, None)
         return Drawing(
             svg_of(figure), "ways of the robots from above, every 30 s a dot; distances of pairs over time"

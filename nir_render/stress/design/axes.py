@@ -261,11 +261,11 @@ class AxisDocument(Document):
             return self.axis(name)
         parts, by_ratio = self.count or _PARTS_SHOWN, self.spacing == "log"
         first, begin, end = self._ends()
-        edges = sorted(_between(begin, end, part / parts, by_ratio) for part in range(parts + 1))
+        edges = sorted(between(begin, end, part / parts, by_ratio) for part in range(parts + 1))
         pairs = list(itertools.pairwise(edges))
-        middles = tuple(_written(_between(low, high, 0.5, by_ratio), first.unit) for low, high in pairs)
+        middles = tuple(written_value(between(low, high, 0.5, by_ratio), first.unit) for low, high in pairs)
         shown = self.model_copy(update={"values": middles}).axis(name)
-        readings = [read_quantity(_written(edge, first.unit)) for edge in edges]
+        readings = [read_quantity(written_value(edge, first.unit)) for edge in edges]
         return replace(
             shown,
             labels=tuple(f"{low:.4g} to {high:.4g} {first.unit}".rstrip() for low, high in pairs),
@@ -296,20 +296,21 @@ class AxisDocument(Document):
         first, begin, end = self._ends()
         count = self.count or 2
         shares = [step / (count - 1) for step in range(count)]
-        rounded = [_between(begin, end, share, self.spacing == "log") for share in shares]
-        whole = all(isinstance(end, int) for end in (self.start, self.to)) and all(
-            number.is_integer() for number in rounded
-        )
-        return tuple(int(one) if whole and not first.unit else _written(one, first.unit) for one in rounded)
+        rounded = [between(begin, end, share, self.spacing == "log") for share in shares]
+        whole = isinstance(self.start, int) and isinstance(self.to, int)
+        if whole and all(one.is_integer() for one in rounded):
+            return tuple(int(one) for one in rounded)
+        return tuple(written_value(one, first.unit) for one in rounded)
 
 
-def _between(begin: float, end: float, share: float, log: bool) -> float:
+def between(begin: float, end: float, share: float, log: bool) -> float:
     """Return what lies at a share of the way; in twelve digits, as 0.1 + 2 · 0.1 is to be 0.3."""
     number = begin * (end / begin) ** share if log else begin + (end - begin) * share
     return float(f"{number:.12g}")
 
 
-def _written(number: float, unit: str) -> Any:
+def written_value(number: float, unit: str) -> str | float:
+    """Return a number as a scene file holds it, with its unit."""
     return f"{number:.12g} {unit}" if unit else number
 
 
@@ -327,7 +328,7 @@ def with_values(axis: Axis, added: Sequence[float]) -> Axis:
     values: list[Any] = [*axis.values]
     si = [*axis.values_si]
     for number in added:
-        value = f"{number:.12g} {axis.unit}" if axis.unit else round(number) if whole else number
+        value = round(number) if whole and not axis.unit else written_value(number, axis.unit)
         reading = read_quantity(value)
         assert reading is not None  # a number, and a unit that was read before
         values.append(value)

@@ -14,7 +14,7 @@ from scipy.stats import qmc
 from nir_render.randomness import generator
 from nir_render.scene.documents.base import Document
 from nir_render.scene.text.units import read_quantity
-from nir_render.stress.design.axes import Axis
+from nir_render.stress.design.axes import Axis, between, written_value
 
 _MOST_POINTS = 100_000
 
@@ -128,9 +128,8 @@ def _at_index(axis: Axis, index: int) -> Point:
 def _at_share(axis: Axis, share: float) -> Point:
     if axis.edges is None:
         return _at_index(axis, min(int(share * len(axis.labels)), len(axis.labels) - 1))
-    low, high = axis.edges[0], axis.edges[-1]
-    number = float(f"{low * (high / low) ** share if axis.log else low + (high - low) * share:.12g}")
-    value = f"{number:.12g} {axis.unit}" if axis.unit else number
+    number = between(axis.edges[0], axis.edges[-1], share, axis.log)
+    value = written_value(number, axis.unit)
     reading = read_quantity(value)
     assert reading is not None  # a number, and a unit that was read before
     label = f"{number:.6g} {axis.unit}".rstrip()

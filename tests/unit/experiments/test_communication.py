@@ -98,6 +98,7 @@ def test_the_limit_of_a_rate() -> None:
     assert (1.0 - rate) ** 200 + 200 * rate * (1.0 - rate) ** 199 == pytest.approx(0.05, rel=1e-6)
 
 
+@pytest.mark.usefixtures("short_film")
 def test_who_knows_the_truth_meets_every_command(tmp_path: Path) -> None:
     scene, plan = load_scene(ARENA), Communication(robots=5, level="truth")
     outcome = outcome_of(scene, plan, range(1), tmp_path, 1, lambda *_: None)

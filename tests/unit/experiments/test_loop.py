@@ -147,6 +147,7 @@ def test_robots_that_see_by_frames_know_where_the_others_are() -> None:
             assert min(np.hypot(*(neighbour.place_m - place_m)) for place_m in others_m) < 0.03
 
 
+@pytest.mark.usefixtures("short_film")
 def test_robust_robots_keep_their_spacing_and_the_paper_s_do_not(tmp_path: Path) -> None:
     """By truth: 1.00 m between neighbours, and 0.8 m by the law with the paper's figures."""
     scene = load_scene(ARENA)
