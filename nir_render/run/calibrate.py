@@ -16,6 +16,7 @@ from nir_render.run.perceive import unknown_camera
 from nir_render.run.render import Progress
 from nir_render.scene.load import load_scene
 from nir_render.simulation.calibration import range_constant
+from nir_render.simulation.flare_spread import flare_spread, share_found
 from nir_render.truth.sources import SourceTruth, parse_truth
 from perception import (
     CalibratedCamera,
@@ -190,9 +191,8 @@ def calibrate_run(folder: Path, progress: Progress) -> RunCalibration:
         for camera, of_camera in frames.items():
             result = calibrate_camera(of_camera, recording.calibrations[camera], progress)
             speaks = () if result.rail is None else tuple(faults(result.rail))
-            done[camera] = CameraCalibration(
-                recording.calibrations[camera], result, speaks, _true_constant(folder, camera, truth)
-            )
+            true_constant = _true_constant(folder, camera, truth, result.calibration.psf_sigma_px)
+            done[camera] = CameraCalibration(recording.calibrations[camera], result, speaks, true_constant)
         learned = {name: camera.result.calibration for name, camera in done.items()}
         known = {**recording.calibrations, **learned}
         rigs = _rigs(taken, recording.calibrations, known, progress)
@@ -348,8 +348,8 @@ def _true_ranges(folder: Path, truth: list[SourceTruth]) -> dict[tuple[str, int]
     return ranges_m
 
 
-def _true_constant(folder: Path, camera: str, truth: list[SourceTruth]) -> float | None:
-    """Return the constant that a rendered run's scene has; None for other recordings."""
+def _true_constant(folder: Path, camera: str, truth: list[SourceTruth], sigma_px: float) -> float | None:
+    """Return the constant that a rendered run's scene has for a Gaussian; None for other recordings."""
     seen = {f"{row.robot}.{row.source}" for row in truth if row.camera == camera}
     if len(seen) != 1 or not (folder / run_folder.SCENE).is_file():
         return None
@@ -360,7 +360,9 @@ def _true_constant(folder: Path, camera: str, truth: list[SourceTruth]) -> float
             f"{folder / run_folder.TRUTH}: speaks of a source {name!r} that scene.yaml does not have"
         )
     _, source = scene.sources()[name]
-    return range_constant(scene.camera(camera)[1], source)
+    device = scene.camera(camera)[1]
+    of_gaussian = share_found(device, source, sigma_px) / flare_spread(device, source).share
+    return range_constant(device, source) * of_gaussian
 
 
 def _numbers(held_out: HeldOut) -> Mapping[str, float | None]:

@@ -87,8 +87,8 @@ def flare_spread(camera: Camera, source: Source, progress: Progress | None = Non
     Where the point spread is no Gaussian and no earlier run has left the answer in the user's cache folder,
     it is measured, which takes seconds and calls `progress`.
     """
-    sigma_px, focus_m = core_of(camera).gaussian_px, camera.lens.focus_distance_m
-    if sigma_px is not None and focus_m is None and camera.point_spread.core_share == 1.0:
+    sigma_px = _gaussian_px(camera)
+    if sigma_px is not None:
         return FlareSpread(sigma_px, 1.0, 0.0)
     # Neither where they are mounted nor how they are driven matters: cameras of one make are measured once.
     mount = {"position_m": (0.0, 0.0, 0.0), "orientation": Orientation()}
@@ -96,6 +96,23 @@ def flare_spread(camera: Camera, source: Source, progress: Progress | None = Non
     bare_camera = camera.model_copy(update={**mount, **free, "shutter": GlobalShutter()})
     bare_source = source.model_copy(update={**mount, "pattern": None, "drive": FULL_DRIVE})
     return _measurement(bare_camera, bare_source).result(progress)
+
+
+def share_found(camera: Camera, source: Source, sigma_px: float) -> float:
+    """Return the share of a source's light that perception finds with another Gaussian than `flare_spread`'s.
+
+    Where the point spread is a Gaussian all of it is found, whatever small error that of perception has.
+    """
+    if _gaussian_px(camera) is not None:
+        return 1.0
+    return _law(_rail(camera, source), sigma_px, camera.point_spread.core_share).share
+
+
+def _gaussian_px(camera: Camera) -> float | None:
+    """Return the standard deviation of a point spread that is a Gaussian at all ranges, else None."""
+    if camera.lens.focus_distance_m is not None or camera.point_spread.core_share != 1.0:
+        return None
+    return core_of(camera).gaussian_px
 
 
 def source_beam(source: Source, unit: Response, direction: NDArray[np.float64], range_m: float) -> Beam:

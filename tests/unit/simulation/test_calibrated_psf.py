@@ -13,7 +13,7 @@ from nir_render.camera.optics.lens import aperture_area_m2, intrinsics_of
 from nir_render.camera.optics.response import response
 from nir_render.camera.sensor.read_out import quantise
 from nir_render.simulation.calibration import range_constant
-from nir_render.simulation.flare_spread import FlareSpread, flare_spread, source_beam
+from nir_render.simulation.flare_spread import FlareSpread, flare_spread, share_found, source_beam
 from perception import RawFrame, detect
 from tests.paths import SCENES
 
@@ -54,6 +54,17 @@ def test_ranges_are_right_within_what_is_claimed(name: str) -> None:
     assert abs(np.mean(errors)) < 0.005
     assert np.abs(errors).max() < 0.01
     assert max(claimed) < 0.02
+
+
+def test_a_narrower_gaussian_finds_less_of_the_glare() -> None:
+    """The share that is told holds for the Gaussian that is told; of a Gaussian all is found."""
+    scene = load_scene(SCENE, SPREADS["glare"])
+    camera, source = scene.camera("r1.front")[1], scene.sources()["r2.top"][1]
+    spread = flare_spread(camera, source)
+    assert share_found(camera, source, spread.sigma_px) == pytest.approx(spread.share, rel=1e-5)
+    narrow, wide = (share_found(camera, source, factor * spread.sigma_px) for factor in (0.97, 1.03))
+    assert narrow < spread.share < wide
+    assert share_found(load_scene(SCENE).camera("r1.front")[1], source, 0.71) == 1.0
 
 
 def test_a_gaussian_is_told_as_it_is() -> None:
