@@ -210,7 +210,7 @@ def _information(jacobian: Array, weight: Array, into: Array) -> None:
 
 
 @compiled
-def _slopes(
+def slopes(
     view: View, values: Array, expected: Array, jacobian: Array, variance: Array,
     precision: Array, clip_e: float, of_average: bool, gradient: Array, information: Array,
 ) -> None:  # fmt: skip
@@ -243,7 +243,7 @@ def _slopes(
 
 
 @compiled
-def _objective(
+def objective(
     view: View, values: Array, expected: Array, variance: Array, precision: Array, clip_e: float
 ) -> tuple[float, float]:
     """Return −2 ln L of an expectation with given variances, priors included, without Σ ln variance; that."""
@@ -351,7 +351,7 @@ def maximise(
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
     for _ in range(MOST_STEPS):
         if is_new:
-            _slopes(view, values, expected, jacobian, variance, precision, clip_e, False, gradient, fisher)
+            slopes(view, values, expected, jacobian, variance, precision, clip_e, False, gradient, fisher)
             log_det = inverted(fisher, inverse)
             if math.isnan(log_det):
                 return math.inf, math.inf
@@ -376,8 +376,8 @@ def maximise(
         is_new = False
         if _is_inside(trial, view, count, step):
             expectation(trial, view, sources, structure, known, new_expected, new_jacobian, new_variance)
-            before, _ = _objective(view, values, expected, variance, precision, clip_e)
-            after, _ = _objective(view, trial, new_expected, variance, precision, clip_e)
+            before, _ = objective(view, values, expected, variance, precision, clip_e)
+            after, _ = objective(view, trial, new_expected, variance, precision, clip_e)
             is_new = after <= before + 1e-9 * abs(before) + 1e-9
         if is_new:
             values[:], expected[:] = trial, new_expected
@@ -391,10 +391,10 @@ def maximise(
     else:
         return math.inf, math.inf
     if (view.state == CLIPPED).any():
-        _slopes(view, values, expected, jacobian, variance, precision, clip_e, True, gradient, fisher)
+        slopes(view, values, expected, jacobian, variance, precision, clip_e, True, gradient, fisher)
         log_det = inverted(fisher, inverse)
         if math.isnan(log_det):
             return math.inf, math.inf
     covariance[:] = inverse
-    chi2, logs = _objective(view, values, expected, variance, precision, clip_e)
+    chi2, logs = objective(view, values, expected, variance, precision, clip_e)
     return chi2 + logs, log_det

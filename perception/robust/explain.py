@@ -10,6 +10,7 @@ from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.deblend import asks_for_more, deblend, of_free_width
+from perception.robust.eclipse import eclipses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
@@ -22,6 +23,8 @@ from perception.robust.verdict import is_hardly_seen, is_one_pixel
 HALO_SEEMS_SIGMAS = 1.5
 HALO_GAIN = 10.0
 """2 Δ ln L that a halo must bring: noise gives χ² of three degrees of freedom, 10 twice in a hundred."""
+
+_ALIKE = 1.0  # in −2 ln of the evidence: discs that do not overlap add up to the same, but for rounding
 
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
@@ -60,6 +63,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
         parted = _parted(plain, prepared.shape, camera, cut_short)
+        for index, pair in eclipses(found, plain, parted, camera).items():
+            if _is_better(pair, parted.get(index)):
+                parted[index] = pair
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
         without = _without_spill(plain, prepared, camera)
         for index, line in moving(plain, camera).items():
@@ -81,14 +87,21 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     _retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
-        one = chosen[index]
-        if one is None or more.cost < one.cost:
+        if _is_better(more, chosen[index]):
             chosen[index] = more
     for index in cut_short:
         one = chosen[index]
         if one is not None and asks_for_more(one):
             chosen[index] = replace(one, may_be_more=True)
     return chosen
+
+
+def _is_better(pair: Solution, other: Solution | None) -> bool:
+    """Tell whether flares explain a window better; of as many that which also says what is hidden."""
+    if other is None:
+        return True
+    alike = _ALIKE if pair.count == other.count else 0.0
+    return pair.cost < other.cost + alike
 
 
 def _drop_beside_lines(

@@ -206,8 +206,10 @@ def _hidden_log_range(solution: Solution, index: int) -> float:
 
     What is fitted are whole discs, which shine through each other. Where they overlap so much of a source's
     light may lack, or be another's. And one that seems farther than another, within two radii of which it
-    lies, may be as near as that, most of it hidden behind it.
+    lies, may be as near as that, most of it hidden behind it. Eclipses are fitted as they are.
     """
+    if solution.is_eclipse:
+        return 0.0
     apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
     others_px = solution.image_radius_px
     if solution.motion_px is not None:

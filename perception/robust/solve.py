@@ -71,6 +71,9 @@ class Solution:
         Whether another number of flares explains the window nearly as well (`motion.weighed`).
     may_be_more
         Whether more flares were not looked for, as there are too many already (`deblend`).
+    is_eclipse
+        Whether what one hides of another is left out of λ, where fluxes are of whole sources, and nothing
+        else explains the window as well (`eclipse`).
     """
 
     window: Window
@@ -97,6 +100,7 @@ class Solution:
     motion_cost: float = 0.0
     is_doubtful: bool = False
     may_be_more: bool = False
+    is_eclipse: bool = False
 
     @property
     def cost(self) -> float:
@@ -173,7 +177,7 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     A solution for each, None where the fit did not converge.
     """
     moving = replace(camera, motion_px=MOTION_PX)
-    fits = [_Fit(problem, camera if problem.motions is None else moving) for problem in problems]
+    fits = [Fit(problem, camera if problem.motions is None else moving) for problem in problems]
     solved: dict[int, Solution] = {}
     for of_camera, moves in ((camera, False), (moving, True)):
         alike = [(index, fit) for index, fit in enumerate(fits) if fit.layout.moves == moves]
@@ -183,12 +187,12 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
                 break
             going = _climbed(going, of_camera)
         done = [(index, fit) for index, fit in alike if fit.converged]
-        found = _solutions([fit for _, fit in done], of_camera)
+        found = solutions_of([fit for _, fit in done], of_camera)
         solved.update((index, one) for (index, _), one in zip(done, found, strict=True))
     return [solved.get(index) for index in range(len(fits))]
 
 
-class _Fit:
+class Fit:
     """The fit of one window, on its way from first guesses."""
 
     def __init__(self, problem: Problem, camera: Camera) -> None:
@@ -205,7 +209,7 @@ class _Fit:
         self.expected_e = np.empty(window.image_e.shape)
         self.deviance = self.log_information = math.inf
         self.converged = False
-        self.log_flux_at_1_m = self.image_radius_px = np.empty(0)
+        self.log_flux_at_1_m, self.image_radius_px = (np.empty(self.layout.sources) for _ in range(2))
 
     @property
     def own(self) -> Array:
@@ -236,19 +240,19 @@ class _Fit:
             layout.most_step, self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
         self.converged = math.isfinite(self.deviance)
-        growth = np.exp(sources.log_range_at - _log_range_by_size(self.own, self))
+        growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
         self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
 
 
-def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
+def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
     hidden_px = _hidden_px_at_1_m(own, camera)
     background_e = np.concatenate([fit.background_e for fit in fits])
-    hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
+    hidden_e = hidden_e_at_1_m(own, background_e, camera)
     motion_px = _motion_px(own, fits[0])
     laid_px = None if motion_px is None else motion_px + _LINE_KEPT_PX
-    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], _log_range_by_size(own, fits[0]), hidden_e, laid_px)
+    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], log_range_by_size(own, fits[0]), hidden_e, laid_px)
     reach_px = laid.reach_px
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
@@ -256,7 +260,7 @@ def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
         if imaged[first:end].all():
             fit.climb(laid.part(first, end), reach_px[first:end])
     own = np.concatenate([fit.own for fit in fits])
-    change = laid.log_range_at - _log_range_by_size(own, fits[0])
+    change = laid.log_range_at - log_range_by_size(own, fits[0])
     moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
     if laid_px is not None and (motion_px := _motion_px(own, fits[0])) is not None:
         moved |= motion_px > laid_px
@@ -272,25 +276,31 @@ def _climbed(fits: Sequence[_Fit], camera: Camera) -> list[_Fit]:
     ]
 
 
+def hidden_e_at_1_m(own: Array, background_e: Array, camera: Camera) -> Array | None:
+    """Return how much of such backgrounds each source would take away from one metre; None if nothing."""
+    hidden_px = _hidden_px_at_1_m(own, camera)
+    return None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
+
+
 def _hidden_px_at_1_m(own: Array, camera: Camera) -> Array | None:
     """Return of how many pixels' background each source would take away from one metre; None if of none."""
     hiding = camera.calibration.hidden_background
     return hiding * covered_px_at_1_m(own[:, :2], camera.calibration) if hiding else None
 
 
-def _log_range_by_size(own: Array, fit: _Fit) -> Array:
+def log_range_by_size(own: Array, fit: Fit) -> Array:
     """Return the logarithm of the range that each source's size stands for."""
     return np.asarray(own[:, 2] - fit.known.tie_spread * own[:, 3]) if fit.layout.has_slack else own[:, 2]
 
 
-def _motion_px(own: Array, fit: _Fit) -> Array | None:
+def _motion_px(own: Array, fit: Fit) -> Array | None:
     """Return how far each source moves, None if none may."""
     if not fit.layout.moves:
         return None
     return np.asarray(np.hypot(own[:, fit.layout.motion], own[:, fit.layout.motion + 1]))
 
 
-def _solutions(fits: Sequence[_Fit], camera: Camera) -> list[Solution]:
+def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
     """Return what has been found, reckoned for all sources at once."""
     if not fits:
         return []

@@ -1,0 +1,344 @@
+"""Two resolved spheres, one partly behind the other: the nearer is whole, of the farther what stands out.
+
+Deblending adds discs up, which shine through each other; where two overlap neither is then where and as large
+as it seems. Here each quadrature node of the farther counts by how much of it stands out from behind the
+nearer, so that the expected image and its derivatives, by places and sizes of both, are of what is seen.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.bearing import pixel_turn
+from perception.model.flare import image_radius_px
+from perception.model.layout import Sources, View
+from perception.model.pixels import (
+    FIRST_DAMPING,
+    LEAST_DAMPING,
+    LOG_RANGE_BOUND,
+    MOST_DAMPING,
+    MOST_STEPS,
+    inverted,
+    objective,
+    slopes,
+    spread_nodes,
+)
+from perception.model.sensor import pixel_variance_e2
+from perception.model.window import Camera, lay_out
+from perception.robust.clusters import Cluster
+from perception.robust.deblend import asks_for_more
+from perception.robust.problem import Problem, Start
+from perception.robust.solve import Fit, Solution, hidden_e_at_1_m, log_range_by_size, solutions_of
+
+Array = NDArray[np.float64]
+
+LEAST_RADIUS_PX = 1.5
+"""Smaller images tell hardly anything of which of two hides the other."""
+
+_SMALLEST_PX = 0.5  # of the one behind
+_RAMP_PX = 0.4  # over which what is hidden begins: about as far as nodes lie apart
+_FINER = 2.0  # are the nodes of what is hidden in part
+_SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
+_TRIED = 2
+
+_RIVAL = 16.0
+"""Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
+
+_OTHER_SIGMAS = 3.0
+# In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
+_SETTLED = 0.02
+
+
+def eclipses(
+    found: Sequence[Cluster],
+    plain: Sequence[Solution | None],
+    parted: Mapping[int, Solution],
+    camera: Camera,
+) -> dict[int, Solution]:
+    """Explain windows by two resolved spheres, one partly behind the other.
+
+    Parameters
+    ----------
+    found
+        The clusters.
+    plain, parted
+        What explains each so far: a flare for each blob, None where nothing does; and, by index, more.
+    camera
+        The camera.
+
+    Returns
+    -------
+    By index what explains a window well; nothing where nothing does.
+    """
+    pairs = {}
+    for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
+        if cluster.is_in_crowd:
+            continue
+        guesses: list[list[Start]] = []
+        if one is None or (one.count == 1 and asks_for_more(one)):
+            guesses = _guesses(cluster, camera)
+        of_two = [each.starts for each in (one, parted.get(index)) if each is not None and _is_pair(each)]
+        fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
+        fits.sort(key=lambda fit: fit.objective)
+        fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
+        good: list[Solution] = []
+        for fit in fits:
+            pair = fit.solution() if len(good) < _TRIED else None
+            if pair is not None and _is_pair(pair):
+                good.append(pair)
+        if good:
+            likeliest = min(good, key=lambda pair: pair.cost)
+            pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
+    return pairs
+
+
+def _may_be_other(pair: Solution, camera: Camera) -> bool:
+    """Tell whether the farther may as well be nearer than it seems, and more of it hidden.
+
+    Tried with its outer edge held where it is seen, at the range of the nearer, and half way there.
+    """
+    near, far = int(np.argmax(pair.image_radius_px)), int(np.argmin(pair.image_radius_px))
+    (near_u, near_v, near_log), (far_u, far_v, far_log) = pair.starts[near], pair.starts[far]
+    apart_px = max(math.hypot(far_u - near_u, far_v - near_v), 1e-9)
+    for share in (0.5, 1.0):
+        log_range = far_log + share * (near_log - far_log)
+        inwards = float(pair.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
+        place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
+        starts: list[Start] = [(near_u, near_v, near_log), (*place, log_range)]
+        other = _Eclipse(Problem(pair.window, starts, pair.background_e), camera).solution()
+        if other is None or other.cost > pair.cost + _RIVAL:
+            continue
+        farthest = abs(other.log_range.max() - pair.log_range.max())
+        if farthest > _OTHER_SIGMAS * float(pair.log_range_sigma[far]):
+            return True
+    return False
+
+
+def _is_pair(several: Solution) -> bool:
+    """Tell whether they are two, well fitted, resolved, and one within two radii of the other."""
+    if several.count != 2 or not several.left_over.is_good:
+        return False
+    apart_px = math.hypot(several.u_px[0] - several.u_px[1], several.v_px[0] - several.v_px[1])
+    near_px, far_px = float(several.image_radius_px.max()), float(several.image_radius_px.min())
+    return near_px > LEAST_RADIUS_PX and far_px > _SMALLEST_PX and apart_px < 2.0 * near_px + far_px
+
+
+def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
+    """Return first guesses of two discs: at both ends of what is lit, the wider one at either."""
+    window = cluster.window
+    excess_e = np.where(window.usable, window.image_e - cluster.background_e, 0.0)
+    level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
+    rows, columns = np.nonzero(excess_e > 0.5 * level_e)
+    places = np.column_stack([columns, rows]).astype(np.float64)
+    middle = places.mean(axis=0)
+    _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
+    along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
+    near_px = 0.5 * (float(np.ptp(across)) + 1.0)
+    if near_px < LEAST_RADIUS_PX:
+        return []
+    corner = np.array([window.box.left, window.box.top], dtype=np.float64)
+    u_px, v_px = corner + middle
+    at_1_m_px = float(image_radius_px(u_px, v_px, math.asin(min(camera.radius_m, 1.0)), camera.calibration))
+    if not at_1_m_px > 0.0:
+        return []
+    guesses = []
+    for sign in (1.0, -1.0):
+        end_px, start_px = sign * float((sign * along).max()), sign * float((sign * along).min())
+        for size in _SIZES:
+            starts = []
+            for at_px, radius_px in (
+                (end_px - sign * (near_px - 0.5), near_px),
+                (start_px + sign * (size * near_px - 0.5), size * near_px),
+            ):
+                u, v = (corner + middle + at_px * axes[:, 1]).tolist()
+                starts.append((u, v, math.log(at_1_m_px / radius_px)))
+            guesses.append(starts)
+    return guesses
+
+
+class _Eclipse:
+    """The fit of two spheres to a window, on its way from first guesses."""
+
+    def __init__(self, problem: Problem, camera: Camera) -> None:
+        self._fit = fit = Fit(problem, camera)
+        self._camera = camera
+        box, window = fit.window.box, fit.window
+        self._known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
+        self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, self._known_e)
+        self._prior = fit.layout.prior(fit.structure, 0.0)
+        smooth_px2 = (camera.calibration.psf_sigma_px**2 + 1.0 / 12.0) / _FINER**2
+        sigma_px = math.sqrt(max(smooth_px2 - 1.0 / 12.0, 0.0))
+        self._finer = replace(camera, calibration=replace(camera.calibration, psf_sigma_px=sigma_px))
+        self._expected, self._jacobian = self._expectation(fit.values)
+        self.objective = self._objective(fit.values, self._expected)
+
+    def solution(self) -> Solution | None:
+        """Return what is likeliest; None where no maximum is reached."""
+        if not self._climb():
+            return None
+        return solutions_of([self._fit], self._camera)[0]
+
+    def _climb(self) -> bool:
+        """Go on to the greatest likelihood, as `pixels.maximise` does; tell whether it is reached."""
+        fit, clip_e = self._fit, self._fit.known.clip_e
+        size = fit.layout.size
+        gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
+        damped = np.empty((size, size))
+        damping, is_new = FIRST_DAMPING, True
+        for _ in range(MOST_STEPS):
+            if is_new:
+                variance = self._variance(self._expected)
+                slopes(
+                    self._view, fit.values, self._expected, self._jacobian, variance, self._prior, clip_e,
+                    False, gradient, fisher,
+                )  # fmt: skip
+                log_det = inverted(fisher, inverse)
+                if math.isnan(log_det):
+                    return False
+                if gradient @ inverse @ gradient < _SETTLED:
+                    break
+            np.copyto(damped, fisher)
+            np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))
+            if math.isnan(inverted(damped, damped)):
+                return False
+            trial = fit.values + np.clip(damped @ gradient, -fit.layout.most_step, fit.layout.most_step)
+            is_new = False
+            if self._is_inside(trial):
+                expected, jacobian = self._expectation(trial)
+                after = self._objective(trial, expected, variance)
+                is_new = after <= self._objective(fit.values, self._expected, variance) * (1.0 + 1e-9) + 1e-9
+            if is_new:
+                fit.values[:], self._expected, self._jacobian = trial, expected, jacobian
+                damping = max(0.1 * damping, LEAST_DAMPING)
+            else:
+                damping *= 10.0
+                if not damping < MOST_DAMPING:
+                    return False
+        else:
+            return False
+        variance = self._variance(self._expected)
+        slopes(
+            self._view, fit.values, self._expected, self._jacobian, variance, self._prior, clip_e,
+            True, gradient, fisher,
+        )  # fmt: skip
+        fit.log_information = inverted(fisher, fit.covariance)
+        fit.expected_e = self._expected.reshape(fit.window.image_e.shape)
+        fit.deviance = self._objective(fit.values, self._expected)
+        return math.isfinite(fit.log_information)
+
+    def _variance(self, expected: Array) -> Array:
+        window = self._fit.window
+        return np.asarray(pixel_variance_e2(expected, window.floor_e2, window.prnu))
+
+    def _objective(self, values: Array, expected: Array, variance: Array | None = None) -> float:
+        """Return −2 ln L but for a constant of the window; with given variances without their logarithms."""
+        own = self._variance(expected) if variance is None else variance
+        total, logs = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
+        return float(total + logs) if variance is None else float(total)
+
+    def _is_inside(self, values: Array) -> bool:
+        rows, columns = self._fit.window.image_e.shape
+        own = self._fit.layout.of_sources(values)
+        column, row = own[:, 0] - self._view.left, own[:, 1] - self._view.top
+        on_pixels = (column > -0.5) & (column < columns - 0.5) & (row > -0.5) & (row < rows - 0.5)
+        return bool((on_pixels & (abs(own[:, 2]) < LOG_RANGE_BOUND)).all())
+
+    def _expectation(self, values: Array) -> tuple[Array, Array]:
+        """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
+        fit, known, layout = self._fit, self._fit.known, self._fit.layout
+        own = layout.of_sources(values)
+        background_e = float(values[layout.background])
+        by_size = log_range_by_size(own, fit)
+        hidden_e = hidden_e_at_1_m(own, np.full(len(own), background_e), self._camera)
+        near = int(np.argmin(by_size))
+        far = 1 - near
+        jacobian = np.zeros((layout.size, fit.window.image_e.size))
+        jacobian[layout.background] = 1.0
+        jacobian[layout.background + 1 :] = fit.structure.columns
+        expected = (
+            background_e + self._known_e.ravel() + values[layout.background + 1 :] @ fit.structure.columns
+        )
+        sigma_px = known.psf_sigma_px
+        if layout.has_width:
+            sigma_px *= math.exp(known.width_spread * float(values[layout.width]))
+        step = layout.per_source
+        for source, camera in ((near, self._camera), (far, self._finer)):
+            these = slice(source, source + 1)
+            of_hidden = None if hidden_e is None else hidden_e[these]
+            laid, imaged = lay_out(camera, own[these, 0], own[these, 1], by_size[these], of_hidden)
+            fit.log_flux_at_1_m[source] = laid.log_flux_at_1_m[0]
+            fit.image_radius_px[source] = laid.reach_px[0]
+            flux = math.exp(float(laid.log_flux_at_1_m[0]) - 2.0 * float(own[source, 2]))
+            flux = flux if imaged[0] else math.nan  # nowhere to go on to
+            by_place, by_near = np.zeros((3, expected.size)), np.zeros((3, expected.size))
+            if source == far:
+                laid, by_place, by_near = self._behind(laid, own, near, sigma_px)
+            image = self._spread(laid, own[source], sigma_px)
+            grown = image[3] + by_place[2]
+            expected = expected + flux * image[0]
+            at, of_near = source * step, near * step
+            jacobian[at : at + 2] += flux * (image[1:3] + by_place[:2])
+            jacobian[at + 2] -= flux * (2.0 * image[0] + grown)
+            jacobian[of_near : of_near + 2] += flux * by_near[:2]
+            jacobian[of_near + 2] -= flux * by_near[2]
+            if layout.has_slack:
+                jacobian[at + 3] += known.tie_spread * flux * grown
+                jacobian[of_near + 3] += known.tie_spread * flux * by_near[2]
+            if layout.has_width:
+                jacobian[layout.width] += known.width_spread * flux * image[4]
+        return expected, jacobian
+
+    def _behind(self, laid: Sources, own: Array, near: int, sigma_px: float) -> tuple[Sources, Array, Array]:
+        """Return of the farther source what stands out, and how that changes.
+
+        The changes, shape (3, pixels) each, are those of its share of light in each pixel by its own column,
+        row and ln size, and by column, row and ln size of the nearer, for what is hidden alone.
+        """
+        camera, far = self._camera, 1 - near
+        offset = np.column_stack([laid.node_u_px, laid.node_v_px])
+        away_px = own[far, :2] + offset - own[near, :2]
+        turn = pixel_turn(own[near : near + 1, :2], camera.calibration)[0]
+        away = away_px @ turn
+        apart_rad = np.sqrt((away**2).sum(axis=1))
+        size = math.exp(-float(log_range_by_size(own[near : near + 1], self._fit)[0]))
+        radius_rad = math.asin(min(camera.radius_m * size, 1.0))
+        ramp_rad = _RAMP_PX * float(np.linalg.norm(turn, ord=2))
+        stands_out = 0.5 + (apart_rad - radius_rad) / ramp_rad
+        ramp = (stands_out > 0.0) & (stands_out < 1.0)
+        # By how much more of a node stands out as it moves away, by column and row.
+        slope = (away / (np.maximum(apart_rad, 1e-12) * ramp_rad)[:, None]) @ turn.T
+        weights = laid.weight * np.array(
+            [
+                slope[:, 0],
+                slope[:, 1],
+                (slope * offset).sum(axis=1),
+                np.full(len(slope), -radius_rad / ramp_rad),
+            ]
+        )
+        edge = _chosen(laid, ramp)
+        changes = np.stack(
+            [self._spread(edge._replace(weight=one[ramp]), own[far], sigma_px)[0] for one in weights]
+        )
+        seen = laid._replace(weight=laid.weight * np.clip(stands_out, 0.0, 1.0))
+        return seen, changes[:3], np.stack([-changes[0], -changes[1], changes[3]])
+
+    def _spread(self, laid: Sources, own: Array, sigma_px: float) -> Array:
+        """Return shares of light in each pixel, and derivatives, as `spread_nodes`; shape (5, pixels)."""
+        image = np.zeros((5, *self._fit.window.image_e.shape))
+        place = (float(own[0]) - self._view.left, float(own[1]) - self._view.top)
+        spread_nodes(laid, 0, place, 1.0, (0.0, 0.0), sigma_px, image)
+        return image.reshape(5, -1)
+
+
+def _chosen(laid: Sources, which: NDArray[np.bool_]) -> Sources:
+    """Return some of the nodes of a source."""
+    return laid._replace(
+        first_node=np.array([0, int(which.sum())]),
+        node_u_px=laid.node_u_px[which],
+        node_v_px=laid.node_v_px[which],
+        node_along=laid.node_along[which],
+        weight=laid.weight[which],
+    )
