@@ -9,8 +9,8 @@ import numpy as np
 from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
-from perception.robust.deblend import asks_for_more, deblend, of_free_width
-from perception.robust.eclipse import eclipses
+from perception.robust.overlap.deblend import asks_for_more, deblend, of_free_width
+from perception.robust.overlap.eclipse import eclipses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
@@ -64,7 +64,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
         parted = _parted(plain, prepared.shape, camera, cut_short)
         for index, pair in eclipses(found, plain, parted, camera).items():
-            if _is_better(pair, parted.get(index)):
+            if _explains_all(pair, prepared.shape) and _is_better(pair, parted.get(index)):
                 parted[index] = pair
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
         without = _without_spill(plain, prepared, camera)
@@ -154,12 +154,15 @@ def _parted(
     return {
         index: several
         for (index, _), several in zip(tried, divided, strict=True)
-        if several is not None
-        and several.most_motion_px <= MOST_MOTION_PX
-        and several.left_over.is_good
-        and several.left_over.structure_e == 0.0
-        and not any(is_hardly_seen(several, k, shape) for k in range(several.count))
+        if several is not None and several.most_motion_px <= MOST_MOTION_PX and _explains_all(several, shape)
     }
+
+
+def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:
+    """Tell whether several flares explain all that is seen, each of them seen itself."""
+    left = several.left_over
+    hardly_seen = (is_hardly_seen(several, k, shape) for k in range(several.count))
+    return left.is_good and left.structure_e == 0.0 and not any(hardly_seen)
 
 
 def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:

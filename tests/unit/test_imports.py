@@ -50,7 +50,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.command_estimator": (),
     "perception.estimators": (),
     "perception.paper": (),
-    "perception.robust": ("search",),
+    "perception.robust": ("overlap", "search"),
     "perception.files": (),
     "perception.causes": (),
     "perception.model": (),

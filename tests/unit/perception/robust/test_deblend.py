@@ -8,7 +8,7 @@ import pytest
 
 import perception
 from perception.model.flare import PixelBox, flare_image
-from perception.robust import deblend
+from perception.robust.overlap import deblend
 from perception.robust.search.blobs import Blob, divide, near_groups
 from tests.hard_frames import (
     BACKGROUND_E,

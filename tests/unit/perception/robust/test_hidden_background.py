@@ -87,8 +87,8 @@ def test_by_aperture_likewise() -> None:
 
 
 def test_sources_that_hide_each_other_are_as_unsure_in_fog() -> None:
-    """At 3 m and 5 m, 2.5 px apart: much of the farther one may be hidden. Claims in clear air and in hardly any fog."""
-    pair_e = expected_e(CAMERA, [(600.2, 460.1, 3.0), (602.7, 460.4, 5.0)], EXPOSURE_S, 5.0)
+    """At 4 m and 6.7 m, 1.9 px apart: too small to tell how much of the farther is hidden. In air and hardly any fog."""
+    pair_e = expected_e(CAMERA, [(600.2, 460.1, 4.0), (602.1, 460.4, 6.7)], EXPOSURE_S, 5.0)
     counts = np.rint(CAMERA.system_gain_dn_per_e * pair_e + CAMERA.black_level_dn).astype(np.uint16)
     frame = RawFrame("r1.front", 0, 0.0, EXPOSURE_S, counts, 64.0)
     known = replace(CAMERA, hidden_background=0.0, read_noise_e=10.0)

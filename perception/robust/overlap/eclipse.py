@@ -29,7 +29,7 @@ from perception.model.pixels import (
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.deblend import asks_for_more
+from perception.robust.overlap.deblend import asks_for_more
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Fit, Solution, hidden_e_at_1_m, log_range_by_size, solutions_of
 
@@ -130,6 +130,8 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     """Return first guesses of two discs: at both ends of what is lit, the wider one at either."""
     window = cluster.window
     excess_e = np.where(window.usable, window.image_e - cluster.background_e, 0.0)
+    if not excess_e.max() > 0.0:
+        return []
     level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
     rows, columns = np.nonzero(excess_e > 0.5 * level_e)
     places = np.column_stack([columns, rows]).astype(np.float64)
