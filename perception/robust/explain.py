@@ -9,11 +9,11 @@ import numpy as np
 from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
-from perception.robust.overlap.deblend import asks_for_more, deblend, of_free_width
-from perception.robust.overlap.eclipse import eclipses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
+from perception.robust.overlap.deblend import asks_for_more, deblend, of_free_width
+from perception.robust.overlap.eclipse import eclipses
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.search.structure import EDGES, halo_of, halo_widths_px, joined, structure_of

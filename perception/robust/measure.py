@@ -13,8 +13,8 @@ from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux
 from perception.robust.clusters import Candidate, Cluster, clusters, dilated
-from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size
 from perception.robust.explain import MOST_LEFT, best
+from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution

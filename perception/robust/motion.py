@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
 from perception.model.window import MOST_MOTION_PX, Camera
-from perception.robust.overlap.deblend import asks_for_more
 from perception.robust.goodness import drawn_out
+from perception.robust.overlap.deblend import asks_for_more
 from perception.robust.problem import Motion, Problem
 from perception.robust.solve import Solution, solve
 
