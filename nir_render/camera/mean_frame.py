@@ -185,7 +185,8 @@ def electron_rates(light: Light, snapshot: Snapshot, shared: Collection[int] = (
     camera = snapshot.camera(light.camera).camera
     of_groups = [_drive_of_rates(emitter) for emitter in group_emitters(light, snapshot)]
     drives = tuple(dict.fromkeys(of_groups))
-    drive = np.array([drives.index(of_group) for of_group in of_groups], dtype=np.int64)
+    number = {of_drive: index for index, of_drive in enumerate(drives)}
+    drive = np.array([number[of_group] for of_group in of_groups], dtype=np.int64)
     windows = tuple(_windows(light, snapshot, camera))
     image, mixed = images_shared(drive, group_fluxes(light, snapshot), shared)
     images = images_of(light, snapshot, image, len(drives) if mixed is None else len(mixed), windows)
@@ -308,7 +309,7 @@ def _drawn_out(rates: Rates, exposure_s: float, time_s: float) -> dict[int, Wind
         if not chosen.weight_s.any():
             continue
         path = path_of(snapshot, light.camera, group, table, row, chosen.offset_s)
-        beam = _beam(light, snapshot, camera, row)
+        beam = _beam(light, snapshot, camera, row, group_fluxes(light, snapshot))
         seen = None if beam.seen is None else table.seen[row]
         windows = [
             beam_window(camera, moved_beam(beam, direction, float(distance_m), seen), 1.0)
@@ -329,23 +330,23 @@ def _drive_of_rates(emitter: Emitter) -> Drive:
 
 def _windows(light: Light, snapshot: Snapshot, camera: Camera) -> list[Window]:
     """Return the electrons per second of each row of the direct table."""
-    rows = range(len(light.direct.group))
-    return [beam_window(camera, _beam(light, snapshot, camera, row), 1.0) for row in rows]
+    rows, flux = range(len(light.direct.group)), group_fluxes(light, snapshot)
+    return [beam_window(camera, _beam(light, snapshot, camera, row, flux), 1.0) for row in rows]
 
 
-def _beam(light: Light, snapshot: Snapshot, camera: Camera, row: int) -> Beam:
+def _beam(light: Light, snapshot: Snapshot, camera: Camera, row: int, flux: NDArray[np.float64]) -> Beam:
     """Return the beam of a row of the direct table, fully lit where its drive is not constant."""
     table, group = light.direct, light.direct.group[row]
     direction, angular_radius_rad = table.direction[row], float(table.angular_radius_rad[row])
     seen = None
     if 0.0 < table.visible_fraction[row] < 1.0:
         seen = sunflower(direction, angular_radius_rad, table.visibility_rays)[table.seen[row]]
-    emitter = group_emitters(light, snapshot)[group]
+    emitter = snapshot.emitters[light.groups[group]]
     irradiance_per_unit, response = row_response(camera, light, row, emitter)
     return Beam(
         direction=direction,
         angular_radius_rad=angular_radius_rad,
-        irradiance_w_per_m2=irradiance_per_unit * float(group_fluxes(light, snapshot)[group]),
+        irradiance_w_per_m2=irradiance_per_unit * float(flux[group]),
         response=response,
         seen=seen,
         distance_m=float(table.distance_m[row]),

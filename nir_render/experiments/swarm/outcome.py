@@ -134,7 +134,7 @@ def name_of(plan: Swarm) -> str:
 def conditions_of(
     plan: Swarm, densities_per_m2: Sequence[float] = (), bodies: str | None = None
 ) -> list[Swarm]:
-    """Return a plan for each kind of bodies and each density; both kinds at 0.5, 1 and 2 per m² where none are said."""
+    """Return a plan for each kind of bodies and each density; both, at 0.5, 1 and 2 per m², by default."""
     return [
         replace(plan, bodies=of_bodies, density_per_m2=density)
         for of_bodies in ([str(bodies)] if bodies else BODIES)

@@ -30,17 +30,17 @@ RULES = {
         "and merged too, and of those that stand free."
     ),
     "ranges": (
-        "of robots that stand free and are lit all through the exposure, held against the Cramér–Rao bound of "
-        "these very frames, flares that overlap told apart: 1 is as good as can be. σ is what the detector "
-        "claims."
+        "of robots that stand free and are lit all through the exposure, held against the Cramér–Rao bound "
+        "of these very frames, flares that overlap told apart: 1 is as good as can be. σ is what the "
+        "detector claims."
     ),
     "packets": (
         "sent in full while the observer looked; received if the track of that robot says the word. A word "
         "that another one sent just then is misattributed, one that nobody sent is wrong."
     ),
     "identity": (
-        "each says its number once a minute: one word up to 128 robots, beyond that two, one after the other. "
-        "Who says only one of two, or what is nobody's, is refused."
+        "each says its number once a minute: one word up to 128 robots, beyond that two, one after the "
+        "other. Who says only one of two, or what is nobody's, is refused."
     ),
     "masts, columns": (
         "masts: hulls end below all lines of sight, and sources merge. columns: hulls of 0.1 m reach up to "
@@ -92,9 +92,9 @@ def sentence(outcome: Outcome) -> str:
         )
     )  # fmt: skip
     return (
-        f"Of {lit} sights of lit robots {_part(found, lit)} were found; {_part(free, lit)} stood free, and of "
-        f"these {_part(free_found, free)} were found. {received} of {packets} packets received; who it is was "
-        f"told of {right} of {full}, wrongly {counted(bad, 'time')}."
+        f"Of {lit} sights of lit robots {_part(found, lit)} were found; {_part(free, lit)} stood free, and "
+        f"of these {_part(free_found, free)} were found. {received} of {packets} packets received; who it is "
+        f"was told of {right} of {full}, wrongly {counted(bad, 'time')}."
     )
 
 
