@@ -135,12 +135,13 @@ def experiment(
         Law, typer.Option("--law", help="Flocking: how robots steer, robust or as the paper says.")
     ] = Law.ROBUST,
     level: Annotated[
-        Level,
+        Level | None,
         typer.Option(
             "--level",
-            help="What they see by: frames (hours), measurements drawn at their bound (minutes), or truth.",
+            help="What they see by: frames (hours), measurements drawn at their bound (minutes), or truth; "
+            "by default frames for swarm, else measurements.",
         ),
-    ] = Level.MEASUREMENTS,
+    ] = None,
     stack: Annotated[
         Law, typer.Option("--stack", help="With frames: the perception stack, robust or paper.")
     ] = Law.ROBUST,
@@ -207,7 +208,8 @@ def experiment(
     if name is Experiment.COMMUNICATION and not 3 <= (robots or 3) <= 7:
         raise InputError(f"--robots {robots}: communication wants 3 to 7, the leader among them")
     folder = output if output is not None else Path("outputs") / name.value
-    every = _kept_every(keep_frames, level)
+    by = level or (Level.FRAMES if name is Experiment.SWARM else Level.MEASUREMENTS)
+    every = _kept_every(keep_frames, by)
     arenas = {Experiment.CALIBRATION: RAIL, Experiment.DIFFUSER: TURNTABLE, Experiment.SWARM: HALL}
     arena = arenas.get(name, ARENA)
     seeds = seeds or (1 if name is Experiment.SWARM else 20)
@@ -217,11 +219,13 @@ def experiment(
     elif name is Experiment.DIFFUSER:
         said, page, record = _diffuser(world, seeds, folder, workers)
     elif name is Experiment.SWARM:
-        wanted = (robots or 30, tuple(density or ()), bodies)
+        if by is Level.TRUTH:
+            raise InputError("--level truth: a swarm is seen by frames or by measurements")
+        wanted = (robots or 30, tuple(density or ()), bodies, by)
         said, page, record = _swarm(world, wanted, seconds or 60.0, seeds, folder, workers)
     elif name is Experiment.FLOCKING:
         flocking = Flocking(
-            law=law.value, level=level.value, stack=stack.value, lasts_s=seconds or 120.0, keep_frames=every
+            law=law.value, level=by.value, stack=stack.value, lasts_s=seconds or 120.0, keep_frames=every
         )
         said, page, record = _flocking(world, flocking, seeds, folder, workers)
     else:
@@ -281,7 +285,7 @@ def _diffuser(
 
 def _swarm(
     world: "Scene",
-    wanted: tuple[int, tuple[float, ...], Bodies | None],
+    wanted: tuple[int, tuple[float, ...], Bodies | None, Level],
     seconds: float,
     seeds: int,
     folder: Path,
@@ -294,12 +298,12 @@ def _swarm(
     from nir_render.experiments.swarm.page import sentence, write_outcome
     from nir_render.transport.backend.cores import usual_workers
 
-    robots, densities, bodies = wanted
+    robots, densities, bodies, level = wanted
     if robots > MOST:
         raise InputError(f"--robots {robots}: two words tell {MOST} apart")
     if any(not (math.isfinite(one) and 0.01 <= one <= 4.0) for one in densities):
         raise InputError("--density: wanted 0.01 to 4 robots per m²; they stand 0.3 m apart at least")
-    plans = conditions_of(Swarm(robots=robots, lasts_s=seconds), densities, bodies)
+    plans = conditions_of(Swarm(level=level.value, robots=robots, lasts_s=seconds), densities, bodies)
     with progress_bar("swarm") as progress:
         outcome = outcome_of(world, plans, range(seeds), folder, workers or usual_workers(), progress)
     return sentence(outcome), write_outcome(outcome, folder), outcome.record()

@@ -12,21 +12,26 @@ from nir_render.camera.mean_frame import MeanFrame, Rates, electron_rates, expos
 from nir_render.camera.shared_light import SharedLight, shared_light
 from nir_render.camera.timing.exposure_control import own_setting
 from nir_render.camera.timing.shutter import mid_exposure_s
+from nir_render.evaluate.match import MIN_VISIBLE_FRACTION
 from nir_render.experiments.loop.journal import Told
+from nir_render.experiments.loop.measurement_sight import MeasurementSight
 from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of
 from nir_render.experiments.swarm.identity import MOST, number_of, words_of
 from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights
 from nir_render.randomness import RandomKey
 from nir_render.scene.scene import Scene
+from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import frame_of
 from nir_render.simulation.lamps import lamp_truth
 from nir_render.simulation.sent import sent_packets
 from nir_render.simulation.truth import truth_of
+from nir_render.truth.lamps import Outline
 from perception import (
     Calibration,
     Detection,
     Message,
+    Odometry,
     Pipeline,
     RawFrame,
     Track,
@@ -50,6 +55,9 @@ class Swarm:
 
     Attributes
     ----------
+    level
+        `frames`: rendered, exposed, and read by the whole stack. `measurements`: detections drawn about the
+        truth (`MeasurementSight`) of whom bodies do not hide; what is found of single frames is not judged.
     robots, density_per_m2
         How many stand in the hall, the observer among them, and how densely.
     bodies
@@ -60,6 +68,7 @@ class Swarm:
         In how many sets, evenly over the run, each robot is held against truth.
     """
 
+    level: str = "frames"
     robots: int = 30
     density_per_m2: float = 1.0
     bodies: str = "masts"
@@ -74,8 +83,10 @@ class Swarm:
 
     @property
     def judged(self) -> tuple[int, ...]:
-        """The numbers of the sets that are judged."""
+        """The numbers of the sets that are judged: none without frames."""
         count = min(self.judged_sets, self.steps)
+        if self.level != "frames":
+            return ()
         return tuple(sorted({int((number + 0.5) * self.steps / count) for number in range(count)}))
 
     def loop(self, scene: Scene, seed: int) -> "SwarmLoop":
@@ -96,6 +107,7 @@ class SwarmLoop:
         cameras = self._scene.document.cameras_of(OBSERVER)
         self._known = {name: calibration(self._scene, name) for name in cameras}
         self._pipeline = Pipeline.of("robust", self._known)
+        self._sight: MeasurementSight | None = None
         self._rates: dict[str, Rates] = {}
         self._followed: dict[int, str | None] = {}
         self._done = 0
@@ -126,9 +138,14 @@ class SwarmLoop:
     def step(self) -> Told:
         """Take a set of frames, read it, and hold it against truth where its turn is."""
         clock = _Clock()
-        if not self._rates:
+        if not self._rates and (self.plan.level == "frames" or not self._standing):
             self._render()
             clock.lap("render")
+        if not self._standing:
+            self._standing = [one.record() for one in self._lit()]
+            clock.lap("ceiling")
+        if self.plan.level != "frames":
+            return self._measured(clock)
         time_s = self._done / self.plan.rate_hz
         means, frames = {}, []
         for name, rates in self._rates.items():
@@ -157,6 +174,33 @@ class SwarmLoop:
         }
         return Told(lines, frames if last else [])
 
+    def _measured(self, clock: "_Clock") -> Told:
+        """Draw the detections of a set, and read them."""
+        if self._sight is None:
+            self._sight = MeasurementSight(self._scene, OBSERVER, self.seed, hidden=self._hidden())
+            self._rates = {}
+        seen = self._sight.look(_Standing(self._world, self._done / self.plan.rate_hz))
+        words = seen.messages
+        if self._done + 1 == self.steps:
+            words += self._sight.finish()
+        clock.lap("follow")
+        self._hear(words, seen.tracks)
+        self._done += 1
+        lines = {
+            "messages.robust.jsonl": [message_record(word) for word in words],
+            "seconds.jsonl": [{"set": self._done - 1, **clock.laps_s}],
+        }
+        return Told(lines)
+
+    def _hidden(self) -> dict[str, list[str]]:
+        """Return by camera the sources of which less than half is seen."""
+        found: dict[str, list[str]] = {}
+        for name, rates in self._rates.items():
+            table, groups = rates.light.direct, rates.light.groups
+            rows = np.flatnonzero((table.facet < 0) & (table.visible_fraction < MIN_VISIBLE_FRACTION))
+            found[name] = [groups[table.group[row]] for row in rows]
+        return found
+
     def record(self) -> dict[str, Any]:
         """Return a run that is done as plain data: what could be seen, what was, and what was heard."""
         sent = [packet for packet in sent_packets(self._scene) if packet.end_s <= self.plan.lasts_s]
@@ -181,9 +225,13 @@ class SwarmLoop:
         }
 
     def _render(self) -> None:
-        """Render the light of every camera; what is kept of it is what exposing needs."""
-        from nir_render.transport.render import render
+        """Render the light of every camera, without frames direct light alone; keep what exposing needs."""
+        from nir_render.transport.render import direct_lights, render
 
+        if self.plan.level != "frames":
+            lights = direct_lights(self._world, list(self._known), self.seed)
+            self._rates = {name: electron_rates(light, self._world) for name, light in lights.items()}
+            return
         for name in self._known:
             light = render(self._world, name, self.seed)
             exposure_s = own_setting(self._world.camera(name).camera, 0).exposure_s
@@ -214,16 +262,18 @@ class SwarmLoop:
         seen, alarms = sights(self._others, rows, hits, lamps_px, self._known)
         self._sights.append([one.record() for one in seen])
         self._alarms += alarms
-        if not self._standing:
-            self._standing = [one.record() for one in self._lit(by_camera, lamps_px)]
 
-    def _lit(self, frames: dict[str, RawFrame], lamps_px: dict[str, Any]) -> list[Sight]:
+    def _lit(self) -> list[Sight]:
         """Return each robot as it could be seen were all lit at once: the ceiling of what is heard."""
         rows = {}
         for name, rates in self._rates.items():
-            lit = fully_lit_frame(rates, frames[name].exposure_s)
-            rows[name] = [replace(row, on_fraction=1.0) for row in truth_of(lit, frames[name])]
+            setting = own_setting(rates.camera, 0)
+            lit = fully_lit_frame(rates, setting.exposure_s)
+            key = RandomKey(self.seed, "read_out", name, 0)
+            frame = frame_of(lit.electrons, rates.camera, setting, 0.0, key)
+            rows[name] = [replace(row, on_fraction=1.0) for row in truth_of(lit, frame)]
         none: dict[str, list[Detection]] = {name: [] for name in rows}
+        lamps_px: dict[str, list[Outline]] = {name: [] for name in rows}
         return sights(self._others, rows, none, lamps_px, self._known)[0]
 
     def _identities(self) -> dict[str, Any]:
@@ -262,6 +312,22 @@ def _nearest(track: Track, others_m: Array, names: Sequence[str]) -> str | None:
     chi2 = np.einsum("ni,ij,nj->n", off_m, np.linalg.inv(covariance), off_m)
     best = int(np.argmin(chi2))
     return names[best] if chi2[best] < _GATE_CHI2 else None
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """A world in which nobody moves, at a time."""
+
+    world: Snapshot
+    time_s: float
+
+    def snapshot(self) -> Snapshot:
+        """Return the world, which is always the same."""
+        return self.world
+
+    def odometry(self, _: str) -> list[Odometry]:
+        """Return none: who knows nothing of its way stands still."""
+        return []
 
 
 class _Clock:

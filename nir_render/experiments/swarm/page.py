@@ -66,7 +66,12 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
     html = render_page(
         "experiments/swarm/page.html",
         title=f"swarm: {outcome.robots} robots",
-        subtitle=[counted(len(outcome.seeds), "seed"), f"{shown.plan.lasts_s:g} s each", outcome.scene],
+        subtitle=[
+            counted(len(outcome.seeds), "seed"),
+            f"{shown.plan.lasts_s:g} s each",
+            shown.plan.level,
+            outcome.scene,
+        ],
         sentence=sentence(outcome),
         seen=_seen(figures),
         ranges=_ranges(figures),
@@ -157,8 +162,9 @@ def _took(outcome: Outcome, figures: dict[str, Any]) -> Table:
         took = one["seconds"]
         parts = [took[name] for name in ("expose", "detect", "follow")]
         each = "–"
-        if all(part is not None for part in parts):
-            each = f"{1e6 * sum(parts) / (4 * outcome.robots):.0f} µs"
+        known = [part for part in parts if part is not None]
+        if len(known) == len(parts):
+            each = f"{1e6 * sum(known) / (4 * outcome.robots):.0f} µs"
         rows.append(
             (*_where(one), _seconds(took["light_of_a_set"]), *(_seconds(part) for part in parts), each,
              share(one["shared_light_worst"], more=1), share(one["shared_light_mean"], more=1))
