@@ -203,8 +203,9 @@ def experiment(
     from nir_render.experiments.standing.turntable import TURNTABLE
     from nir_render.experiments.swarm.hall import HALL
 
-    if seconds is not None and not (math.isfinite(seconds) and seconds >= 1.0):
-        raise InputError(f"--seconds {seconds:g}: wanted a second or more, such as 120")
+    least_s = 0.1 if name is Experiment.SWARM else 1.0
+    if seconds is not None and not (math.isfinite(seconds) and seconds >= least_s):
+        raise InputError(f"--seconds {seconds:g}: wanted {least_s:g} s or more, such as 60")
     if name is Experiment.COMMUNICATION and not 3 <= (robots or 3) <= 7:
         raise InputError(f"--robots {robots}: communication wants 3 to 7, the leader among them")
     folder = output if output is not None else Path("outputs") / name.value
@@ -231,7 +232,7 @@ def experiment(
     else:
         communication = Communication(
             robots=robots or 3,
-            level=level.value,
+            level=by.value,
             stack=stack.value,
             lasts_s=seconds or 65.0,
             keep_frames=every,

@@ -146,14 +146,14 @@ def outcome_of(
     scene: Scene, plans: Sequence[Swarm], seeds: Sequence[int], folder: Path, workers: int, progress: Progress
 ) -> Outcome:
     """Run every condition for each seed; errors as `run_seeds`."""
-    found = []
-    for number, plan in enumerate(plans):
-        there = folder / name_of(plan)
-        before = number * len(seeds)
-        records = run_seeds(
-            scene, plan, seeds, there, workers,
-            lambda done, _, before=before: progress(before + done, len(plans) * len(seeds)),
-        )  # fmt: skip
+    found: list[Condition] = []
+    for plan in plans:
+        there, before = folder / name_of(plan), len(found) * len(seeds)
+
+        def tell(done: int, _: int, before: int = before) -> None:
+            progress(before + done, len(plans) * len(seeds))
+
+        records = run_seeds(scene, plan, seeds, there, workers, tell)
         seconds = [row for seed in seeds for row in read_lines(run_folder(there, seed) / SECONDS)]
         found.append(Condition(plan, records, seconds))
     return Outcome(plans[0].robots, scene.document.name, list(seeds), found)

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from nir_render.experiments.loop.ending import write_ending
-from nir_render.experiments.standing.rail_outcome import lower_limit
+from nir_render.experiments.loop.shares import lower_limit
 from nir_render.experiments.swarm.hall import BODIES
 from nir_render.experiments.swarm.judge import WHYS
 from nir_render.experiments.swarm.outcome import Condition, Outcome
@@ -242,7 +242,7 @@ def above_plot(condition: Condition) -> Drawing:
         for why in WHYS:
             some = [number for number, one in enumerate(record["standing"], 1) if one[1] == why]
             if some:
-                look = {"color": _COLOURS[why], "markersize": size, "linestyle": "none"}
+                look: dict[str, Any] = {"color": _COLOURS[why], "markersize": size, "linestyle": "none"}
                 axes.plot(*places_m[some].T, "o", **look, label=f"{why}: {len(some)}")
         for names, marker, label in ((heard, "+", "a packet received"), (right, "s", "identity told")):
             some = [number for number, one in enumerate(record["standing"], 1) if one[0] in names]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from nir_render import load_scene
+from nir_render.experiments.loop.shares import lower_limit
 from nir_render.experiments.standing.rail_outcome import (
     figures,
     held_out,
     ideal_mae_m,
-    lower_limit,
 )
 from nir_render.experiments.standing.turntable import TURNTABLE, Turntable
 from nir_render.experiments.standing.turntable_page import outcome_of as turned
