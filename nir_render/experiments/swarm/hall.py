@@ -31,8 +31,8 @@ _HEIGHT_M = 3.0
 _HULLS: dict[str, dict[str, Any]] = {
     # Below all lines of sight: cameras look from 0.2 m, sources shine from 0.28 m.
     "masts": {"type": "cylinder", "start": "[0, 0, 0.005] m", "end": "[0, 0, 0.15] m", "radius": "0.1 m"},
-    # Up to the source's foot, and thinner than the ring of cameras.
-    "columns": {"type": "cylinder", "start": "[0, 0, 0.005] m", "end": "[0, 0, 0.268] m", "radius": "0.05 m"},
+    # As high as leaves its own source free for who is 0.3 m away, and thinner than the ring of cameras.
+    "columns": {"type": "cylinder", "start": "[0, 0, 0.005] m", "end": "[0, 0, 0.255] m", "radius": "0.05 m"},
 }
 
 

@@ -1,5 +1,6 @@
 """One robot of a swarm that stands looks around: its light is rendered once, and exposed set by set."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,7 +19,10 @@ from nir_render.experiments.loop.measurement_sight import MeasurementSight
 from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of
 from nir_render.experiments.swarm.identity import MOST, number_of, words_of
 from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights
+from nir_render.experiments.swarm.views import TRACKS
 from nir_render.randomness import RandomKey
+from nir_render.run.folder import POSES, SENT
+from nir_render.scene.pose import Pose
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.calibration import calibration
@@ -27,6 +31,7 @@ from nir_render.simulation.lamps import lamp_truth
 from nir_render.simulation.sent import sent_packets
 from nir_render.simulation.truth import truth_of
 from nir_render.truth.lamps import Outline
+from nir_render.truth.poses import PoseTruth
 from perception import (
     Calibration,
     Detection,
@@ -37,9 +42,13 @@ from perception import (
     Track,
     detect_frames,
     message_record,
+    track_record,
 )
 
 Array = NDArray[np.float64]
+
+SECONDS = "seconds.jsonl"
+"""How long each part of each set took, in a run's folder."""
 
 OFF = 0.01
 """Of a block's temporal variance: by so much may light that many share be off in the mean square."""
@@ -168,10 +177,9 @@ class SwarmLoop:
             self._judge(means, frames, found)
             clock.lap("judge")
         self._done += 1
-        lines = {
-            "messages.robust.jsonl": [message_record(word) for word in words],
-            "seconds.jsonl": [{"set": self._done - 1, **clock.laps_s}],
-        }
+        lines = self._lines(words, clock)
+        if last:
+            lines[TRACKS] = [track_record(track) for track in heard.tracks]
         return Told(lines, frames if last else [])
 
     def _measured(self, clock: "_Clock") -> Told:
@@ -186,11 +194,19 @@ class SwarmLoop:
         clock.lap("follow")
         self._hear(words, seen.tracks)
         self._done += 1
-        lines = {
+        return Told(self._lines(words, clock))
+
+    def _lines(self, words: Sequence[Message], clock: "_Clock") -> dict[str, Any]:
+        """Return the lines of a set that is done: with the first one where all stand, and what they send."""
+        lines: dict[str, Any] = {
             "messages.robust.jsonl": [message_record(word) for word in words],
-            "seconds.jsonl": [{"set": self._done - 1, **clock.laps_s}],
+            SECONDS: [{"set": self._done - 1, **clock.laps_s}],
         }
-        return Told(lines)
+        if self._done == 1:
+            poses = {name: robot.pose for name, robot in self._world.robots.items()}
+            lines[POSES] = [_standing(name, pose) for name, pose in poses.items()]
+            lines[SENT] = [packet.record() for packet in sent_packets(self._scene)]
+        return lines
 
     def _hidden(self) -> dict[str, list[str]]:
         """Return by camera the sources of which less than half is seen."""
@@ -303,6 +319,14 @@ class SwarmLoop:
                 else:
                     wrong += 1
         return {"right": sorted(right), "wrong": wrong}
+
+
+def _standing(robot: str, pose: Pose) -> dict[str, Any]:
+    """Return the line of `poses.jsonl` of a robot that stands, upright."""
+    x, y, z = map(float, pose.position_m)
+    half_rad = 0.5 * math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
+    turned = (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
+    return PoseTruth(robot, 0.0, (x, y, z), turned, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)).record()
 
 
 def _nearest(track: Track, others_m: Array, names: Sequence[str]) -> str | None:

@@ -13,14 +13,13 @@ from nir_render.experiments.loop.runs import Progress, run_folder, run_seeds
 from nir_render.experiments.swarm.hall import BODIES
 from nir_render.experiments.swarm.identity import words_of
 from nir_render.experiments.swarm.judge import WHYS
-from nir_render.experiments.swarm.loop import Swarm
+from nir_render.experiments.swarm.loop import SECONDS, Swarm
 from nir_render.run.folder import read_lines
 from nir_render.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
 DENSITIES_PER_M2 = (0.5, 1.0, 2.0)
-SECONDS = "seconds.jsonl"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +10,20 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
-from nir_render.experiments.loop.ending import write_ending
+from nir_render.experiments.loop.ending import BAG, write_ending
+from nir_render.experiments.loop.runs import run_folder
 from nir_render.experiments.loop.shares import lower_limit
 from nir_render.experiments.swarm.hall import BODIES
 from nir_render.experiments.swarm.judge import WHYS
 from nir_render.experiments.swarm.outcome import Condition, Outcome
+from nir_render.experiments.swarm.views import views_of
+from nir_render.export.mcap_file import export_mcap
 from nir_render.report.drawing import Drawing, legend, sheet, svg_of
 from nir_render.report.parts import Table, render_page
+from nir_render.report.pictures import png_uri
 from nir_render.report.style import FAINT, INK, MATPLOTLIB
 from nir_render.report.wording import counted, metres, share
+from nir_render.run.folder import POSES
 
 RULES = {
     "ceiling": (
@@ -43,8 +49,8 @@ RULES = {
         "other. Who says only one of two, or what is nobody's, is refused."
     ),
     "masts, columns": (
-        "masts: hulls end below all lines of sight, and sources merge. columns: hulls of 0.1 m reach up to "
-        "the source, and hide those behind."
+        "masts: hulls end below all lines of sight, and sources merge. columns: hulls of 0.1 m reach up "
+        "to 2.5 cm below the source, and hide those behind, in part or whole."
     ),
     "light": (
         "direct light is each robot's own, in closed form. Indirect light of the faintest shares one image, "
@@ -63,6 +69,12 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
         if len(outcome.conditions) > 1
         else outcome.conditions[0]
     )
+    run = run_folder(folder / shown.name, shown.records[0]["seed"])
+    views = views_of(run)
+    bag = None
+    if find_spec("mcap") is not None and (run / POSES).is_file():
+        bag = BAG
+        export_mcap(run, folder / BAG)
     html = render_page(
         "experiments/swarm/page.html",
         title=f"swarm: {outcome.robots} robots",
@@ -79,6 +91,8 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
         took=_took(outcome, figures),
         against=density_plot(figures),
         above=above_plot(shown),
+        views=None if views is None else png_uri(views),
+        bag=bag,
         shown=f"{shown.plan.bodies}, {shown.plan.density_per_m2:g} per m², seed {shown.records[0]['seed']}",
         conditions=_conditions(outcome),
         rules=RULES,
@@ -96,10 +110,15 @@ def sentence(outcome: Outcome) -> str:
             "told_in_full", "identities_wrong",
         )
     )  # fmt: skip
+    seen = ""
+    if lit:
+        seen = (
+            f"Of {lit} sights of lit robots {_part(found, lit)} were found; {_part(free, lit)} stood free, "
+            f"and of these {_part(free_found, free)} were found. "
+        )
     return (
-        f"Of {lit} sights of lit robots {_part(found, lit)} were found; {_part(free, lit)} stood free, and "
-        f"of these {_part(free_found, free)} were found. {received} of {packets} packets received; who it is "
-        f"was told of {right} of {full}, wrongly {counted(bad, 'time')}."
+        f"{seen}{received} of {packets} packets received; who it is was told of {right} of {full}, "
+        f"wrongly {counted(bad, 'time')}."
     )
 
 
@@ -202,14 +221,12 @@ def density_plot(figures: dict[str, Any]) -> Drawing:
             if not some:
                 continue
             at = [one["density_per_m2"] for one in some]
-            _line(recall, at, [one["found"] / max(one["lit"], 1) for one in some], colour, bodies)
-            recall.plot(
-                at, [one["free"] / max(one["lit"], 1) for one in some], "--", color=colour, linewidth=0.9
-            )
-            _line(ranges, at, [one["range"]["of_limit"] or np.nan for one in some], colour, bodies)
-            _line(
-                heard, at, [one["packets_received"] / max(one["packets"], 1) for one in some], colour, bodies
-            )
+            _line(recall, at, [_ratio(one["found"], one["lit"]) for one in some], colour, bodies)
+            ceiling = [_ratio(one["free"], one["lit"]) for one in some]
+            recall.plot(at, ceiling, "--", color=colour, linewidth=0.9)
+            _line(ranges, at, [one["range"]["of_limit"] or math.nan for one in some], colour, bodies)
+            received = [_ratio(one["packets_received"], one["packets"]) for one in some]
+            _line(heard, at, received, colour, bodies)
             free = [one["could_be_seen"]["free"] for one in some]
             heard.plot(at, free, "--", color=colour, linewidth=0.9)
         recall.set_ylabel("found, of lit robots; dashes: stand free")
@@ -221,6 +238,7 @@ def density_plot(figures: dict[str, Any]) -> Drawing:
         ranges.set_ylim(0.0, None)
         for axes in (recall, ranges, heard):
             axes.set_xlabel("robots per m²")
+            axes.set_xlim(0.0, 1.1 * max(one["density_per_m2"] for one in figures["conditions"]))
             legend(axes)
         return Drawing(svg_of(figure), "recall, ranges and packets against density")
 
@@ -273,6 +291,10 @@ def _seconds(value: float | None) -> str:
 
 def _metres(value: float | None) -> str:
     return "–" if value is None else metres(value)
+
+
+def _ratio(number: int, of: int) -> float:
+    return number / of if of else math.nan
 
 
 def _part(number: int, of: int) -> str:
