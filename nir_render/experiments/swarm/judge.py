@@ -14,12 +14,13 @@ from nir_render.truth.sent import SentTruth
 from nir_render.truth.sources import SourceTruth
 from perception import Calibration, Detection
 
-WHYS = ("free", "merged", "faint", "dark", "hidden", "cut")
+WHYS = ("free", "eclipsed", "merged", "faint", "dark", "hidden", "cut")
 """How a robot can be seen, the best first: of its cameras the best one counts."""
 
 MERGED_PX, NEAR_PX = 2.0, 4.0
 _BESIDE = 0.1  # a neighbour with less of one's light hardly shifts it
 _EDGE_PX = 3.0
+_WHOLE = 0.99
 _SLACK_S = 0.55  # half a frame of eleven bits
 
 
@@ -64,7 +65,7 @@ def whys(rows: Sequence[SourceTruth], known: Calibration) -> list[tuple[str, boo
 
     `cut`: its centre is within 3 px of the frame's edge, or beyond. `hidden`: less than half of it is seen.
     `dark`: it is, in this frame. `faint`: its peak SNR is below 5. `merged`: another that brings a tenth of
-    its light or more is within 2 px. `free`: none of these.
+    its light or more is within 2 px. `eclipsed`: between half of it and 99 % is seen. `free`: none of these.
     """
     places_px = np.array([(row.u_px, row.v_px) for row in rows]).reshape(-1, 2)
     light_e = np.array([row.direct_e for row in rows])
@@ -83,8 +84,10 @@ def whys(rows: Sequence[SourceTruth], known: Calibration) -> list[tuple[str, boo
             why = "dark"
         elif row.peak_snr < MIN_PEAK_SNR:
             why = "faint"
+        elif nearest_px < MERGED_PX:
+            why = "merged"
         else:
-            why = "merged" if nearest_px < MERGED_PX else "free"
+            why = "eclipsed" if row.visible_fraction < _WHOLE else "free"
         found.append((why, nearest_px < NEAR_PX))
     return found
 

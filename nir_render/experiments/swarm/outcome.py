@@ -95,12 +95,12 @@ class Condition:
         return count
 
     def _seconds(self) -> dict[str, float | None]:
-        """Return how long things took, by the clock: the light of a camera, and a set after the first."""
-        rendered = [row["render_s"] for row in self.seconds if "render_s" in row]
-        later = [row for row in self.seconds if "render_s" not in row]
+        """Return processor time, the light of all cameras, and in the median a set after the first."""
+        rendered = [row["render_cpu_s"] for row in self.seconds if "render_cpu_s" in row]
+        later = [row for row in self.seconds if "render_cpu_s" not in row]
         parts: dict[str, float | None] = {}
         for part in ("expose", "detect", "follow"):
-            known = [row[f"{part}_s"] for row in later if f"{part}_s" in row]
+            known = [row[f"{part}_cpu_s"] for row in later if f"{part}_cpu_s" in row]
             parts[part] = float(np.median(known)) if known else None
         return {"light_of_a_set": max(rendered, default=None), **parts}
 

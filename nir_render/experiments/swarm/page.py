@@ -27,9 +27,10 @@ from nir_render.run.folder import POSES
 
 RULES = {
     "ceiling": (
-        "the share of lit robots that stand free by truth: half of the source seen or more, its centre 3 px "
-        "or more within the frame, peak SNR 5 or more, and no other that brings a tenth of its light or more "
-        "within 2 px. The best of the four cameras counts."
+        "the share of lit robots that stand free by truth: 99 % of the source seen or more (eclipsed: half "
+        "or more; hidden: less), its centre 3 px or more within the frame (else cut), peak SNR 5 or more "
+        "(else faint), and no other that brings a tenth of its light or more within 2 px (else merged). The "
+        "best of the four cameras counts."
     ),
     "recall": (
         "robots that are lit, of which a detection is within 3 px; of all, those that are hidden, cut, faint "
@@ -58,7 +59,9 @@ RULES = {
     ),
 }
 
-_COLOURS = dict(zip(WHYS, ("#2ec27e", "#f72585", "#b392f0", FAINT, "#5e9bff", "#ff9f1c"), strict=True))
+_COLOURS = dict(
+    zip(WHYS, ("#2ec27e", "#ffd166", "#f72585", "#b392f0", FAINT, "#5e9bff", "#ff9f1c"), strict=True)
+)
 
 
 def write_outcome(outcome: Outcome, folder: Path) -> Path:
@@ -133,12 +136,12 @@ def _seen(figures: dict[str, Any]) -> Table:
         rows.append(
             (*_where(one), _part(one["found"], one["lit"]), _part(one["free"], one["lit"]),
              _of(one["free_found"], one["free"]),
-             *(share(could[why], more=1) for why in ("merged", "hidden", "faint", "cut")),
+             *(share(could[why], more=1) for why in ("eclipsed", "merged", "hidden", "faint", "cut")),
              share(one["within_4_px"], more=1), f"{one['false_alarms']} in {one['sets_judged']}")
         )  # fmt: skip
     headings = (
-        "bodies", "per m²", "recall", "ceiling: stand free", "found of the free", "merged", "hidden", "faint",
-        "cut", "another within 4 px", "false alarms in sets",
+        "bodies", "per m²", "recall", "ceiling: stand free", "found of the free", "eclipsed", "merged",
+        "hidden", "faint", "cut", "another within 4 px", "false alarms in sets",
     )  # fmt: skip
     return Table(headings, rows)
 

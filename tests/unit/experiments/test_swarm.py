@@ -52,6 +52,7 @@ def test_how_robots_can_be_seen() -> None:
         _row(100.0), _row(101.9),
         _row(200.0), _row(202.1),
         _row(300.0, 10_001.0), _row(301.0, 1000.0),
+        _row(350.0, visible_fraction=0.98),
         _row(400.0, visible_fraction=0.49), _row(500.0, peak_snr=4.9), _row(600.0, 0.0, on_fraction=0.0),
         _row(2.9),
         _row(1276.1),
@@ -62,7 +63,7 @@ def test_how_robots_can_be_seen() -> None:
         "merged", "merged",
         "free", "free",
         "free", "merged",
-        "hidden", "faint", "dark",
+        "eclipsed", "hidden", "faint", "dark",
         "cut", "cut", "free", "cut",
     ]  # fmt: skip
     assert [near for _, near in whys(rows, known)][:4] == [True] * 4
@@ -162,7 +163,7 @@ def test_a_run_that_is_saved_goes_on_to_the_same_record() -> None:
     while again.done < again.steps:
         again.step()
     assert again.record() == whole.record()
-    assert {sight[1] for sight in whole.record()["standing"]} <= {"free", "merged", "hidden"}
+    assert {sight[1] for sight in whole.record()["standing"]} <= {"free", "eclipsed", "merged", "hidden"}
 
 
 def _record(seed: int) -> dict[str, Any]:
@@ -182,7 +183,10 @@ def _record(seed: int) -> dict[str, Any]:
 
 
 def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
-    seconds = [{"set": 0, "render_s": 9.0}, {"set": 1, "expose_s": 0.1, "detect_s": 0.2, "follow_s": 0.1}]
+    seconds = [
+        {"set": 0, "render_cpu_s": 9.0},
+        {"set": 1, "expose_cpu_s": 0.1, "detect_cpu_s": 0.2, "follow_cpu_s": 0.1},
+    ]
     condition = Condition(Swarm(robots=5), [_record(0), _record(1)], seconds)
     figures = condition.figures()
     assert (figures["lit"], figures["found"], figures["free"], figures["free_found"]) == (12, 8, 8, 4)
