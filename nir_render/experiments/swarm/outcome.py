@@ -19,6 +19,7 @@ from nir_render.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
+_MEDIAN_OF_NORMAL = 0.6745  # of the absolute value, of σ
 DENSITIES_PER_M2 = (0.5, 1.0, 2.0)
 
 
@@ -171,6 +172,7 @@ def _range_figures(free: Sequence[list[Any]]) -> dict[str, float | None]:
             "limit_m": None,
             "bias_sigmas": None,
             "of_limit": None,
+            "typical_of_limit": None,
             "of_sigma": None,
         }
     true_m, limit_m, said_m, sigma_m = said.T
@@ -182,6 +184,7 @@ def _range_figures(free: Sequence[list[Any]]) -> dict[str, float | None]:
         "limit_m": math.sqrt(float((limit_m**2).mean())),
         "bias_sigmas": float((off_m / limit_m).mean()),
         "of_limit": math.sqrt(float(((off_m / limit_m) ** 2).mean())),
+        "typical_of_limit": float(np.median(abs(off_m / limit_m)) / _MEDIAN_OF_NORMAL),
         "of_sigma": math.sqrt(float(((off_m / sigma_m) ** 2).mean())),
     }
 

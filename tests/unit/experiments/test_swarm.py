@@ -194,6 +194,7 @@ def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
     assert figures["within_4_px"] == pytest.approx(0.5)
     assert figures["range"]["of_limit"] == pytest.approx(1.0)
     assert figures["range"]["of_sigma"] == pytest.approx(2.0)
+    assert figures["range"]["typical_of_limit"] == pytest.approx(1.0 / 0.6745)
     assert figures["range"]["rmse_m"] == pytest.approx(0.02)
     assert figures["packets_by_sight"] == {"free": [4, 4], "merged": [2, 0]}
     assert (figures["told_in_full"], figures["identities_right"], figures["identities_wrong"]) == (6, 4, 2)
