@@ -5,9 +5,8 @@
     python benchmarks/swarm.py --robots 100 --observers 10    # ten robots': `all_cameras_s` is scaled up
 
 One JSON object. Robots stand at 1 per m², hulls below lines of sight; sources blink each by itself, as they
-do over a minute. Indirect light is rendered in blocks of 4 × 4 pixels with 8 samples; that of the faintest
-shares an image. `peak_gib` is the largest resident memory of a process. Starting, compiling and reading the
-scene are part of `seconds`.
+do over a minute. Indirect light is rendered in blocks of 4 × 4 pixels with 8 samples. `peak_gib` is the
+largest resident memory of a process. Starting, compiling and reading the scene are part of `seconds`.
 """
 
 import argparse
@@ -22,11 +21,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from nir_render import load_scene
-from nir_render.camera.mean_frame import electron_rates, exposed_frame
-from nir_render.camera.shared_light import shared_light
+from nir_render.camera.mean_frame import mean_frame
+from nir_render.camera.timing.drive import drive_of, mean_level
 from nir_render.camera.timing.exposure_control import own_setting
 from nir_render.experiments.swarm.hall import HALL, hall_scene, names_of
-from nir_render.experiments.swarm.loop import OFF
 from nir_render.randomness import RandomKey
 from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import frame_of
@@ -39,21 +37,27 @@ def hall(robots: int) -> Scene:
     return hall_scene(load_scene(HALL), robots, 1.0, "masts", 100.0, SEED)
 
 
-def frames_of(robots: int, names: list[str]) -> tuple[float, float, float, int]:
-    """Return peak memory in GiB, what light that shares an image is off by, processor time, and frames."""
+def frames_of(robots: int, names: list[str]) -> tuple[float, float, int]:
+    """Return peak memory in GiB, processor time, and frames: each of one exposure, at one time.
+
+    All that blinks has one level in it, so one image is enough, and nothing is left off.
+    """
     from nir_render.transport.render import render
 
     scene = hall(robots)
-    world, worst, frames = scene.at(0.0), 0.0, 0
+    world, frames = scene.at(0.0), 0
     for name in (camera for robot in names for camera in scene.document.cameras_of(robot)):
         light = render(world, name, SEED)
         setting = own_setting(world.camera(name).camera, 0)
-        shared = shared_light(light, world, setting.exposure_s, OFF)
-        mean = exposed_frame(electron_rates(light, world, shared.groups), setting.exposure_s, TIME_S)
+        levels = {
+            source: float(mean_level(drive_of(placed.source), TIME_S, setting.exposure_s))
+            for source, placed in world.carried_sources.items()
+        }
+        mean = mean_frame(light, world.sending(levels), setting.exposure_s, TIME_S)
         frame_of(mean.electrons, mean.camera, setting, TIME_S, RandomKey(SEED, "read_out", name, 0))
-        worst, frames = max(worst, shared.worst_share), frames + 1
+        frames += 1
     peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return peak_gib, worst, time.process_time(), frames
+    return peak_gib, time.process_time(), frames
 
 
 def measured(robots: int, observers: int, workers: int) -> dict[str, object]:
@@ -64,16 +68,15 @@ def measured(robots: int, observers: int, workers: int) -> dict[str, object]:
     with ProcessPoolExecutor(len(parts), multiprocessing.get_context("spawn")) as pool:
         found = list(pool.map(frames_of, [robots] * len(parts), parts))
     seconds = time.perf_counter() - began_s
-    frames = sum(one[3] for one in found)
+    frames = sum(one[2] for one in found)
     return {
         "robots": robots,
         "frames": frames,
         "workers": len(parts),
         "seconds": round(seconds, 1),
-        "cpu_seconds": round(sum(one[2] for one in found), 1),
+        "cpu_seconds": round(sum(one[1] for one in found), 1),
         "all_cameras_s": round(seconds * 4 * robots / frames, 1),
         "peak_gib": round(max(one[0] for one in found), 2),
-        "shared_light_worst_block": round(max(one[1] for one in found), 5),
     }
 
 

@@ -155,7 +155,13 @@ class _Rendering:
                 [stock.indirect(world, site.name, key, self._direct) for world in self._worlds]
             )
         light = groups.indirect(
-            site.snapshot, self._rays, key, self._power, samples, wavelengths_m=self.wavelengths_m
+            site.snapshot,
+            self._rays,
+            key,
+            self._power,
+            samples,
+            wavelengths_m=self.wavelengths_m,
+            built=self._built,
         )
         if light is None:
             return None
