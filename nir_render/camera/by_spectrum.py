@@ -66,7 +66,7 @@ def by_spectrum(
         if weights[group] == 0.0:
             continue
         for node in light.nodes:
-            key = _spectrum_key(emitter), node
+            key = spectrum_key(emitter), node
             values = weights[group] * per_group[group, node.index].astype(np.float64)
             known = sums.get(key)
             sums[key] = SpectrumPart(emitter, node, values if known is None else known.values + values)
@@ -94,7 +94,8 @@ def _lit_units(emitter: Emitter) -> float:
     return emission_units(emitter) * (1.0 if level is None else level)
 
 
-def _spectrum_key(emitter: Emitter) -> Hashable:
+def spectrum_key(emitter: Emitter) -> Hashable:
+    """Return what emitters of one spectrum have in common."""
     if isinstance(emitter, Sun | Skylight):
         return "sun" if isinstance(emitter, Sun) else "sky"
     if isinstance(emitter, Lamp):

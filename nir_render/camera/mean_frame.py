@@ -5,18 +5,18 @@ that shines fully lit. A frame is their weighted sum: drives and the shutter act
 pixels, behind lens and point spread, so emitters of one drive share an image.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.beams import Beam, beam_window, blur, diffuse_electrons
-from nir_render.camera.by_spectrum import by_spectrum, group_emitters, group_fluxes, row_response
+from nir_render.camera.beams import Beam, beam_window
+from nir_render.camera.by_spectrum import group_emitters, group_fluxes, row_response
+from nir_render.camera.diffuse_images import blurred_image, images_of, images_shared
 from nir_render.camera.motion_blur import (
     STILL_PX,
     drawn_out,
@@ -27,13 +27,11 @@ from nir_render.camera.motion_blur import (
 )
 from nir_render.camera.optics.lens import intrinsics_of
 from nir_render.camera.optics.psf import Window, place_of
-from nir_render.camera.optics.veil import veil
 from nir_render.camera.timing.drive import drive_of
 from nir_render.camera.timing.shutter import mid_exposure_s, row_profile
 from nir_render.errors import InputError
 from nir_render.geometry import sunflower
-from nir_render.light.enlarge import enlarge
-from nir_render.light.light import Indirect, Light
+from nir_render.light.light import Light
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.times.drives import FULL_DRIVE, Drive
 from nir_render.scene.emission import Emitter
@@ -55,6 +53,9 @@ class Rates:
     images
         Electrons per second of all but the windows, by drive: float32, which keeps 1e-7 of a sum of eight,
         shape (drives, rows, columns). None where nothing reaches the frame but the windows.
+    mixed
+        Where groups of unlike drives share an image: what each drive counts in each image, shape
+        (images, drives), and `images` are as many. None where each drive has its own.
     windows
         Electrons per second that each row of the light's direct table brings.
     centre_row
@@ -72,6 +73,7 @@ class Rates:
     images: NDArray[np.float32] | None
     windows: tuple[Window, ...]
     centre_row: NDArray[np.int64]
+    mixed: NDArray[np.float64] | None = None
     between: tuple[tuple[float, "Rates"], ...] = ()
     kept: dict[str, Any] = field(default_factory=dict, repr=False)
 
@@ -100,7 +102,7 @@ class Rates:
             return np.asarray(np.sum(images, axis=0, dtype=np.float64))
         only = np.zeros(len(self.light.groups))
         only[group] = group_fluxes(self.light, self.snapshot)[group]
-        return _blurred(self.light, self.snapshot, only)
+        return blurred_image(self.light, self.snapshot, only)
 
     def kept_group_image(self, group: int) -> NDArray[np.float32]:
         """Return a group's image as float32, kept for the next frame."""
@@ -169,8 +171,11 @@ def mean_frame(light: Light, snapshot: Snapshot, exposure_s: float, time_s: floa
     return exposed_frame(electron_rates(light, snapshot), exposure_s, time_s)
 
 
-def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
+def electron_rates(light: Light, snapshot: Snapshot, shared: Collection[int] = ()) -> Rates:
     """Return what a light brings in a second: all that takes long, once for many exposures.
+
+    The indirect light of the groups `shared` is one image, driven by the mean of their drives, each by its
+    flux (`shared_light` says which may be, and what that leaves off). Their direct light stays their own.
 
     Raises
     ------
@@ -180,9 +185,11 @@ def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
     camera = snapshot.camera(light.camera).camera
     of_groups = [_drive_of_rates(emitter) for emitter in group_emitters(light, snapshot)]
     drives = tuple(dict.fromkeys(of_groups))
-    drive = np.array([drives.index(of_group) for of_group in of_groups], dtype=np.int64)
+    number = {of_drive: index for index, of_drive in enumerate(drives)}
+    drive = np.array([number[of_group] for of_group in of_groups], dtype=np.int64)
     windows = tuple(_windows(light, snapshot, camera))
-    images = images_of(light, snapshot, drive, len(drives), windows)
+    image, mixed = images_shared(drive, group_fluxes(light, snapshot), shared)
+    images = images_of(light, snapshot, image, len(drives) if mixed is None else len(mixed), windows)
     parts: list[tuple[str, NDArray[np.floating]]] = [
         (f"the window of flare {number}", window.values) for number, window in enumerate(windows)
     ]
@@ -196,7 +203,7 @@ def electron_rates(light: Light, snapshot: Snapshot) -> Rates:
             )
     v_px = intrinsics_of(camera).project(light.direct.direction)[:, 1]
     nearest = np.clip(np.nan_to_num(v_px), 0, camera.sensor.rows - 1)
-    return Rates(light, snapshot, drives, drive, images, windows, np.rint(nearest).astype(np.int64))
+    return Rates(light, snapshot, drives, drive, images, windows, np.rint(nearest).astype(np.int64), mixed)
 
 
 def kept_rates(light: Light, snapshot: Snapshot) -> Rates:
@@ -254,7 +261,8 @@ def _weighted_sum(
     if rates.images is None:
         electrons = np.zeros((sensor.rows, sensor.columns))
     else:
-        electrons = np.einsum("dr,drc->rc", weights.astype(np.float32), rates.images).astype(np.float64)
+        of_images = weights if rates.mixed is None else rates.mixed @ weights
+        electrons = np.einsum("dr,drc->rc", of_images.astype(np.float32), rates.images).astype(np.float64)
     windows = tuple(
         drawn[row] if row in drawn else _weighted_window(rates, row, weights)
         for row in range(len(rates.windows))
@@ -301,7 +309,7 @@ def _drawn_out(rates: Rates, exposure_s: float, time_s: float) -> dict[int, Wind
         if not chosen.weight_s.any():
             continue
         path = path_of(snapshot, light.camera, group, table, row, chosen.offset_s)
-        beam = _beam(light, snapshot, camera, row)
+        beam = _beam(light, snapshot, camera, row, group_fluxes(light, snapshot))
         seen = None if beam.seen is None else table.seen[row]
         windows = [
             beam_window(camera, moved_beam(beam, direction, float(distance_m), seen), 1.0)
@@ -320,80 +328,25 @@ def _drive_of_rates(emitter: Emitter) -> Drive:
     return drive if drive.constant is None else FULL_DRIVE
 
 
-def images_of(
-    light: Light,
-    snapshot: Snapshot,
-    drive: NDArray[np.int64],
-    drives: int,
-    windows: tuple[Window, ...] | None,
-) -> NDArray[np.float32] | None:
-    """Return the electrons per second on the sensor, all but the windows, by drive; None where none are.
-
-    They are the indirect light, and what glare and ghosts bring of it and of the windows, if these are given.
-    """
-    camera = snapshot.camera(light.camera).camera
-    veiled = camera.point_spread.core_share < 1.0
-    if light.indirect is None and not veiled:
-        return None
-    flux = group_fluxes(light, snapshot)
-    images = np.empty((drives, camera.sensor.rows, camera.sensor.columns), dtype=np.float32)
-    for number in range(drives):
-        image = _blurred(light, snapshot, np.where(drive == number, flux, 0.0))
-        if veiled:
-            core = image.copy()
-            for row in np.flatnonzero(drive[light.direct.group] == number):
-                if windows is not None:
-                    windows[row].add_into(core)
-            image += veil(camera, core)
-        images[number] = image
-    return images
-
-
-def _blurred(light: Light, snapshot: Snapshot, flux: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the electrons per second of indirect light of groups of given fluxes, never below 0."""
-    camera = snapshot.camera(light.camera).camera
-    if light.indirect is None:
-        return np.zeros((camera.sensor.rows, camera.sensor.columns))
-    image = blur(camera, diffuse_image(light, light.indirect, snapshot, flux))
-    return np.asarray(np.maximum(image, 0.0))  # what is enlarged along edges can dip below
-
-
-def diffuse_image(
-    light: Light, indirect: Indirect, snapshot: Snapshot, fluxes: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the electrons per second of indirect light before the blur, groups of given fluxes summed."""
-    camera = snapshot.camera(light.camera).camera
-    rows, columns = camera.sensor.rows, camera.sensor.columns
-    image = np.zeros((rows, columns))
-    edges = indirect.edges
-    enlargement = None if edges is None else edges.enlargement
-    parts = by_spectrum(light, snapshot, indirect.radiance_per_w, fluxes)
-    patches = [] if edges is None else by_spectrum(light, snapshot, edges.radiance_per_w, fluxes)
-    for part, patch in zip_longest(parts, patches):
-        whole = enlarge(part.values, rows, columns, enlargement, None if patch is None else patch.values)
-        image += diffuse_electrons(camera, whole, part.emitter, 1.0, part.node)
-    return image
-
-
 def _windows(light: Light, snapshot: Snapshot, camera: Camera) -> list[Window]:
     """Return the electrons per second of each row of the direct table."""
-    rows = range(len(light.direct.group))
-    return [beam_window(camera, _beam(light, snapshot, camera, row), 1.0) for row in rows]
+    rows, flux = range(len(light.direct.group)), group_fluxes(light, snapshot)
+    return [beam_window(camera, _beam(light, snapshot, camera, row, flux), 1.0) for row in rows]
 
 
-def _beam(light: Light, snapshot: Snapshot, camera: Camera, row: int) -> Beam:
+def _beam(light: Light, snapshot: Snapshot, camera: Camera, row: int, flux: NDArray[np.float64]) -> Beam:
     """Return the beam of a row of the direct table, fully lit where its drive is not constant."""
     table, group = light.direct, light.direct.group[row]
     direction, angular_radius_rad = table.direction[row], float(table.angular_radius_rad[row])
     seen = None
     if 0.0 < table.visible_fraction[row] < 1.0:
         seen = sunflower(direction, angular_radius_rad, table.visibility_rays)[table.seen[row]]
-    emitter = group_emitters(light, snapshot)[group]
+    emitter = snapshot.emitters[light.groups[group]]
     irradiance_per_unit, response = row_response(camera, light, row, emitter)
     return Beam(
         direction=direction,
         angular_radius_rad=angular_radius_rad,
-        irradiance_w_per_m2=irradiance_per_unit * float(group_fluxes(light, snapshot)[group]),
+        irradiance_w_per_m2=irradiance_per_unit * float(flux[group]),
         response=response,
         seen=seen,
         distance_m=float(table.distance_m[row]),

@@ -1,5 +1,6 @@
 """Bodies that are carried: a shape as a document writes it, in a frame, becomes one in the world."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -18,6 +19,10 @@ from nir_render.scene.documents.shapes import (
 )
 from nir_render.scene.motion import frame_pose
 from nir_render.scene.pose import Pose, rotation_of
+
+Array = NDArray[np.float64]
+Solid = Sphere | Box | Cylinder
+"""A shape that has an inside."""
 
 BODY = ".body."
 """Part of the name, `robot.body.shape`, of a shape that a robot carries."""
@@ -102,3 +107,41 @@ def _rotation_rad(shape: Rectangle, pose: Pose) -> float:
     across = pose.rotation @ rectangle_frame(shape.normal, (2.0, 2.0), shape.rotation_rad)[:, 0]
     plain = rectangle_frame(_vector(pose.rotation @ np.array(shape.normal)), (2.0, 2.0), 0.0)
     return float(np.arctan2(across @ plain[:, 1], across @ plain[:, 0]))
+
+
+def bounding_sphere(body: Solid) -> tuple[Array, float]:
+    """Return centre and radius of a sphere around a body."""
+    match body:
+        case Sphere():
+            return np.array(body.center_m), body.radius_m
+        case Box():
+            return np.array(body.center_m), 0.5 * float(np.linalg.norm(body.size_m))
+        case Cylinder():
+            start_m, end_m = np.array(body.start_m), np.array(body.end_m)
+            half_m = 0.5 * float(np.linalg.norm(end_m - start_m))
+            return 0.5 * (start_m + end_m), math.hypot(half_m, body.radius_m)
+
+
+def solid_around(shapes: Mapping[str, ShapeDocument], point_m: NDArray[np.float64]) -> str | None:
+    """Return the name of a closed shape that holds a point, or None. Meshes are tested when built."""
+    return next((name for name, body in solids(shapes).items() if contains(body, point_m)), None)
+
+
+def solids(shapes: Mapping[str, ShapeDocument]) -> dict[str, Solid]:
+    """Return the closed shapes; meshes are tested when built."""
+    return {name: body for name, body in shapes.items() if isinstance(body, Sphere | Box | Cylinder)}
+
+
+def contains(body: Solid, points_m: Array) -> NDArray[np.bool_]:
+    """Tell which points, shape (..., 3), are in a body, shape (...)."""
+    match body:
+        case Sphere():
+            return np.asarray(np.linalg.norm(points_m - body.center_m, axis=-1) < body.radius_m)
+        case Box():
+            local_m = (points_m - body.center_m) @ rotation_of(body.orientation)
+            return np.asarray((np.abs(local_m) < 0.5 * np.array(body.size_m)).all(axis=-1))
+        case Cylinder():
+            axis = np.subtract(body.end_m, body.start_m)
+            along = (points_m - body.start_m) @ axis / (axis @ axis)
+            off_m = np.linalg.norm(points_m - body.start_m - along[..., None] * axis, axis=-1)
+            return np.asarray((along > 0.0) & (along < 1.0) & (off_m < body.radius_m))

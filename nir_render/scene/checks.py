@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.errors import shown
+from nir_render.scene.bodies import Solid, bounding_sphere, contains, solid_around, solids
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.materials import Dielectric, Pane, texture_of
 from nir_render.scene.documents.sensor import Sensor
-from nir_render.scene.documents.shapes import Box, Cylinder, Mesh, Rectangle, ShapeDocument, Sphere
+from nir_render.scene.documents.shapes import Cylinder, Mesh, Rectangle
 from nir_render.scene.documents.times.clocks import JITTER_SIGMAS, CameraClock
 from nir_render.scene.documents.times.motion import Moving
 from nir_render.scene.emission import emission_spectrum
@@ -23,7 +24,6 @@ from nir_render.scene.motion import (
     robot_positions_m,
     robot_rotations,
 )
-from nir_render.scene.pose import rotation_of
 from nir_render.spectra.curve import Curve, constant_curve
 from nir_render.spectra.illuminants import SILICON_M
 from nir_render.spectra.nodes import BAND_M
@@ -33,7 +33,6 @@ _SLACK = 1e-9
 _MOST_AT_ONCE = 10_000  # poses
 
 Array = NDArray[np.float64]
-Solid = Sphere | Box | Cylinder
 
 
 def check(document: SceneDocument) -> list[str]:
@@ -46,7 +45,7 @@ def check(document: SceneDocument) -> list[str]:
         *_indivisible_sensors(document),
         *_exposures_beyond_the_clock(document),
         *_uncovered_curves(document),
-        *_cameras_inside_solids(document),
+        *_cameras_insidesolids(document),
         *_cameras_and_sources_inside_their_own_bodies(document),
     ]
 
@@ -216,6 +215,9 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
             continue
         if not spectrum.low_m - _SLACK_M <= BAND_M <= spectrum.high_m + _SLACK_M:
             problems.append(f"{place}: covers {spectrum.range_nm()}, not 940 nm")
+    # Of spectra that cover the same the first one tells of all.
+    unlike = {(one.low_m, one.high_m): place for place, one in reversed(spectra.items())}
+    spectra = {place: one for place, one in spectra.items() if place == unlike[one.low_m, one.high_m]}
     for name, robot in document.robots.items():
         for camera_name, camera in robot.rig.cameras.items():
             efficiency = camera.sensor.efficiency()
@@ -250,7 +252,7 @@ def _beyond_the_table(key: str, camera: Camera, spectra: Mapping[str, Curve]) ->
     ][:1]
 
 
-def _cameras_inside_solids(document: SceneDocument) -> list[str]:
+def _cameras_insidesolids(document: SceneDocument) -> list[str]:
     """Tell of cameras that are in a body at the time of a frame. Meshes are tested when built."""
     carriers = _carriers(document)
     if not carriers:
@@ -258,15 +260,22 @@ def _cameras_inside_solids(document: SceneDocument) -> list[str]:
     clock = document.clock
     frames_s = clock.start_s + np.arange(clock.frames) / clock.frame_rate_hz
     problems = []
+    all_stand = not any(carrier.moves for _, carrier, _ in carriers.values())
+    spheres_m = _standing_spheres_m(carriers, frames_s[:1]) if all_stand else None
     for name, robot in document.robots.items():
         # Where the robot stands still, the first frame tells of all.
-        still = not robot.moves and not any(carrier.moves for _, carrier, _ in carriers.values())
-        times_s = frames_s[:1] if still else frames_s
+        times_s = frames_s[:1] if all_stand and not robot.moves else frames_s
         places_m = robot_positions_m(robot, times_s)
+        near = list(carriers.items())
+        if spheres_m is not None and not robot.moves:
+            reaches_m = (float(np.linalg.norm(one.position_m)) for one in robot.rig.cameras.values())
+            off_m = np.linalg.norm(spheres_m[:, :3] - places_m[0], axis=1) - spheres_m[:, 3]
+            reach_m = max(reaches_m, default=0.0) * (1.0 + _SLACK)
+            near = [near[number] for number in np.flatnonzero(off_m <= reach_m)]
         for camera_name, camera in robot.rig.cameras.items():
             met = [
                 (*found, place)
-                for place, (body, carrier, owner) in carriers.items()
+                for place, (body, carrier, owner) in near
                 if owner != name
                 and (found := _first_time_inside(body, carrier, robot, camera, times_s, places_m)) is not None
             ]
@@ -279,6 +288,20 @@ def _cameras_inside_solids(document: SceneDocument) -> list[str]:
     return problems
 
 
+def _standing_spheres_m(carriers: Mapping[str, tuple[Solid, Moving, str | None]], times_s: Array) -> Array:
+    """Return a sphere that holds each body however its carrier is turned, x, y, z, radius: (bodies, 4)."""
+    found = []
+    for body, carrier, _ in carriers.values():
+        center_m, radius_m = bounding_sphere(body)
+        if _carries(carrier):
+            center_m, radius_m = (
+                _carrier_positions_m(carrier, times_s)[0],
+                radius_m + float(np.linalg.norm(center_m)),
+            )
+        found.append([*center_m, radius_m * (1.0 + _SLACK)])
+    return np.array(found)
+
+
 def _first_time_inside(
     body: Solid, carrier: Moving, robot: Robot, camera: Camera, times_s: Array, places_m: Array
 ) -> tuple[float, Array] | None:
@@ -287,7 +310,7 @@ def _first_time_inside(
     `carrier` is what the body moves with. `places_m` is where the camera's robot is, shape (n, 3): only where
     that is near enough is the camera looked for, as this takes the robot's orientation.
     """
-    center_m, radius_m = _bounding_sphere(body)
+    center_m, radius_m = bounding_sphere(body)
     reach_m = (radius_m + float(np.linalg.norm(camera.position_m))) * (1.0 + _SLACK)
     off_m = places_m - center_m
     if _carries(carrier):
@@ -302,7 +325,7 @@ def _first_time_inside(
         if _carries(carrier):
             off_m = points_m - _carrier_positions_m(carrier, times_s[part])
             local_m = (off_m[:, None, :] @ _carrier_rotations(carrier, times_s[part]))[:, 0]
-        inside = np.flatnonzero(_contains(body, local_m))
+        inside = np.flatnonzero(contains(body, local_m))
         if len(inside):
             return float(times_s[part[inside[0]]]), points_m[inside[0]]
     return None
@@ -312,10 +335,10 @@ def _carriers(document: SceneDocument) -> dict[str, tuple[Solid, Moving, str | N
     """Return closed shapes, what each moves with, and the robot whose body it is, by place."""
     carriers: dict[str, tuple[Solid, Moving, str | None]] = {
         f"shapes.{name}": (body, document.shapes[name], None)
-        for name, body in _solids(document.shapes).items()
+        for name, body in solids(document.shapes).items()
     }
     for robot_name, robot in document.robots.items():
-        for name, body in _solids(robot.rig.body).items():
+        for name, body in solids(robot.rig.body).items():
             carriers[f"robots.{robot_name}.rig.body.{name}"] = (body, robot, robot_name)
     return carriers
 
@@ -358,40 +381,3 @@ def _cameras_and_sources_inside_their_own_bodies(document: SceneDocument) -> lis
                     "of them, or make the body of parts that leave it free"
                 )
     return problems
-
-
-def _bounding_sphere(body: Solid) -> tuple[Array, float]:
-    """Return centre and radius of a sphere around a body."""
-    match body:
-        case Sphere():
-            return np.array(body.center_m), body.radius_m
-        case Box():
-            return np.array(body.center_m), 0.5 * float(np.linalg.norm(body.size_m))
-        case Cylinder():
-            start_m, end_m = np.array(body.start_m), np.array(body.end_m)
-            half_m = 0.5 * float(np.linalg.norm(end_m - start_m))
-            return 0.5 * (start_m + end_m), math.hypot(half_m, body.radius_m)
-
-
-def solid_around(shapes: Mapping[str, ShapeDocument], point_m: NDArray[np.float64]) -> str | None:
-    """Return the name of a closed shape that holds a point, or None. Meshes are tested when built."""
-    return next((name for name, body in _solids(shapes).items() if _contains(body, point_m)), None)
-
-
-def _solids(shapes: Mapping[str, ShapeDocument]) -> dict[str, Solid]:
-    return {name: body for name, body in shapes.items() if isinstance(body, Sphere | Box | Cylinder)}
-
-
-def _contains(body: Solid, points_m: Array) -> NDArray[np.bool_]:
-    """Tell which points, shape (..., 3), are in a body, shape (...)."""
-    match body:
-        case Sphere():
-            return np.asarray(np.linalg.norm(points_m - body.center_m, axis=-1) < body.radius_m)
-        case Box():
-            local_m = (points_m - body.center_m) @ rotation_of(body.orientation)
-            return np.asarray((np.abs(local_m) < 0.5 * np.array(body.size_m)).all(axis=-1))
-        case Cylinder():
-            axis = np.subtract(body.end_m, body.start_m)
-            along = (points_m - body.start_m) @ axis / (axis @ axis)
-            off_m = np.linalg.norm(points_m - body.start_m - along[..., None] * axis, axis=-1)
-            return np.asarray((along > 0.0) & (along < 1.0) & (off_m < body.radius_m))

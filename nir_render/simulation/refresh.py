@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.diffuse_images import images_of
 from nir_render.camera.mean_frame import (
     Rates,
     electron_rates,
     fully_lit_frame,
-    images_of,
 )
 from nir_render.camera.optics.apertures import flare_aperture
 from nir_render.camera.render_noise import (

@@ -13,8 +13,8 @@ from nir_render.errors import InputError
 from nir_render.light.enlarge import Enlargement, part_of, with_patch
 from nir_render.light.light import DirectTable, Indirect, Light
 from nir_render.light.nodes import direct_over_nodes, indirect_over_nodes
-from nir_render.scene.bodies import place_of_shape
-from nir_render.scene.checks import indivisible_sensor, solid_around
+from nir_render.scene.bodies import place_of_shape, solid_around
+from nir_render.scene.checks import indivisible_sensor
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.backend.variant import backend
@@ -155,7 +155,13 @@ class _Rendering:
                 [stock.indirect(world, site.name, key, self._direct) for world in self._worlds]
             )
         light = groups.indirect(
-            site.snapshot, self._rays, key, self._power, samples, wavelengths_m=self.wavelengths_m
+            site.snapshot,
+            self._rays,
+            key,
+            self._power,
+            samples,
+            wavelengths_m=self.wavelengths_m,
+            built=self._built,
         )
         if light is None:
             return None

@@ -18,7 +18,8 @@ import pytest
 
 from nir_render import Scene, load_scene, render
 from nir_render.camera.by_spectrum import group_fluxes
-from nir_render.camera.mean_frame import MeanFrame, diffuse_image, mean_frame
+from nir_render.camera.diffuse_images import diffuse_image
+from nir_render.camera.mean_frame import MeanFrame, mean_frame
 from nir_render.camera.render_noise import temporal_variance_e2
 from nir_render.light.light import Light
 from nir_render.transport.backend.variant import backend

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nir_render import Scene, load_scene, render
 from nir_render.camera.by_spectrum import group_fluxes
-from nir_render.camera.mean_frame import diffuse_image
+from nir_render.camera.diffuse_images import diffuse_image
 from tests.physics.documents import rectangle_document
 from tests.physics.rooms import ROOMS, plain
 

@@ -19,7 +19,8 @@ from scipy import stats
 
 from nir_render import Light, Scene, load_scene, render
 from nir_render.camera.by_spectrum import group_fluxes
-from nir_render.camera.mean_frame import diffuse_image, mean_frame
+from nir_render.camera.diffuse_images import diffuse_image
+from nir_render.camera.mean_frame import mean_frame
 from nir_render.camera.optics.apertures import flare_apertures
 from nir_render.camera.render_noise import aperture_variances_e2, render_noise, render_variance_e2
 from tests.physics.rooms import plain

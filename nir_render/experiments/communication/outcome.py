@@ -17,9 +17,8 @@ from nir_render.experiments.communication.loop import (
 from nir_render.experiments.loop.controllers import COMMANDED_M
 from nir_render.experiments.loop.ending import TRUTH
 from nir_render.experiments.loop.runs import Progress, run_seeds
+from nir_render.experiments.loop.shares import upper_limit
 from nir_render.scene.scene import Scene
-
-_NO_ERROR_95 = 0.05
 
 
 @dataclass(frozen=True)
@@ -85,13 +84,6 @@ class Outcome:
         mean = float((parts[:, 0] * parts[:, 1]).sum() / number)
         about = (parts[:, 0] * (parts[:, 2] ** 2 + (parts[:, 1] - mean) ** 2)).sum() / number
         return [float(number), mean, float(np.sqrt(about))]
-
-
-def upper_limit(errors: int, of: int) -> float:
-    """Return the upper 95 % limit of a rate, one-sided: exact for binomial counts (Clopper and Pearson)."""
-    from scipy.stats import beta
-
-    return 1.0 if errors >= of else float(beta.ppf(1.0 - _NO_ERROR_95, errors + 1, of - errors))
 
 
 def outcome_of(

@@ -1,8 +1,9 @@
 """A robot that sees by measurements: as the detector makes them, drawn about the truth, without frames."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import cast
 
 import numpy as np
@@ -10,13 +11,12 @@ from numpy.typing import NDArray
 
 from nir_render.camera.timing.drive import drive_of, mean_level
 from nir_render.experiments.loop.controllers import neighbours_of
-from nir_render.experiments.loop.sight import Seen
-from nir_render.experiments.loop.world import World
+from nir_render.experiments.loop.sight import Around, Seen
 from nir_render.randomness import generator
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.calibration import calibration
-from perception import Calibration, Detection, Pipeline, RawFrame, Signal
+from perception import Calibration, Detection, Message, Pipeline, RawFrame, Signal
 from perception.model.bearing import bearing_body
 from perception.model.fisher import FlareLimit, flare_limit
 from perception.model.flare import PixelBox, flare_image
@@ -103,10 +103,20 @@ class MeasurementSight:
     brightness, the decoder. Left out is what only frames have: light off walls and lamps, false alarms,
     flares drawn out. Two within 2 px are one at their centre of light, and not ranged; below 8 σ of flux
     nothing is found. Where a source was not found its pixels are drawn: how dark it is the stack measures.
+
+    `hidden` names by camera the sources that bodies hide from it; by default they hide none.
     """
 
-    def __init__(self, scene: Scene, robot: str, seed: int, keep_signals: bool = False) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        robot: str,
+        seed: int,
+        keep_signals: bool = False,
+        hidden: Mapping[str, Collection[str]] = MappingProxyType({}),
+    ) -> None:
         self._robot, self._seed = robot, seed
+        self._hidden = {name: frozenset(hidden.get(name, ())) for name in scene.document.cameras_of(robot)}
         self._cameras = scene.document.cameras_of(robot)
         self._known = {name: calibration(scene, name) for name in self._cameras}
         self._exposure_s = {name: scene.camera(name)[1].exposure_s for name in self._cameras}
@@ -114,7 +124,7 @@ class MeasurementSight:
         self._pipeline = Pipeline(self._known, keep_signals=keep_signals)
         self._index = 0
 
-    def look(self, world: World) -> Seen:
+    def look(self, world: Around) -> Seen:
         """Draw the detections of a set, and take them in."""
         snapshot = world.snapshot()
         frames, found = [], []
@@ -128,6 +138,10 @@ class MeasurementSight:
         # They are no raw frames: of their pixels there are only the windows that photometry looks at.
         heard = self._pipeline.follow(cast(list[RawFrame], frames), found, world.odometry(self._robot))
         return Seen(neighbours_of(heard.tracks), heard.messages, heard.tracks)
+
+    def finish(self) -> tuple[Message, ...]:
+        """Return the words that can be told as no more sets will come."""
+        return self._pipeline.finish()
 
     def signals(self) -> tuple[Signal, ...]:
         """Return how bright every track was so far, where that is kept."""
@@ -154,6 +168,8 @@ class MeasurementSight:
             sources.items(), places_px, ranges_m.tolist(), noises, strict=True
         ):
             if name.startswith(f"{self._robot}.") or not _is_in_view(place_px, known):
+                continue
+            if name in self._hidden[frame.camera]:
                 continue
             bound, lit_e = self._bound(frame, range_m, float(place_px[0]), float(place_px[1]))
             # A source that is brighter than its type seems so much nearer, and one that was lit for a part

@@ -6,8 +6,9 @@ from typing import Protocol
 
 from nir_render.experiments.loop.controllers import Neighbour
 from nir_render.experiments.loop.world import World
+from nir_render.scene.snapshot import Snapshot
 from nir_render.truth.sent import SentTruth
-from perception import Message, RawFrame, Signal, Track
+from perception import Message, Odometry, RawFrame, Signal, Track
 from perception.messages.uart import REPEATS
 
 
@@ -19,6 +20,20 @@ class Seen:
     messages: tuple[Message, ...] = ()
     tracks: tuple[Track, ...] = ()
     frames: tuple[RawFrame, ...] = ()
+
+
+class Around(Protocol):
+    """What there is to look at: the world at one time, and what a robot knows of its own way."""
+
+    @property
+    def time_s(self) -> float:
+        """Now."""
+
+    def snapshot(self) -> Snapshot:
+        """Return the world as light meets it now."""
+
+    def odometry(self, robot: str) -> list[Odometry]:
+        """Return what a robot knows of its last seconds."""
 
 
 class Sight(Protocol):

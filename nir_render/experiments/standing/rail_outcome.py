@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.experiments.loop.runs import Progress, run_seeds
+from nir_render.experiments.loop.shares import lower_limit
 from nir_render.experiments.standing.rail import Rail
 from nir_render.experiments.standing.sightings import STACKS, Sighting, sighting_of
 from nir_render.scene.scene import Scene
@@ -113,13 +114,6 @@ def figures(frames: Sequence[Judged], stack: str) -> dict[str, Any]:
         "rmse_m": float(np.sqrt((off_m**2).mean())) if len(off_m) else None,
         "bias_m": float(off_m.mean()) if len(off_m) else None,
     }
-
-
-def lower_limit(found: int, of: int) -> float:
-    """Return the lower 95 % limit of a share, one-sided: exact for binomial counts (Clopper and Pearson)."""
-    from scipy.stats import beta
-
-    return 0.0 if found == 0 else float(beta.ppf(0.05, found, of - found + 1))
 
 
 def outcome_of(

@@ -32,10 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from nir_render.camera.by_spectrum import group_fluxes
+from nir_render.camera.by_spectrum import group_emitters, group_fluxes
 from nir_render.camera.mean_frame import electron_rates, fully_lit_frame
 from nir_render.camera.optics.apertures import aperture_weights, flare_apertures
 from nir_render.camera.render_noise import temporal_variance_e2, variance_by_spectrum
+from nir_render.camera.timing.drive import drive_of
 from nir_render.camera.timing.exposure_control import setting_for
 from nir_render.light.enlarge import Enlargement
 from nir_render.light.light import Light
@@ -53,6 +54,7 @@ _RISE, _FLARE_LIKE_RISE = 4, 16  # times the frame's count
 _BUDGET = 4  # times the samples of a frame without care for pixels that look like flares
 _BLOCKS_OF_A_FLARE = 400
 _MOST_WANTED = 2.0**40
+_MOST_IMAGES = 32
 _SLIGHT = 1e-3  # what counts less in a sum than this, the largest being 1, is not cared for
 
 
@@ -74,7 +76,7 @@ def samples_map(
     """
     assert pilot.indirect is not None  # without indirect light nothing is sampled
     camera = snapshot.camera(pilot.camera).camera
-    rates = electron_rates(pilot, snapshot)
+    rates = electron_rates(pilot, snapshot, _lit_together(pilot, snapshot))
     exposure_s = planned_exposure_s(camera, float(fully_lit_frame(rates, 1.0).electrons.max()))
     sensor_e2 = temporal_variance_e2(fully_lit_frame(rates, exposure_s))
     ratio = _share_of_one_sample(pilot, snapshot, exposure_s, sensor_e2, shape)
@@ -86,6 +88,15 @@ def samples_map(
     given = np.clip(np.maximum(given, of_flares), LEAST_SAMPLES, MOST_SAMPLES)
     wanted = np.clip(np.maximum(np.maximum(need, flare_like), of_flares), LEAST_SAMPLES, _MOST_WANTED)
     return np.asarray(2 ** np.ceil(np.log2([given, wanted])), dtype=np.int64)
+
+
+def _lit_together(light: Light, snapshot: Snapshot) -> range:
+    """Return the groups that may share an image where all are fully lit: all, if their drives are many.
+
+    Only the sum of images is used here. Of few drives it is that of the frames to be, to the last bit.
+    """
+    drives = {drive_of(emitter) for emitter in group_emitters(light, snapshot)}
+    return range(len(light.groups) if len(drives) > _MOST_IMAGES else 0)
 
 
 def _within_budget(need: Array, flare_like: Array, least_bound: float) -> Array:

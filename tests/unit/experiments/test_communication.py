@@ -9,13 +9,14 @@ import pytest
 from nir_render import load_scene
 from nir_render.experiments.communication.judge import judged
 from nir_render.experiments.communication.loop import Communication, Loop, levels_in
-from nir_render.experiments.communication.outcome import outcome_of, upper_limit
+from nir_render.experiments.communication.outcome import outcome_of
 from nir_render.experiments.communication.page import write_outcome
 from nir_render.experiments.flocking.outcome import ARENA
 from nir_render.experiments.loop import runs
 from nir_render.experiments.loop.controllers import Formation, Neighbour
 from nir_render.experiments.loop.frame_sight import FrameSight
 from nir_render.experiments.loop.measurement_sight import MeasurementSight
+from nir_render.experiments.loop.shares import upper_limit
 from nir_render.experiments.loop.world import Base, World
 from nir_render.run.folder import read_json
 from nir_render.simulation.sent import sent_packets

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from nir_render import load_scene
+from nir_render.experiments.loop.shares import lower_limit
 from nir_render.experiments.standing.rail import RAIL, Rail
 from nir_render.experiments.standing.rail_outcome import (
     figures,
     held_out,
     ideal_mae_m,
     judged,
-    lower_limit,
     outcome_of,
 )
 from nir_render.experiments.standing.rail_page import write_outcome

@@ -12,9 +12,9 @@ from nir_render import InputError, Scene, expected_electrons, expose, load_scene
 from nir_render.camera import mean_frame as mean_frame_module
 from nir_render.camera.beams import blur
 from nir_render.camera.by_spectrum import group_fluxes
+from nir_render.camera.diffuse_images import diffuse_image
 from nir_render.camera.mean_frame import (
     Rates,
-    diffuse_image,
     electron_rates,
     exposed_frame,
     fully_lit_frame,

@@ -1,0 +1,1 @@
+"""A massive swarm that stands: whom one robot sees, how far it says they are, and who it says they are."""

@@ -1,0 +1,192 @@
+"""What a robot could see of the others, by truth, and what it did: in a frame set, and of packets."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nir_render.evaluate.match import MIN_PEAK_SNR, MIN_VISIBLE_FRACTION, match, on_a_lamp
+from nir_render.evaluate.metrics import source_limits
+from nir_render.truth.lamps import Outline
+from nir_render.truth.sent import SentTruth
+from nir_render.truth.sources import SourceTruth
+from perception import Calibration, Detection
+
+WHYS = ("free", "eclipsed", "merged", "faint", "dark", "hidden", "cut")
+"""How a robot can be seen, the best first: of its cameras the best one counts."""
+
+MERGED_PX, NEAR_PX = 2.0, 4.0
+_BESIDE = 0.1  # a neighbour with less of one's light hardly shifts it
+_EDGE_PX = 3.0
+_WHOLE = 0.99
+_SLACK_S = 0.55  # half a frame of eleven bits
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One robot in one set of frames.
+
+    Attributes
+    ----------
+    why
+        How it could be seen, one of `WHYS`.
+    near
+        Whether another source shines within 4 px of it, in the camera that shows it best.
+    range_m, limit_m
+        The true distance from that camera, and the Cramér–Rao bound of it, overlapping flares told apart.
+    found
+        Whether a detection is its.
+    said_m, sigma_m
+        What it says of the range; NaN where it says none.
+    """
+
+    robot: str
+    why: str
+    near: bool
+    range_m: float
+    limit_m: float
+    found: bool
+    said_m: float
+    sigma_m: float
+
+    def record(self) -> list[Any]:
+        """Return it as plain data."""
+        floats = [
+            round(value, 5) if math.isfinite(value) else None
+            for value in (self.range_m, self.limit_m, self.said_m, self.sigma_m)
+        ]
+        return [self.robot, self.why, self.near, self.found, *floats]
+
+
+def whys(rows: Sequence[SourceTruth], known: Calibration) -> list[tuple[str, bool]]:
+    """Return how each source of a frame can be seen, and whether another shines within 4 px of it.
+
+    `cut`: its centre is within 3 px of the frame's edge, or beyond. `hidden`: less than half of it is seen.
+    `dark`: it is, in this frame. `faint`: its peak SNR is below 5. `merged`: another that brings a tenth of
+    its light or more is within 2 px. `eclipsed`: between half of it and 99 % is seen. `free`: none of these.
+    """
+    places_px = np.array([(row.u_px, row.v_px) for row in rows]).reshape(-1, 2)
+    light_e = np.array([row.direct_e for row in rows])
+    last_px = np.array([known.width_px, known.height_px]) - 1.0 - _EDGE_PX
+    found = []
+    for number, row in enumerate(rows):
+        apart_px = np.hypot(*(places_px - places_px[number]).T)
+        apart_px[number] = math.inf
+        beside = light_e >= max(_BESIDE * row.direct_e, 1.0)
+        nearest_px = float(apart_px[beside].min(initial=math.inf))
+        if (places_px[number] < _EDGE_PX).any() or (places_px[number] > last_px).any():
+            why = "cut"
+        elif row.visible_fraction < MIN_VISIBLE_FRACTION:
+            why = "hidden"
+        elif row.on_fraction <= 0.0:
+            why = "dark"
+        elif row.peak_snr < MIN_PEAK_SNR:
+            why = "faint"
+        elif nearest_px < MERGED_PX:
+            why = "merged"
+        else:
+            why = "eclipsed" if row.visible_fraction < _WHOLE else "free"
+        found.append((why, nearest_px < NEAR_PX))
+    return found
+
+
+def sights(
+    robots: Iterable[str],
+    rows_of: Mapping[str, Sequence[SourceTruth]],
+    found: Mapping[str, Sequence[Detection]],
+    lamps_px: Mapping[str, Sequence[Outline]],
+    known: Mapping[str, Calibration],
+) -> tuple[list[Sight], int]:
+    """Return each robot as a set of frames shows it, and how many detections are of none of them.
+
+    Parameters
+    ----------
+    robots
+        The others, all of them: whom no camera has is `cut`.
+    rows_of, found, lamps_px, known
+        By camera: truth, detections, lamps, what is known of it.
+    """
+    best: dict[str, Sight] = {}
+    alarms = 0
+    for camera, rows in rows_of.items():
+        real = [row for row in rows if row.ghost_of is None]
+        pairs = match(real, found[camera], known[camera])
+        hits = {number: found[camera][hit] for number, hit in pairs.pairs}
+        alarms += sum(
+            not (found[camera][hit].ghost or on_a_lamp(found[camera][hit], lamps_px[camera]))
+            for hit in pairs.unmatched
+        )
+        for number, (row, (why, near)) in enumerate(zip(real, whys(real, known[camera]), strict=True)):
+            hit = hits.get(number)
+            limit_m = math.nan
+            if why in ("free", "merged") and row.on_fraction >= 1.0:
+                limit_m, _ = source_limits(row, known[camera], real)
+            one = Sight(
+                row.robot, why, near, row.range_m, limit_m, hit is not None,
+                math.nan if hit is None else hit.range_m, math.nan if hit is None else hit.range_sigma_m,
+            )  # fmt: skip
+            best[row.robot] = _better(best.get(row.robot), one)
+    return [best.get(robot, _unseen(robot)) for robot in robots], alarms
+
+
+def _better(known: Sight | None, other: Sight) -> Sight:
+    """Return what is said of a robot that two cameras show: by the one that shows it better."""
+    if known is None:
+        return other
+    first, second = sorted((known, other), key=lambda one: (WHYS.index(one.why), not one.found, one.limit_m))
+    return Sight(**{**first.__dict__, "found": first.found or second.found})
+
+
+def _unseen(robot: str) -> Sight:
+    return Sight(robot, "cut", False, math.nan, math.nan, False, math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class Word:
+    """A word that was told: of whom it was, by truth, as far as its track was one's, and by which track."""
+
+    robot: str | None
+    track: int
+    start_s: float
+    word: int
+
+
+@dataclass(frozen=True)
+class Packets:
+    """What became of packets that were sent.
+
+    Attributes
+    ----------
+    received
+        For each packet whether it was told, with the sender's track.
+    misattributed
+        How many words were told that another one sent just then: the wrong one is said to speak.
+    wrong
+        How many words nobody sent just then.
+    """
+
+    received: tuple[bool, ...]
+    misattributed: int
+    wrong: int
+
+
+def judged_packets(sent: Sequence[SentTruth], told: Sequence[Word]) -> Packets:
+    """Hold words against packets: one is a packet's that begins within half a frame, 0.55 s, of it."""
+    received = [False] * len(sent)
+    misattributed = wrong = 0
+    for word in told:
+        same = [
+            number
+            for number, packet in enumerate(sent)
+            if packet.word == word.word and abs(packet.start_s - word.start_s) < _SLACK_S
+        ]
+        own = [number for number in same if sent[number].robot == word.robot]
+        if own:
+            received[own[0]] = True
+        elif same:
+            misattributed += 1
+        else:
+            wrong += 1
+    return Packets(tuple(received), misattributed, wrong)

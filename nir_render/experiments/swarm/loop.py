@@ -1,0 +1,369 @@
+"""One robot of a swarm that stands looks around: its light is rendered once, and exposed set by set."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.camera.mean_frame import MeanFrame, Rates, electron_rates, exposed_frame, fully_lit_frame
+from nir_render.camera.shared_light import SharedLight, shared_light
+from nir_render.camera.timing.exposure_control import own_setting
+from nir_render.camera.timing.shutter import mid_exposure_s
+from nir_render.evaluate.match import MIN_VISIBLE_FRACTION
+from nir_render.experiments.loop.journal import Told
+from nir_render.experiments.loop.measurement_sight import MeasurementSight
+from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of
+from nir_render.experiments.swarm.identity import MOST, number_of, words_of
+from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights
+from nir_render.experiments.swarm.views import TRACKS
+from nir_render.randomness import RandomKey
+from nir_render.run.folder import POSES, SENT
+from nir_render.scene.pose import Pose
+from nir_render.scene.scene import Scene
+from nir_render.scene.snapshot import Snapshot
+from nir_render.simulation.calibration import calibration
+from nir_render.simulation.clock import frame_of
+from nir_render.simulation.lamps import lamp_truth
+from nir_render.simulation.sent import sent_packets
+from nir_render.simulation.truth import truth_of
+from nir_render.truth.lamps import Outline
+from nir_render.truth.poses import PoseTruth
+from perception import (
+    Calibration,
+    Detection,
+    Message,
+    Odometry,
+    Pipeline,
+    RawFrame,
+    Track,
+    detect_frames,
+    message_record,
+    track_record,
+)
+
+Array = NDArray[np.float64]
+
+SECONDS = "seconds.jsonl"
+"""How long each part of each set took, in a run's folder."""
+
+OFF = 0.01
+"""Of a block's temporal variance: by so much may light that many share be off in the mean square."""
+
+_GATE_CHI2 = 25.0
+_FLOOR_M = 0.02  # a track is not held to a place better than that
+_PAIR_S = 9.0  # the second word of a robot begins 6.65 s after the first
+
+
+@dataclass(frozen=True, kw_only=True)
+class Swarm:
+    """What a run of the experiment is.
+
+    Attributes
+    ----------
+    level
+        `frames`: rendered, exposed, and read by the whole stack. `measurements`: detections drawn about the
+        truth (`MeasurementSight`) of whom bodies do not hide; what is found of single frames is not judged.
+    robots, density_per_m2
+        How many stand in the hall, the observer among them, and how densely.
+    bodies
+        `masts` or `columns` (`hall.hall_scene`).
+    lasts_s, rate_hz
+        How long the observer looks, and how often.
+    judged_sets
+        In how many sets, evenly over the run, each robot is held against truth.
+    """
+
+    level: str = "frames"
+    robots: int = 30
+    density_per_m2: float = 1.0
+    bodies: str = "masts"
+    lasts_s: float = 60.0
+    rate_hz: float = 30.0
+    judged_sets: int = 6
+
+    @property
+    def steps(self) -> int:
+        """How many sets of frames a whole run has."""
+        return round(self.lasts_s * self.rate_hz)
+
+    @property
+    def judged(self) -> tuple[int, ...]:
+        """The numbers of the sets that are judged: none without frames."""
+        count = min(self.judged_sets, self.steps)
+        if self.level != "frames":
+            return ()
+        return tuple(sorted({int((number + 0.5) * self.steps / count) for number in range(count)}))
+
+    def loop(self, scene: Scene, seed: int) -> "SwarmLoop":
+        """Return the beginning of a run."""
+        return SwarmLoop(scene, self, seed)
+
+
+class SwarmLoop:
+    """A run in the making; a step is a set of frames of all cameras of the observer."""
+
+    def __init__(self, scene: Scene, plan: Swarm, seed: int) -> None:
+        if plan.robots > MOST:
+            raise ValueError(f"{plan.robots} robots: two words tell {MOST} apart")
+        self.plan, self.seed = plan, seed
+        self._scene = hall_scene(scene, plan.robots, plan.density_per_m2, plan.bodies, plan.lasts_s, seed)
+        self._world = self._scene.at(0.0)
+        self._others = names_of(plan.robots)[1:]
+        cameras = self._scene.document.cameras_of(OBSERVER)
+        self._known = {name: calibration(self._scene, name) for name in cameras}
+        self._pipeline = Pipeline.of("robust", self._known)
+        self._sight: MeasurementSight | None = None
+        self._rates: dict[str, Rates] = {}
+        self._followed: dict[int, str | None] = {}
+        self._done = 0
+        self._told: list[Word] = []
+        self._sights: list[list[Any]] = []
+        self._alarms = 0
+        self._standing: list[list[Any]] = []
+        self._shared: dict[str, SharedLight] = {}
+
+    @property
+    def steps(self) -> int:
+        """How many sets there are."""
+        return self.plan.steps
+
+    @property
+    def done(self) -> int:
+        """How many of them are done."""
+        return self._done
+
+    def calibrations(self) -> list[Calibration]:
+        """Return what is known of the observer's cameras."""
+        return list(self._known.values())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is rendered again to the same bits."""
+        return {**self.__dict__, "_rates": {}}
+
+    def step(self) -> Told:
+        """Take a set of frames, read it, and hold it against truth where its turn is."""
+        clock = _Clock()
+        if not self._rates and (self.plan.level == "frames" or not self._standing):
+            self._render()
+            clock.lap("render")
+        if not self._standing:
+            self._standing = [one.record() for one in self._lit()]
+            clock.lap("ceiling")
+        if self.plan.level != "frames":
+            return self._measured(clock)
+        time_s = self._done / self.plan.rate_hz
+        means, frames = {}, []
+        for name, rates in self._rates.items():
+            setting = own_setting(rates.camera, self._done)
+            begin_s = time_s - mid_exposure_s(rates.camera, setting.exposure_s)
+            means[name] = exposed_frame(rates, setting.exposure_s, begin_s)
+            key = RandomKey(self.seed, "read_out", name, self._done)
+            frames.append(frame_of(means[name].electrons, rates.camera, setting, begin_s, key))
+        clock.lap("expose")
+        found = detect_frames(frames, self._known)
+        clock.lap("detect")
+        heard = self._pipeline.follow(frames, found)
+        words = heard.messages
+        last = self._done + 1 == self.steps
+        if last:
+            words += self._pipeline.finish()
+        clock.lap("follow")
+        self._hear(words, heard.tracks)
+        if self._done in self.plan.judged:
+            self._judge(means, frames, found)
+            clock.lap("judge")
+        self._done += 1
+        lines = self._lines(words, clock)
+        if last:
+            lines[TRACKS] = [track_record(track) for track in heard.tracks]
+        return Told(lines, frames if last else [])
+
+    def _measured(self, clock: "_Clock") -> Told:
+        """Draw the detections of a set, and read them."""
+        if self._sight is None:
+            self._sight = MeasurementSight(self._scene, OBSERVER, self.seed, hidden=self._hidden())
+            self._rates = {}
+        seen = self._sight.look(_Standing(self._world, self._done / self.plan.rate_hz))
+        words = seen.messages
+        if self._done + 1 == self.steps:
+            words += self._sight.finish()
+        clock.lap("follow")
+        self._hear(words, seen.tracks)
+        self._done += 1
+        return Told(self._lines(words, clock))
+
+    def _lines(self, words: Sequence[Message], clock: "_Clock") -> dict[str, Any]:
+        """Return the lines of a set that is done: with the first one where all stand, and what they send."""
+        lines: dict[str, Any] = {
+            "messages.robust.jsonl": [message_record(word) for word in words],
+            SECONDS: [{"set": self._done - 1, **clock.laps_s}],
+        }
+        if self._done == 1:
+            poses = {name: robot.pose for name, robot in self._world.robots.items()}
+            lines[POSES] = [_standing(name, pose) for name, pose in poses.items()]
+            lines[SENT] = [packet.record() for packet in sent_packets(self._scene)]
+        return lines
+
+    def _hidden(self) -> dict[str, list[str]]:
+        """Return by camera the sources of which less than half is seen."""
+        found: dict[str, list[str]] = {}
+        for name, rates in self._rates.items():
+            table, groups = rates.light.direct, rates.light.groups
+            rows = np.flatnonzero((table.facet < 0) & (table.visible_fraction < MIN_VISIBLE_FRACTION))
+            found[name] = [groups[table.group[row]] for row in rows]
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """Return a run that is done as plain data: what could be seen, what was, and what was heard."""
+        sent = [packet for packet in sent_packets(self._scene) if packet.end_s <= self.plan.lasts_s]
+        packets = judged_packets(sent, self._told)
+        places_m = [self._world.robots[name].pose.position_m[:2] for name in names_of(self.plan.robots)]
+        return {
+            "format": 1,
+            "seed": self.seed,
+            "places_m": np.round(places_m, 4).tolist(),
+            "standing": self._standing,
+            "sights": self._sights,
+            "false_alarms": self._alarms,
+            "packets": [
+                [packet.robot, packet.word, round(packet.start_s, 4), received]
+                for packet, received in zip(sent, packets.received, strict=True)
+            ],
+            "misattributed": packets.misattributed,
+            "wrong_words": packets.wrong,
+            "identities": self._identities(),
+            "tracks": list(self._followed.values()),
+            "shared": {name: asdict(one) for name, one in self._shared.items()},
+        }
+
+    def _render(self) -> None:
+        """Render the light of every camera, without frames direct light alone; keep what exposing needs."""
+        from nir_render.transport.render import direct_lights, render
+
+        if self.plan.level != "frames":
+            lights = direct_lights(self._world, list(self._known), self.seed)
+            self._rates = {name: electron_rates(light, self._world) for name, light in lights.items()}
+            return
+        for name in self._known:
+            light = render(self._world, name, self.seed)
+            exposure_s = own_setting(self._world.camera(name).camera, 0).exposure_s
+            self._shared[name] = shared_light(light, self._world, exposure_s, OFF)
+            self._rates[name] = electron_rates(light, self._world, self._shared[name].groups)
+
+    def _hear(self, words: Sequence[Message], tracks: Sequence[Track]) -> None:
+        """Note of whom each word is, by truth: of the robot that its track follows."""
+        place = self._world.robots[OBSERVER].pose
+        others_m = np.array([self._world.sources[f"{name}.top"].pose.position_m for name in self._others])
+        others_body_m = place.to_local(others_m)
+        for track in tracks:
+            if track.ghost != "yes":
+                self._followed[track.track] = _nearest(track, others_body_m, self._others)
+        self._told += [
+            Word(self._followed.get(word.track), word.track, word.start_s, word.word) for word in words
+        ]
+
+    def _judge(
+        self, means: dict[str, MeanFrame], frames: Sequence[RawFrame], found: Sequence[Sequence[Detection]]
+    ) -> None:
+        by_camera = {frame.camera: frame for frame in frames}
+        hits = {frame.camera: each for frame, each in zip(frames, found, strict=True)}
+        lamps_px = {
+            name: [lamp.outline_px for lamp in lamp_truth(self._world, name, self._done)] for name in means
+        }
+        rows = {name: list(truth_of(mean, by_camera[name])) for name, mean in means.items()}
+        seen, alarms = sights(self._others, rows, hits, lamps_px, self._known)
+        self._sights.append([one.record() for one in seen])
+        self._alarms += alarms
+
+    def _lit(self) -> list[Sight]:
+        """Return each robot as it could be seen were all lit at once: the ceiling of what is heard."""
+        rows = {}
+        for name, rates in self._rates.items():
+            setting = own_setting(rates.camera, 0)
+            lit = fully_lit_frame(rates, setting.exposure_s)
+            key = RandomKey(self.seed, "read_out", name, 0)
+            frame = frame_of(lit.electrons, rates.camera, setting, 0.0, key)
+            rows[name] = [replace(row, on_fraction=1.0) for row in truth_of(lit, frame)]
+        none: dict[str, list[Detection]] = {name: [] for name in rows}
+        lamps_px: dict[str, list[Outline]] = {name: [] for name in rows}
+        return sights(self._others, rows, none, lamps_px, self._known)[0]
+
+    def _identities(self) -> dict[str, Any]:
+        """Return who was told to be who: numbers right, wrong, and robots that told it in full.
+
+        A track's two words are one robot's where they follow each other as a robot sends them.
+        """
+        robots = self.plan.robots
+        right: set[str] = set()
+        wrong = 0
+        by_track: dict[int, list[Word]] = {}
+        for word in self._told:
+            by_track.setdefault(word.track, []).append(word)
+        length = len(words_of(0, robots))
+        for words in by_track.values():
+            in_time = sorted(words, key=lambda word: word.start_s)
+            for first in range(len(in_time) - length + 1):
+                some = in_time[first : first + length]
+                if some[-1].start_s - some[0].start_s > _PAIR_S * (length - 1) + 1e-9:
+                    continue
+                number = number_of(tuple(word.word for word in some), robots)
+                if number is None:
+                    continue
+                told = names_of(robots)[number]
+                if told == some[-1].robot:
+                    right.add(told)
+                else:
+                    wrong += 1
+        return {"right": sorted(right), "wrong": wrong}
+
+
+def _standing(robot: str, pose: Pose) -> dict[str, Any]:
+    """Return the line of `poses.jsonl` of a robot that stands, upright."""
+    x, y, z = map(float, pose.position_m)
+    half_rad = 0.5 * math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
+    turned = (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
+    return PoseTruth(robot, 0.0, (x, y, z), turned, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)).record()
+
+
+def _nearest(track: Track, others_m: Array, names: Sequence[str]) -> str | None:
+    """Return the robot that a track follows: the likeliest, where one is within five σ."""
+    off_m = others_m - track.position_body_m
+    covariance = track.covariance[:3, :3] + _FLOOR_M**2 * np.eye(3)
+    chi2 = np.einsum("ni,ij,nj->n", off_m, np.linalg.inv(covariance), off_m)
+    best = int(np.argmin(chi2))
+    return names[best] if chi2[best] < _GATE_CHI2 else None
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """A world in which nobody moves, at a time."""
+
+    world: Snapshot
+    time_s: float
+
+    def snapshot(self) -> Snapshot:
+        """Return the world, which is always the same."""
+        return self.world
+
+    def odometry(self, _: str) -> list[Odometry]:
+        """Return none: who knows nothing of its way stands still."""
+        return []
+
+
+class _Clock:
+    """How long the parts of a step took, in seconds of this process's processors."""
+
+    def __init__(self) -> None:
+        self.laps_s: dict[str, float] = {}
+        self._last_s = (time.perf_counter(), time.process_time())
+
+    def lap(self, name: str) -> None:
+        """Note what has gone since the last lap, by the clock and of all processors."""
+        now = (time.perf_counter(), time.process_time())
+        self.laps_s[f"{name}_s"] = round(now[0] - self._last_s[0], 4)
+        self.laps_s[f"{name}_cpu_s"] = round(now[1] - self._last_s[1], 4)
+        self._last_s = now

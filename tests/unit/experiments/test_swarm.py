@@ -1,0 +1,206 @@
+"""A massive swarm that stands: who can be seen, who is whom, what is heard."""
+
+import math
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nir_render import load_scene
+from nir_render.experiments.swarm.hall import HALL, OBSERVER, hall_scene, places_m, side_m
+from nir_render.experiments.swarm.identity import number_of, words_of
+from nir_render.experiments.swarm.judge import Word, judged_packets, whys
+from nir_render.experiments.swarm.loop import Swarm, SwarmLoop
+from nir_render.experiments.swarm.outcome import Condition, Outcome
+from nir_render.experiments.swarm.page import write_outcome
+from nir_render.simulation.calibration import calibration
+from nir_render.simulation.sent import sent_packets
+from nir_render.truth.sent import SentTruth
+from nir_render.truth.sources import SourceTruth
+
+CAMERA = f"{OBSERVER}.front"
+
+
+@pytest.mark.parametrize("robots", [30, 128, 129, 1000, 3072])
+def test_words_tell_robots_apart(robots: int) -> None:
+    """Everybody's words are its own, and give its number back; beyond 128 their order can be told."""
+    said = [words_of(number, robots) for number in range(robots)]
+    assert len(set(said)) == robots
+    assert [number_of(words, robots) for words in said] == list(range(robots))
+    assert all(0 <= word < 128 for words in said for word in words)
+    if robots > 128:
+        assert all(number_of(words[::-1], robots) is None for words in said)
+        assert number_of(said[-1][:1], robots) is None
+    if robots == 1000:
+        assert number_of((31, 127), robots) is None  # it would be number 3071
+        with pytest.raises(ValueError, match="1000"):
+            words_of(1000, robots)
+
+
+def _row(u_px: float, direct_e: float = 1000.0, **changes: Any) -> SourceTruth:
+    given: dict[str, Any] = {"camera": CAMERA, "index": 0, "time_s": 0.0, "source": "top", "robot": f"at{u_px:g}", "u_px": u_px,
+             "v_px": 400.0, "range_m": 3.0, "bearing_body": (1.0, 0.0, 0.0), "direct_e": direct_e}  # fmt: skip
+    return SourceTruth(**(given | changes))
+
+
+def test_how_robots_can_be_seen() -> None:
+    """Limits: 2 px to one of a tenth of the light, 4 px, half of it seen, SNR 5, 3 px from the edge."""
+    known = calibration(load_scene(HALL), CAMERA)
+    rows = [
+        _row(100.0), _row(101.9),
+        _row(200.0), _row(202.1),
+        _row(300.0, 10_001.0), _row(301.0, 1000.0),
+        _row(350.0, visible_fraction=0.98),
+        _row(400.0, visible_fraction=0.49), _row(500.0, peak_snr=4.9), _row(600.0, 0.0, on_fraction=0.0),
+        _row(2.9),
+        _row(1276.1),
+        _row(1275.9, v_px=500.0),
+        _row(700.0, v_px=2.0),
+    ]  # fmt: skip
+    assert [why for why, _ in whys(rows, known)] == [
+        "merged", "merged",
+        "free", "free",
+        "free", "merged",
+        "eclipsed", "hidden", "faint", "dark",
+        "cut", "cut", "free", "cut",
+    ]  # fmt: skip
+    assert [near for _, near in whys(rows, known)][:4] == [True] * 4
+
+
+def test_words_are_held_against_packets() -> None:
+    sent = [SentTruth("a", "top", 3.0, 8.5, 7, "x"), SentTruth("b", "top", 3.2, 8.7, 7, "x"),
+            SentTruth("c", "top", 9.0, 14.5, 8, "x")]  # fmt: skip
+    told = [
+        Word("a", 1, 3.1, 7),  # its own
+        Word("c", 2, 3.3, 7),  # of a or b, but its track is c's
+        Word("c", 2, 9.6, 8),  # begins too late
+        Word(None, 3, 9.0, 8),  # of nobody's track
+    ]
+    packets = judged_packets(sent, told)
+    assert packets.received == (True, False, False)
+    assert (packets.misattributed, packets.wrong) == (2, 1)
+
+
+@pytest.mark.parametrize("density_per_m2", [0.5, 2.0])
+def test_robots_stand_apart_within_their_hall(density_per_m2: float) -> None:
+    places = places_m(300, density_per_m2, seed=3)
+    half_m = 0.5 * side_m(300, density_per_m2)
+    assert 300 / (2.0 * half_m) ** 2 == pytest.approx(density_per_m2)
+    apart_m = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    assert apart_m[np.triu_indices(300, 1)].min() >= 0.3
+    assert abs(places).max() <= half_m - 0.15
+    assert places[0].tolist() == [0.0, 0.0]
+
+
+def test_as_many_speak_at_a_time_as_in_a_whole_minute() -> None:
+    """Of 129 robots a share of (30 − 1.5 − 12.15) / 60 ends two packets within 30 s; each says its number."""
+    scene = hall_scene(load_scene(HALL), 400, 1.0, "masts", 30.0, seed=0)
+    packets = sent_packets(scene)
+    assert max(packet.end_s for packet in packets) <= 30.0
+    robots = {packet.robot for packet in packets}
+    expected = 399 * (30.0 - 1.5 - 12.15) / 60.0
+    assert abs(len(robots) - expected) < 4.0 * math.sqrt(expected * (1.0 - expected / 399))
+    for robot in robots:
+        words = tuple(packet.word for packet in packets if packet.robot == robot)
+        assert words == words_of(int(robot[1:]), 400)
+
+
+@pytest.mark.mitsuba
+def test_columns_hide_as_upright_cylinders_do() -> None:
+    """By hand: a source is hidden if its line to the lens meets a column of 5 cm below 25.5 cm of height."""
+    from nir_render.transport.render import direct_light
+
+    scene = hall_scene(load_scene(HALL), 120, 2.0, "columns", 10.0, seed=1)
+    world = scene.at(0.0)
+    light = direct_light(world, CAMERA, 1)
+    lens_m = world.camera(CAMERA).pose.position_m
+    axes_m = {name: robot.pose.position_m[:2] for name, robot in world.robots.items()}
+    expected, found = {}, {}
+    for group, fraction in zip(light.direct.group, light.direct.visible_fraction, strict=True):
+        robot = light.groups[group].partition(".")[0]
+        source_m = world.sources[light.groups[group]].pose.position_m
+        hidden = clear = True
+        for aside_m in (-0.009, 0.0, 0.009):  # both rims of the disc, and its middle
+            across = np.array([-(source_m - lens_m)[1], (source_m - lens_m)[0]])
+            end_m = source_m[:2] + aside_m * across / np.linalg.norm(across)
+            met = any(
+                _meets(lens_m, np.array([*end_m, source_m[2]]), axis_m)
+                for name, axis_m in axes_m.items()
+                if name not in (robot, OBSERVER)
+            )
+            hidden, clear = hidden and met, clear and not met
+        if hidden or clear:
+            expected[robot], found[robot] = hidden, bool(fraction < 0.5)
+    assert sum(expected.values()) >= 5
+    off = {robot for robot in expected if expected[robot] != found[robot]}
+    assert len(off) <= 0.02 * len(expected), off  # the upper or lower half may pass a column's top
+
+
+def _meets(lens_m: np.ndarray, source_m: np.ndarray, axis_m: np.ndarray) -> bool:
+    """Tell whether a line of sight enters an upright cylinder, by the quadratic of its place along the line."""
+    along = source_m - lens_m
+    off = lens_m[:2] - axis_m
+    a, b, c = along[:2] @ along[:2], 2.0 * off @ along[:2], off @ off - 0.05**2
+    if b * b - 4.0 * a * c <= 0.0:
+        return False
+    ends = (-b + np.array([-1.0, 1.0]) * math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
+    first, last = np.clip(ends, 0.0, 1.0)
+    return bool(last > first and lens_m[2] + first * along[2] < 0.255)
+
+
+@pytest.mark.mitsuba
+def test_a_run_that_is_saved_goes_on_to_the_same_record() -> None:
+    plan = Swarm(level="measurements", robots=12, density_per_m2=1.0, lasts_s=1.0, rate_hz=10.0)
+    scene = load_scene(HALL)
+    whole, part = plan.loop(scene, 2), plan.loop(scene, 2)
+    while whole.done < whole.steps:
+        whole.step()
+    for _ in range(4):
+        part.step()
+    again: SwarmLoop = pickle.loads(pickle.dumps(part))
+    while again.done < again.steps:
+        again.step()
+    assert again.record() == whole.record()
+    assert {sight[1] for sight in whole.record()["standing"]} <= {"free", "eclipsed", "merged", "hidden"}
+
+
+def _record(seed: int) -> dict[str, Any]:
+    """Four others: one free and found 1 σ off, one free and missed, one merged and found, one dark."""
+    sights = [
+        ["r0001", "free", False, True, 2.0, 0.02, 2.02, 0.01], ["r0002", "free", True, False, 3.0, 0.05, None, None],
+        ["r0003", "merged", True, True, 4.0, 0.1, None, None], ["r0004", "dark", False, False, 1.0, None, None, None],
+    ]  # fmt: skip
+    return {
+        "format": 1, "seed": seed, "places_m": [[0.0, 0.0], [2.0, 0.0], [0.0, 3.0], [4.0, 0.0], [1.0, 0.0]],
+        "standing": [[*sights[0]], [*sights[1]], [*sights[2]], ["r0004", "free", *sights[3][2:]]],
+        "sights": [sights, sights], "false_alarms": 3,
+        "packets": [["r0001", 1, 5.0, True], ["r0003", 3, 7.0, False], ["r0004", 4, 7.0, True]],
+        "misattributed": 1, "wrong_words": 0, "identities": {"right": ["r0001", "r0004"], "wrong": 1},
+        "tracks": ["r0001", None], "shared": {"front": {"groups": [1, 2], "mean_share": 1e-5, "worst_share": 0.004}},
+    }  # fmt: skip
+
+
+def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
+    seconds = [
+        {"set": 0, "render_cpu_s": 9.0},
+        {"set": 1, "expose_cpu_s": 0.1, "detect_cpu_s": 0.2, "follow_cpu_s": 0.1},
+    ]
+    condition = Condition(Swarm(robots=5), [_record(0), _record(1)], seconds)
+    figures = condition.figures()
+    assert (figures["lit"], figures["found"], figures["free"], figures["free_found"]) == (12, 8, 8, 4)
+    assert figures["could_be_seen"]["free"] == pytest.approx(0.75)
+    assert figures["within_4_px"] == pytest.approx(0.5)
+    assert figures["range"]["of_limit"] == pytest.approx(1.0)
+    assert figures["range"]["of_sigma"] == pytest.approx(2.0)
+    assert figures["range"]["typical_of_limit"] == pytest.approx(1.0 / 0.6745)
+    assert figures["range"]["rmse_m"] == pytest.approx(0.02)
+    assert figures["packets_by_sight"] == {"free": [4, 4], "merged": [2, 0]}
+    assert (figures["told_in_full"], figures["identities_right"], figures["identities_wrong"]) == (6, 4, 2)
+    assert figures["seconds"]["light_of_a_set"] == 9.0
+    page = write_outcome(Outcome(5, "hall", [0, 1], [condition]), tmp_path)
+    text = page.read_text()
+    assert "8 of 12" not in text
+    assert "66.67 %" in text
+    assert "20000 µs" in text
