@@ -66,7 +66,7 @@ def test_the_paper_s_line_takes_an_offset_for_an_intercept() -> None:
 
 def test_what_is_not_found_counts_and_frames_of_one_place_are_one_trial() -> None:
     """Of four places with three frames each one frame is missed; another has no range."""
-    rows = [_row(place, 1.0 + place, 1.0, 1.0 + place) for place in range(4) for _ in range(3)]
+    rows = [_row(place, 1.0 + place, 1.0 + 0.1 * k, 1.0 + place) for place in range(4) for k in range(3)]
     rows[9]["seen"]["robust"], rows[3]["seen"]["robust"]["range_m"] = None, math.nan
     frames, _ = judged(rows, 1)
     robust = figures(frames, "robust")
