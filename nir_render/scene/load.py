@@ -14,6 +14,7 @@ from nir_render.scene.problems import explain
 from nir_render.scene.scene import Scene, parse_scene
 from nir_render.scene.text.yaml_text import read_yaml
 
+_FORMAT = 1  # the newest that is read here, and the first
 _MOST_SHOWN = 400  # characters of a path
 
 
@@ -71,6 +72,13 @@ def _read_with_includes(file: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise InputError(
             f"{file}: wanted a mapping of keys such as 'format' and 'robots'; see scenes/one_source.yaml"
+        )
+    written = raw.get("format")
+    if isinstance(written, int) and written > _FORMAT:
+        # What a newer format means is not known here: its keys would be reported as wrong, one by one.
+        raise InputError(
+            f"{file}: format: {written} is newer than this nir_render reads, which is {_FORMAT}; "
+            "install a newer nir_render, or write the scene in that format"
         )
     includes = raw.pop("include", [])
     if not isinstance(includes, list) or not all(isinstance(name, str) for name in includes):

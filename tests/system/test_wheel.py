@@ -1,8 +1,11 @@
 """The wheel carries all that the packages read from beside their code."""
 
+import tomllib
 import zipfile
+from email import message_from_bytes
 from pathlib import Path
 
+import yaml
 from hatchling.builders.wheel import WheelBuilder
 
 from tests.paths import ROOT
@@ -12,6 +15,7 @@ def test_the_wheel_carries_templates_presets_and_examples(tmp_path: Path) -> Non
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
+        (about,) = (packed.read(name) for name in names if name.endswith(".dist-info/METADATA"))
     beside = {
         file.relative_to(ROOT).as_posix()
         for package in ("nir_render", "perception")
@@ -24,4 +28,13 @@ def test_the_wheel_carries_templates_presets_and_examples(tmp_path: Path) -> Non
         "nir_render/regress/check.html",
     } < beside
     assert beside <= names
-    assert "nir_render/data/scenes/empty.yaml" in names
+    for example in (ROOT / "scenes").rglob("*.yaml"):
+        assert f"nir_render/data/{example.relative_to(ROOT).as_posix()}" in names
+    assert {"nir_render/data/scenes/my_estimator.py", "nir_render/data/scenes/pallet.obj"} < names
+    assert {"sun", "export", "test"} <= set(message_from_bytes(about).get_all("Provides-Extra", []))
+
+
+def test_who_cites_the_package_names_its_version_and_licence() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert (cited["version"], cited["license"]) == (project["version"], project["license"])

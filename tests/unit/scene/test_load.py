@@ -411,3 +411,14 @@ def test_the_largest_scene_loads_again_when_all_is_written_out(tmp_path: Path) -
     scene = load_scene(SCENES / "swarm_30.yaml")
     (tmp_path / "scene.yaml").write_text(scene.resolved_yaml(), encoding="utf-8")
     assert load_scene(tmp_path / "scene.yaml").document == scene.document
+
+
+def test_a_newer_format_is_refused_whole_and_says_how_to_mend(tmp_path: Path) -> None:
+    file = tmp_path / "scene.yaml"
+    file.write_text("format: 2\nkeys_of_tomorrow: 1\n")
+    with pytest.raises(InputError) as caught:
+        load_scene(file)
+    assert str(caught.value) == (
+        f"{file}: format: 2 is newer than this nir_render reads, which is 1; "
+        "install a newer nir_render, or write the scene in that format"
+    )
