@@ -24,7 +24,7 @@ HALO_SEEMS_SIGMAS = 1.5
 HALO_GAIN = 10.0
 """2 Δ ln L that a halo must bring: noise gives χ² of three degrees of freedom, 10 twice in a hundred."""
 
-_ALIKE = 1.0  # in −2 ln of the evidence: discs that do not overlap add up to the same, but for rounding
+_ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""

@@ -5,6 +5,7 @@ else would fill a campaign with what it is not; so they are refused before the f
 """
 
 import contextlib
+import logging
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -118,6 +119,9 @@ def connected(address: str, terms: Terms) -> Iterator[Client]:
     InputError
         Nobody answers, no worker is there in time, or workers are not of one mind with this program.
     """
+    # That a scheduler goes is told by what becomes of the jobs; Dask's own log would add tracebacks.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=_ANSWERS_WITHIN_S)
     except (OSError, ValueError) as error:

@@ -43,6 +43,10 @@ _RAMP_PX = 0.4  # over which what is hidden begins: about as far as nodes lie ap
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
+_DIMMEST, _BRIGHTEST = (
+    0.5,
+    1.5,
+)  # of what is lit, over the brightness of sources: where clipped it seems dimmer
 
 _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
@@ -80,7 +84,7 @@ def eclipses(
         guesses: list[list[Start]] = []
         if one is None or (one.count == 1 and asks_for_more(one)):
             guesses = _guesses(cluster, camera)
-        of_two = [each.starts for each in (one, parted.get(index)) if each is not None and _is_pair(each)]
+        of_two = [each.starts for each in (one, parted.get(index)) if each is not None and _is_near(each)]
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
         fits.sort(key=lambda fit: fit.objective)
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
@@ -118,8 +122,13 @@ def _may_be_other(pair: Solution, camera: Camera) -> bool:
 
 
 def _is_pair(several: Solution) -> bool:
-    """Tell whether they are two, well fitted, resolved, and one within two radii of the other."""
-    if several.count != 2 or not several.left_over.is_good:
+    """Tell whether flares are two, well fitted, resolved, and one within two radii of the other."""
+    return several.left_over.is_good and _is_near(several)
+
+
+def _is_near(several: Solution) -> bool:
+    """Tell whether flares are two, resolved, and one within two radii of the other."""
+    if several.count != 2:
         return False
     apart_px = math.hypot(several.u_px[0] - several.u_px[1], several.v_px[0] - several.v_px[1])
     near_px, far_px = float(several.image_radius_px.max()), float(several.image_radius_px.min())
@@ -142,9 +151,10 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     if near_px < LEAST_RADIUS_PX:
         return []
     corner = np.array([window.box.left, window.box.top], dtype=np.float64)
-    u_px, v_px = corner + middle
+    u_px, v_px = (corner + middle).tolist()
     at_1_m_px = float(image_radius_px(u_px, v_px, math.asin(min(camera.radius_m, 1.0)), camera.calibration))
-    if not at_1_m_px > 0.0:
+    most_e = math.inf if cluster.is_clipped else level_e
+    if not at_1_m_px > 0.0 or not _is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
         return []
     guesses = []
     for sign in (1.0, -1.0):
@@ -159,6 +169,16 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
                 starts.append((u, v, math.log(at_1_m_px / radius_px)))
             guesses.append(starts)
     return guesses
+
+
+def _is_as_bright(
+    least_e: float, most_e: float, place: tuple[float, float], at_1_m_px: float, camera: Camera
+) -> bool:
+    """Tell whether pixels of so much light may be of sources, which are as bright at any range."""
+    laid, _ = lay_out(camera, np.array([place[0]]), np.array([place[1]]), np.zeros(1))
+    source_e = math.exp(float(laid.log_flux_at_1_m[0])) / (math.pi * at_1_m_px**2)
+    spread = 1.0 + 4.0 * camera.flux_spread
+    return _DIMMEST / spread * source_e < most_e and least_e < _BRIGHTEST * spread * source_e
 
 
 class _Eclipse:
