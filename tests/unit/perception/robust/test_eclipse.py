@@ -16,6 +16,7 @@ from perception.model.window import Camera
 from perception.robust.clusters import Cluster
 from perception.robust.overlap import eclipse
 from perception.robust.problem import Problem
+from perception.robust.solve import Solution
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expose, random
 
@@ -30,8 +31,8 @@ CAMERA = calibration(
 )  # fmt: skip
 
 
-def union_e_per_s(places: list[Place], share: float = 1.0) -> Array:
-    """Return what is seen of spheres at (u, v, range): each direction shows the nearest; `share` of the flux."""
+def union_e_per_s(places: list[Place]) -> Array:
+    """Return what is seen of spheres at (u, v, range): each direction shows the nearest."""
     at = (np.arange(SIDE_PX * FINE) + 0.5) / FINE - 0.5
     x, y = np.meshgrid((at - CAMERA.cx_px) / CAMERA.fx_px, (at - CAMERA.cy_px) / CAMERA.fy_px)
     cosine = 1.0 / np.sqrt(1.0 + x**2 + y**2)
@@ -40,10 +41,12 @@ def union_e_per_s(places: list[Place], share: float = 1.0) -> Array:
         middle = np.array([(u - CAMERA.cx_px) / CAMERA.fx_px, (v - CAMERA.cy_px) / CAMERA.fy_px, 1.0])
         middle /= np.linalg.norm(middle)
         # Twice the sine of half the angle between directions, without cancellation; edges soft over a sample.
-        away = np.sqrt(sum((part * cosine - one) ** 2 for part, one in zip((x, y, 1.0), middle, strict=True)))
+        away = np.sqrt(
+            (x * cosine - middle[0]) ** 2 + (y * cosine - middle[1]) ** 2 + (cosine - middle[2]) ** 2
+        )
         radius = 2.0 * math.sin(0.5 * math.asin(RADIUS_M / range_m))
         lit = np.maximum(lit, np.clip(0.5 + (radius - away) * CAMERA.fx_px * FINE, 0.0, 1.0))
-    radiance = share * FLUX_PER_S_AT_1_M / (math.pi * RADIUS_M**2)
+    radiance = FLUX_PER_S_AT_1_M / (math.pi * RADIUS_M**2)
     light = lit * radiance * cosine**4 / (CAMERA.fx_px * FINE) ** 2
     spread = gaussian_filter(light, CAMERA.psf_sigma_px * FINE, truncate=6.0)
     return np.asarray(spread.reshape(SIDE_PX, FINE, SIDE_PX, FINE).sum(axis=(1, 3)))
@@ -117,11 +120,16 @@ def test_slopes_are_those_of_what_is_expected(monkeypatch: pytest.MonkeyPatch) -
     places = _behind(1.5, 2.0, 0.5, 0.7)
     starts = [(u, v, math.log(range_m)) for u, v, range_m in places]
     seen: list[Cluster] = []
+
+    def look(found: list[Cluster], *_: object) -> dict[int, Solution]:
+        seen.extend(found)
+        return {}
+
     mean_e_per_s = union_e_per_s(places)
     exposure_s = 0.6 * 4000.0 / 0.74 / float(mean_e_per_s.max())
     frame = expose(mean_e_per_s * exposure_s + BACKGROUND_E, CAMERA, random(77, 5), exposure_s)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("perception.robust.explain.eclipses", lambda found, *_: seen.extend(found) or {})
+        patch.setattr("perception.robust.explain.eclipses", look)
         detect(frame, CAMERA)
     monkeypatch.setattr(eclipse, "_FINER", 8.0)
     known = replace(CAMERA, sigma={"range_constant_dn_m2_per_s": 0.1 * CAMERA.range_constant_dn_m2_per_s})
