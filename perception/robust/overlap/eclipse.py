@@ -20,7 +20,6 @@ from perception.model.pixels import (
     LEAST_DAMPING,
     LOG_RANGE_BOUND,
     MOST_DAMPING,
-    MOST_STEPS,
     inverted,
     objective,
     slopes,
@@ -43,6 +42,8 @@ _RAMP_PX = 0.4  # over which what is hidden begins: about as far as nodes lie ap
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
+_MOST_STEPS = 25  # what is no eclipse goes on without an end
+_LEAST_LONGER_PX = 1.0  # than wide is what is lit of two: what is round is one, whatever is left over
 _DIMMEST, _BRIGHTEST = (
     0.5,
     1.5,
@@ -148,7 +149,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
     near_px = 0.5 * (float(np.ptp(across)) + 1.0)
-    if near_px < LEAST_RADIUS_PX:
+    if near_px < LEAST_RADIUS_PX or np.ptp(along) < np.ptp(across) + _LEAST_LONGER_PX:
         return []
     corner = np.array([window.box.left, window.box.top], dtype=np.float64)
     u_px, v_px = (corner + middle).tolist()
@@ -210,7 +211,7 @@ class _Eclipse:
         gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
         damped = np.empty((size, size))
         damping, is_new = FIRST_DAMPING, True
-        for _ in range(MOST_STEPS):
+        for _ in range(_MOST_STEPS):
             if is_new:
                 variance = self._variance(self._expected)
                 slopes(
