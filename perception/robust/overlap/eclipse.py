@@ -43,7 +43,6 @@ _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
 _MOST_STEPS = 25  # what is no eclipse goes on without an end
-_LEAST_LONGER_PX = 1.0  # than wide is what is lit of two: what is round is one, whatever is left over
 _DIMMEST, _BRIGHTEST = (
     0.5,
     1.5,
@@ -149,7 +148,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
     near_px = 0.5 * (float(np.ptp(across)) + 1.0)
-    if near_px < LEAST_RADIUS_PX or np.ptp(along) < np.ptp(across) + _LEAST_LONGER_PX:
+    if near_px < LEAST_RADIUS_PX:
         return []
     corner = np.array([window.box.left, window.box.top], dtype=np.float64)
     u_px, v_px = (corner + middle).tolist()
