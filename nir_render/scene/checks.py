@@ -45,7 +45,7 @@ def check(document: SceneDocument) -> list[str]:
         *_indivisible_sensors(document),
         *_exposures_beyond_the_clock(document),
         *_uncovered_curves(document),
-        *_cameras_insidesolids(document),
+        *_cameras_inside_solids(document),
         *_cameras_and_sources_inside_their_own_bodies(document),
     ]
 
@@ -252,7 +252,7 @@ def _beyond_the_table(key: str, camera: Camera, spectra: Mapping[str, Curve]) ->
     ][:1]
 
 
-def _cameras_insidesolids(document: SceneDocument) -> list[str]:
+def _cameras_inside_solids(document: SceneDocument) -> list[str]:
     """Tell of cameras that are in a body at the time of a frame. Meshes are tested when built."""
     carriers = _carriers(document)
     if not carriers:

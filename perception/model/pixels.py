@@ -305,7 +305,7 @@ def inverted(matrix: Array, inverse: Array) -> float:
 
 
 @compiled
-def _is_inside(values: Array, view: View, count: int, step: int) -> bool:
+def is_inside(values: Array, view: View, count: int, step: int) -> bool:
     """Tell whether all sources are on the window's pixels, at ranges and motions that can be."""
     rows, columns = view.image_e.shape
     for at in range(0, count * step, step):
@@ -374,7 +374,7 @@ def maximise(
                 shift += damped[one, other] * gradient[other]
             trial[one] = values[one] + min(max(shift, -most_step[one]), most_step[one])
         is_new = False
-        if _is_inside(trial, view, count, step):
+        if is_inside(trial, view, count, step):
             expectation(trial, view, sources, structure, known, new_expected, new_jacobian, new_variance)
             before, _ = objective(view, values, expected, variance, precision, clip_e)
             after, _ = objective(view, trial, new_expected, variance, precision, clip_e)

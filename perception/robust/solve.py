@@ -247,9 +247,9 @@ class Fit:
 def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
-    hidden_px = _hidden_px_at_1_m(own, camera)
+    hidden_px = hidden_px_at_1_m(own, camera)
     background_e = np.concatenate([fit.background_e for fit in fits])
-    hidden_e = hidden_e_at_1_m(own, background_e, camera)
+    hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
     motion_px = _motion_px(own, fits[0])
     laid_px = None if motion_px is None else motion_px + _LINE_KEPT_PX
     laid, imaged = lay_out(camera, own[:, 0], own[:, 1], log_range_by_size(own, fits[0]), hidden_e, laid_px)
@@ -276,13 +276,7 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     ]
 
 
-def hidden_e_at_1_m(own: Array, background_e: Array, camera: Camera) -> Array | None:
-    """Return how much of such backgrounds each source would take away from one metre; None if nothing."""
-    hidden_px = _hidden_px_at_1_m(own, camera)
-    return None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
-
-
-def _hidden_px_at_1_m(own: Array, camera: Camera) -> Array | None:
+def hidden_px_at_1_m(own: Array, camera: Camera) -> Array | None:
     """Return of how many pixels' background each source would take away from one metre; None if of none."""
     hiding = camera.calibration.hidden_background
     return hiding * covered_px_at_1_m(own[:, :2], camera.calibration) if hiding else None

@@ -118,8 +118,8 @@ def _beside(outcome: Outcome) -> Table:
          f"{figures['commands_read']} of {figures['commands']}", "all"),
         ("reached after the reading", "by its marks, a packet taken off: −0.5, 0.5, 0.5 s",
          f"{_seconds(figures['reached_latest_s'])} at the latest", f"{_seconds(latest)} by truth"),
-        ("worst pair while held", "not said", _metres(figures["worst_pair_held_m"]),
-         f"{_metres(max(held, default=None))} by truth"),
+        ("worst pair while held", "not said", metres(figures["worst_pair_held_m"]),
+         f"{metres(max(held, default=None))} by truth"),
         ("bit error rate", "< 0.1 %", rate, _bit_limit(outcome)),
         ("packets", "not said", f"{figures['packets_received']} of {figures['packets']} read", "all"),
         ("words that were not sent", "not said", str(figures["wrong_words"]), "none"),
@@ -147,7 +147,7 @@ def _seeds(outcome: Outcome) -> Table:
             str(run.seed), "yes" if run.judged.met else "no",
             ", ".join("–" if one.read_s is None else f"{one.read_s - one.ended_s:.1f}" for one in commands),
             ", ".join("–" if one.reached_s is None else f"{one.reached_s:.1f}" for one in commands),
-            ", ".join(_metres(one.worst_m) for one in commands),
+            ", ".join(metres(one.worst_m) for one in commands),
             f"{run.judged.received} of {run.judged.packets}",
             f"{run.record['wrong_bits']} of {run.record['bits']}",
         )  # fmt: skip
@@ -214,7 +214,3 @@ def _reached(one: Command) -> float:
 
 def _seconds(value: float | None) -> str:
     return "–" if value is None or not np.isfinite(value) else f"{value:.1f} s"
-
-
-def _metres(value: float | None) -> str:
-    return "–" if value is None else metres(value)

@@ -66,8 +66,8 @@ def sentence(outcome: Outcome) -> str:
     figures, count = outcome.record(), len(outcome.runs)
     return (
         f"Spacing error below 5 cm in {figures['below_5_cm']} of {count} runs, "
-        f"{_metres(figures['spacing_error_median_m'])} in the median, "
-        f"{_metres(figures['loss_against_truth_median_m'])} of it more than by truth; "
+        f"{metres(figures['spacing_error_median_m'])} in the median, "
+        f"{metres(figures['loss_against_truth_median_m'])} of it more than by truth; "
         f"neighbours' mean distances within 5 cm of each other in {figures['spread_below_5_cm']}; "
         f"bodies touched in {figures['touched']}."
     )
@@ -78,10 +78,10 @@ def _beside(outcome: Outcome) -> Table:
     truth = [run.spacing.error_m for run in outcome.by_truth if run.spacing.valid]
     middle, most = figures["spacing_error_median_m"], figures["spacing_error_largest_m"]
     below = f"below 5 cm in {figures['below_5_cm']} of {count}"
-    by_truth = _metres(float(np.median(truth)) if truth else None)
+    by_truth = metres(float(np.median(truth)) if truth else None)
     apart_m = math.fsum(run.spacing.all_pairs_m for run in outcome.by_truth) / count
-    found = f"{_metres(middle)} in the median, {_metres(most)} at most; {below}"
-    pairs = f"{_metres(figures['mean_distance_of_all_pairs_m'])}, all pairs"
+    found = f"{metres(middle)} in the median, {metres(most)} at most; {below}"
+    pairs = f"{metres(figures['mean_distance_of_all_pairs_m'])}, all pairs"
     rows = [
         ("spacing error", "< 5 cm, not defined", found, f"{by_truth} by truth"),
         ("average distance", "1 m, of whom is not said", pairs, f"{metres(apart_m)} by truth"),
@@ -117,7 +117,3 @@ def _conditions(outcome: Outcome) -> Table:
         *frame_rows(plan, outcome.record()["held_light_share_largest"]),
     ]
     return Table((), rows)
-
-
-def _metres(value: float | None) -> str:
-    return "–" if value is None else metres(value)

@@ -66,7 +66,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
 def sentence(outcome: Outcome) -> str:
     """Say in a sentence what was found."""
     figures = outcome.record()
-    said = ", ".join(f"{name} {_metres(figures['stacks'][name]['mae_m'])}" for name in STACKS)
+    said = ", ".join(f"{name} {metres(figures['stacks'][name]['mae_m'])}" for name in STACKS)
     found = ", ".join(
         f"{name} {figures['stacks'][name]['found']} of {figures['stacks'][name]['frames']}" for name in STACKS
     )
@@ -79,9 +79,9 @@ def sentence(outcome: Outcome) -> str:
 def _beside(figures: dict[str, Any]) -> Table:
     stacks = figures["stacks"]
     rows = [
-        ("range MAE, 1 to 10 m", "2.8 cm", *(_metres(stacks[name]["mae_m"]) for name in STACKS),
+        ("range MAE, 1 to 10 m", "2.8 cm", *(metres(stacks[name]["mae_m"]) for name in STACKS),
          metres(figures["ideal_mae_m"])),
-        ("bias", "not said", *(_metres(stacks[name]["bias_m"], signed=True) for name in STACKS), "none"),
+        ("bias", "not said", *(metres(stacks[name]["bias_m"], signed=True) for name in STACKS), "none"),
         ("of places held out: found without a range", "not said",
          *(str(stacks[name]["without_a_range"]) for name in STACKS), "0"),
         ("detection, 300 to 800 lx", "> 99.8 %", *(_found(stacks[name]) for name in STACKS), "100 %"),
@@ -105,8 +105,8 @@ def _places(figures: dict[str, Any]) -> str:
 
 def _levels(figures: dict[str, Any]) -> Table:
     rows = [
-        (f"{lux} lx", name, _metres(one["mae_m"]), _metres(one["rmse_m"]),
-         _metres(one["bias_m"], signed=True), _of(one), _places(one),
+        (f"{lux} lx", name, metres(one["mae_m"]), metres(one["rmse_m"]),
+         metres(one["bias_m"], signed=True), _of(one), _places(one),
          str(one["false_alarms"]))
         for lux, stacks in figures["levels_lx"].items()
         for name, one in stacks.items()
@@ -151,7 +151,3 @@ def error_plot(outcome: Outcome) -> Drawing:
         axes.set_ylabel("absolute error of the range in m")
         legend(axes)
         return Drawing(svg_of(figure), "absolute error of the range against the range, both stacks")
-
-
-def _metres(value: float | None, *, signed: bool = False) -> str:
-    return "–" if value is None else metres(value, signed=signed)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -136,7 +136,7 @@ def _better(known: Sight | None, other: Sight) -> Sight:
     if known is None:
         return other
     first, second = sorted((known, other), key=lambda one: (WHYS.index(one.why), not one.found, one.limit_m))
-    return Sight(**{**first.__dict__, "found": first.found or second.found})
+    return replace(first, found=first.found or second.found)
 
 
 def _unseen(robot: str) -> Sight:

@@ -151,7 +151,7 @@ def _ranges(figures: dict[str, Any]) -> Table:
     for one in figures["conditions"]:
         said = one["range"]
         rows.append(
-            (*_where(one), f"{said['number']:.0f}", *(_metres(said[name]) for name in ("rmse_m", "limit_m")),
+            (*_where(one), f"{said['number']:.0f}", *(metres(said[name]) for name in ("rmse_m", "limit_m")),
              *(_number(said[name]) for name in ("of_limit", "typical_of_limit", "bias_sigmas", "of_sigma")))
         )  # fmt: skip
     headings = (
@@ -291,10 +291,6 @@ def _number(value: float | None) -> str:
 
 def _seconds(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} s"
-
-
-def _metres(value: float | None) -> str:
-    return "–" if value is None else metres(value)
 
 
 def _ratio(number: int, of: int) -> float:

@@ -18,9 +18,9 @@ from perception.model.layout import Sources, View
 from perception.model.pixels import (
     FIRST_DAMPING,
     LEAST_DAMPING,
-    LOG_RANGE_BOUND,
     MOST_DAMPING,
     inverted,
+    is_inside,
     objective,
     slopes,
     spread_nodes,
@@ -30,7 +30,7 @@ from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.deblend import asks_for_more
 from perception.robust.problem import Problem, Start
-from perception.robust.solve import Fit, Solution, hidden_e_at_1_m, log_range_by_size, solutions_of
+from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
 Array = NDArray[np.float64]
 
@@ -222,16 +222,17 @@ class _Eclipse:
                     return False
                 if gradient @ inverse @ gradient < _SETTLED:
                     break
+                before = self._objective(fit.values, self._expected, variance)
             np.copyto(damped, fisher)
             np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))
             if math.isnan(inverted(damped, damped)):
                 return False
             trial = fit.values + np.clip(damped @ gradient, -fit.layout.most_step, fit.layout.most_step)
             is_new = False
-            if self._is_inside(trial):
+            if is_inside(trial, self._view, fit.layout.sources, fit.layout.per_source):
                 expected, jacobian = self._expectation(trial)
                 after = self._objective(trial, expected, variance)
-                is_new = after <= self._objective(fit.values, self._expected, variance) * (1.0 + 1e-9) + 1e-9
+                is_new = after <= before * (1.0 + 1e-9) + 1e-9
             if is_new:
                 fit.values[:], self._expected, self._jacobian = trial, expected, jacobian
                 damping = max(0.1 * damping, LEAST_DAMPING)
@@ -261,20 +262,14 @@ class _Eclipse:
         total, logs = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
         return float(total + logs) if variance is None else float(total)
 
-    def _is_inside(self, values: Array) -> bool:
-        rows, columns = self._fit.window.image_e.shape
-        own = self._fit.layout.of_sources(values)
-        column, row = own[:, 0] - self._view.left, own[:, 1] - self._view.top
-        on_pixels = (column > -0.5) & (column < columns - 0.5) & (row > -0.5) & (row < rows - 0.5)
-        return bool((on_pixels & (abs(own[:, 2]) < LOG_RANGE_BOUND)).all())
-
     def _expectation(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
         fit, known, layout = self._fit, self._fit.known, self._fit.layout
         own = layout.of_sources(values)
         background_e = float(values[layout.background])
         by_size = log_range_by_size(own, fit)
-        hidden_e = hidden_e_at_1_m(own, np.full(len(own), background_e), self._camera)
+        hidden_px = hidden_px_at_1_m(own, self._camera)
+        hidden_e = None if hidden_px is None else hidden_px * max(background_e, 0.0)
         near = int(np.argmin(by_size))
         far = 1 - near
         jacobian = np.zeros((layout.size, fit.window.image_e.size))
