@@ -6,18 +6,22 @@ disk, so that only the first call on a machine (`make setup` makes it) takes lon
 without being compiled, far slower, where the variable NUMBA_DISABLE_JIT is set: to follow it in a debugger,
 and for the test that holds that both find the same.
 
-What is kept on disk is renewed when the file of a function changes, not when another does. So a compiled
-function calls compiled functions of its own file alone (a test holds it), and the constants and named tuples
-that its file takes from others are a part of what it is known by.
+What is kept on disk is renewed when the file of a function changes, not when another does. So what its file
+takes from others is a part of what a function is known by: constants, named tuples, and the files of the
+compiled functions that it calls.
 """
 
+import hashlib
 import types
 import warnings
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 from typing import ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core.dispatcher import Dispatcher
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -42,15 +46,24 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
 
 def _with_constants(function: types.FunctionType) -> types.FunctionType:
-    """Return a function with the constants of its file in a closure: by that Numba tells functions apart."""
+    """Return a function with what it takes from other files in a closure, by which Numba knows it.
+
+    These are constants, and the files of compiled functions that it calls, with all that these take.
+    """
     held = tuple(
         (name, value.tobytes() if isinstance(value, np.ndarray) else getattr(value, "_fields", value))
         for name, value in sorted(function.__globals__.items())
         if name.upper() == name or hasattr(value, "_fields")
     )
+    called = tuple(
+        (name, _file_digest(own.__code__.co_filename), own.__closure__[-1].cell_contents)
+        for name in function.__code__.co_names
+        if isinstance(value := function.__globals__.get(name), Dispatcher)
+        and (own := value.py_func).__code__.co_filename != function.__code__.co_filename
+    )
     code = function.__code__
     code = code.replace(co_freevars=(*code.co_freevars, "constants"))
-    closure = (*(function.__closure__ or ()), types.CellType(repr(held)))
+    closure = (*(function.__closure__ or ()), types.CellType(repr((held, called))))
     made = types.FunctionType(code, function.__globals__, function.__name__, function.__defaults__, closure)
     made.__doc__, made.__module__, made.__qualname__ = (
         function.__doc__,
@@ -59,3 +72,8 @@ def _with_constants(function: types.FunctionType) -> types.FunctionType:
     )
     made.__annotations__ = function.__annotations__
     return made
+
+
+@lru_cache(maxsize=64)
+def _file_digest(path: str) -> str:
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
