@@ -1,14 +1,20 @@
-"""The normal distribution in cubics: far quicker than its functions, and as exact as an image needs."""
+"""The normal distribution: over a row of pixels, in cubics as exact as an image needs, and its upper tail."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
+
+Array = NDArray[np.float64]
+
 REACH_SIGMAS = 6.0
 """Beyond this nothing of a point's light counts: 10⁻⁹ on either side."""
 
 STEP = 1.0 / 32.0
+
+_SQRT_HALF, _LOG_SQRT_2_PI = math.sqrt(0.5), 0.5 * math.log(2.0 * math.pi)
 
 
 def _table() -> NDArray[np.float64]:
@@ -30,3 +36,55 @@ def _table() -> NDArray[np.float64]:
 
 
 NORMAL = _table()
+
+
+@compiled
+def shares(at_px: float, count: int, sigma_px: float, into: Array) -> tuple[int, int]:
+    """Spread a point along a row of pixels.
+
+    Writes each pixel's share of a Gaussian, its derivative by place and that by ln σ, into rows 0, 1 and 2 of
+    `into`, shape (3, count), and returns the first pixel reached and the one after the last.
+    """
+    reach_px = REACH_SIGMAS * sigma_px
+    if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):
+        return 0, 0
+    first = max(0, math.ceil(at_px - reach_px - 0.5))
+    end = min(count, math.floor(at_px + reach_px + 0.5) + 1)
+    below, density, moment = 0.0, 0.0, 0.0
+    for edge in range(first, end + 1):
+        away = min(max((edge - 0.5 - at_px) / sigma_px, -REACH_SIGMAS), REACH_SIGMAS)
+        place = (away + (REACH_SIGMAS + 2.0 * STEP)) / STEP
+        step = int(place)
+        cubic, t = NORMAL[step], place - step
+        next_below = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
+        next_density = (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7]))) / sigma_px
+        next_moment = sigma_px * away * next_density
+        if edge > first:
+            into[0, edge - 1] = next_below - below
+            into[1, edge - 1] = density - next_density
+            into[2, edge - 1] = moment - next_moment
+        below, density, moment = next_below, next_density, next_moment
+    return first, end
+
+
+@compiled
+def log_upper_tail(z: float) -> float:
+    """Return ln Q(z) of the normal distribution: to 10⁻⁸ beyond z = 36, where Q itself is too small."""
+    if z < 0.0:
+        return math.log1p(-0.5 * math.erfc(-z * _SQRT_HALF))
+    if z < 36.0:
+        return math.log(0.5 * math.erfc(z * _SQRT_HALF))
+    z2 = z * z
+    return -0.5 * z2 - _LOG_SQRT_2_PI - math.log(z) + math.log1p(-(1.0 - 3.0 / z2) / z2)
+
+
+@compiled
+def of_clipped(z: float) -> tuple[float, float, float]:
+    """Return φ/Q, the curvature of ln Q, and the share of its information that such a pixel keeps."""
+    z = min(max(z, -38.0), 1e4)
+    log_tail = log_upper_tail(z)
+    mills = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI - log_tail)
+    curvature = min(max(mills * (mills - z), 0.0), 1.0)
+    density = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI)
+    kept = 1.0 - math.exp(log_tail) - z * density + density * mills
+    return mills, curvature, min(max(kept, 0.0), 1.0)

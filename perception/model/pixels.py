@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
-from perception.model.normal import NORMAL, REACH_SIGMAS, STEP
+from perception.model.normal import log_upper_tail, of_clipped, shares
 
 Array = NDArray[np.float64]
 
@@ -22,37 +22,6 @@ SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 MOST_STEPS, LEAST_PIVOT = 50, 1e-10
 LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
-
-_SQRT_HALF, _LOG_SQRT_2_PI = math.sqrt(0.5), 0.5 * math.log(2.0 * math.pi)
-
-
-@compiled
-def shares(at_px: float, count: int, sigma_px: float, into: Array) -> tuple[int, int]:
-    """Spread a point along a row of pixels.
-
-    Writes each pixel's share of a Gaussian, its derivative by place and that by ln σ, into rows 0, 1 and 2 of
-    `into`, shape (3, count), and returns the first pixel reached and the one after the last.
-    """
-    reach_px = REACH_SIGMAS * sigma_px
-    if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):
-        return 0, 0
-    first = max(0, math.ceil(at_px - reach_px - 0.5))
-    end = min(count, math.floor(at_px + reach_px + 0.5) + 1)
-    below, density, moment = 0.0, 0.0, 0.0
-    for edge in range(first, end + 1):
-        away = min(max((edge - 0.5 - at_px) / sigma_px, -REACH_SIGMAS), REACH_SIGMAS)
-        place = (away + (REACH_SIGMAS + 2.0 * STEP)) / STEP
-        step = int(place)
-        cubic, t = NORMAL[step], place - step
-        next_below = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
-        next_density = (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7]))) / sigma_px
-        next_moment = sigma_px * away * next_density
-        if edge > first:
-            into[0, edge - 1] = next_below - below
-            into[1, edge - 1] = density - next_density
-            into[2, edge - 1] = moment - next_moment
-        below, density, moment = next_below, next_density, next_moment
-    return first, end
 
 
 @compiled
@@ -162,29 +131,6 @@ def expectation(
 
 
 @compiled
-def log_upper_tail(z: float) -> float:
-    """Return ln Q(z) of the normal distribution: to 10⁻⁸ beyond z = 36, where Q itself is too small."""
-    if z < 0.0:
-        return math.log1p(-0.5 * math.erfc(-z * _SQRT_HALF))
-    if z < 36.0:
-        return math.log(0.5 * math.erfc(z * _SQRT_HALF))
-    z2 = z * z
-    return -0.5 * z2 - _LOG_SQRT_2_PI - math.log(z) + math.log1p(-(1.0 - 3.0 / z2) / z2)
-
-
-@compiled
-def _of_clipped(z: float) -> tuple[float, float, float]:
-    """Return φ/Q, the curvature of ln Q, and the share of its information that such a pixel keeps."""
-    z = min(max(z, -38.0), 1e4)
-    log_tail = log_upper_tail(z)
-    mills = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI - log_tail)
-    curvature = min(max(mills * (mills - z), 0.0), 1.0)
-    density = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI)
-    kept = 1.0 - math.exp(log_tail) - z * density + density * mills
-    return mills, curvature, min(max(kept, 0.0), 1.0)
-
-
-@compiled
 def _information(jacobian: Array, weight: Array, into: Array) -> None:
     """Add J W Jᵀ."""
     size, pixels = jacobian.shape
@@ -228,7 +174,7 @@ def slopes(
             pull[pixel] = (image[pixel] - expected[pixel]) / variance[pixel]
         elif math.isfinite(clip_e):
             sigma = math.sqrt(variance[pixel])
-            mills, curvature, kept = _of_clipped((clip_e - expected[pixel]) / sigma)
+            mills, curvature, kept = of_clipped((clip_e - expected[pixel]) / sigma)
             pull[pixel] = mills / sigma
             weight[pixel] *= kept if of_average else curvature
     information[:] = precision
@@ -305,6 +251,39 @@ def inverted(matrix: Array, inverse: Array) -> float:
 
 
 @compiled
+def _add_bends(
+    view: View, expected: Array, jacobian: Array, variance: Array, of: tuple[int, int, int], into: Array
+) -> None:
+    """Add to an information how ln L bends with motions beside it, where that is downwards.
+
+    A motion m adds ∂ᵢ∂ⱼ(F S) mᵢ mⱼ / 24 to a flare's light: of that first order in m's square Fisher's
+    information knows nothing across a short m, and steps by it alone go to and fro. For the steps alone:
+    second derivatives are differences of first ones. `of` is how many sources there are, how many unknowns
+    each has, and in how many columns the pixels lie.
+    """
+    count, step, columns = of
+    image, state = view.image_e.ravel(), view.state.ravel()
+    for at in range(0, count * step, step):
+        uu, uv, vv = 0.0, 0.0, 0.0
+        for pixel in range(columns + 1, len(expected) - columns - 1):
+            if state[pixel] != SEEN:
+                continue
+            pull = (image[pixel] - expected[pixel]) / (24.0 * variance[pixel])
+            uu += pull * (jacobian[at, pixel + 1] - jacobian[at, pixel - 1])
+            vv += pull * (jacobian[at + 1, pixel + columns] - jacobian[at + 1, pixel - columns])
+            uv += pull * (jacobian[at, pixel + columns] - jacobian[at, pixel - columns])
+        # Of the two bends along the axes of a symmetric matrix those that are positive.
+        mean, half = 0.5 * (uu + vv), math.hypot(0.5 * (uu - vv), uv)
+        larger, smaller = max(mean + half, 0.0), max(mean - half, 0.0)
+        cosine, sine = (0.5 * (uu - vv) / half, uv / half) if half > 0.0 else (1.0, 0.0)
+        even, odd, motion = 0.5 * (larger + smaller), 0.5 * (larger - smaller), at + step - 2
+        into[motion, motion] += even + odd * cosine
+        into[motion + 1, motion + 1] += even - odd * cosine
+        into[motion, motion + 1] += odd * sine
+        into[motion + 1, motion] += odd * sine
+
+
+@compiled
 def is_inside(values: Array, view: View, count: int, step: int) -> bool:
     """Tell whether all sources are on the window's pixels, at ranges and motions that can be."""
     rows, columns = view.image_e.shape
@@ -366,6 +345,8 @@ def maximise(
         for one in range(size):
             damped[one] = fisher[one]
             damped[one, one] *= 1.0 + damping
+        if known.motion_px > 0.0:
+            _add_bends(view, expected, jacobian, variance, (count, step, view.image_e.shape[1]), damped)
         if math.isnan(inverted(damped, damped)):
             return math.inf, math.inf
         for one in range(size):

@@ -57,7 +57,7 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
     return {
         index: weighed(fit, at_rest) if fit.cost < at_rest.cost else weighed(at_rest, fit)
         for (index, at_rest), fit in zip(tried, fits, strict=True)
-        if fit is not None and fit.most_motion_px <= MOST_MOTION_PX
+        if fit is not None and LEAST_PX <= fit.most_motion_px <= MOST_MOTION_PX
     }
 
 
