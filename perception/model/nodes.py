@@ -56,6 +56,7 @@ def disc_nodes(
     angular_radius_rad: Array,
     calibration: Calibration,
     moved_px: Array | None = None,
+    finer: Array | None = None,
 ) -> DiscNodes:
     """Return quadrature nodes over the caps of spheres, as many for each as its image needs.
 
@@ -68,11 +69,14 @@ def disc_nodes(
         Intrinsics, PSF and response.
     moved_px
         How far each moves at most during the exposure, shape (sources,); by default nothing does.
+    finer
+        By how much nearer together nodes are to lie than a whole image needs, shape (sources,); by default 1.
     """
     # The pixel smooths like a box of variance 1/12 px², on top of the PSF.
     smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
     radius_px = stretch(direction, calibration) * np.tan(angular_radius_rad)
-    rules = [_cap_rule(fineness) for fineness in np.ceil(2.0 * radius_px / smooth_px).astype(int).tolist()]
+    fineness = 2.0 * radius_px / smooth_px if finer is None else 2.0 * radius_px / (smooth_px / finer)
+    rules = [_cap_rule(each) for each in np.ceil(fineness).astype(int).tolist()]
     first = np.cumsum([0, *(rule.shape[1] for rule in rules)])
     omega, weight = _over_caps(
         first,

@@ -136,6 +136,7 @@ def lay_out(
     log_range: Array,
     hidden_e: Array | None = None,
     moved_px: Array | None = None,
+    finer: Array | None = None,
 ) -> tuple[Sources, NDArray[np.bool_]]:
     """Lay sources out as quadrature nodes, all of them at once.
 
@@ -150,6 +151,8 @@ def lay_out(
         By default nothing.
     moved_px
         How far each moves at most during the exposure, shape (sources,). By default nothing does.
+    finer
+        As for `nodes.disc_nodes`.
 
     Returns
     -------
@@ -167,7 +170,7 @@ def lay_out(
         u_px, v_px = np.where(imaged, u_px, calibration.cx_px), np.where(imaged, v_px, calibration.cy_px)
         direction = np.where(imaged[:, None], direction, (0.0, 0.0, 1.0))
         radius_rad = np.where(imaged, radius_rad, 0.0)
-    nodes = disc_nodes(u_px, v_px, direction, radius_rad, calibration, moved_px)
+    nodes = disc_nodes(u_px, v_px, direction, radius_rad, calibration, moved_px, finer)
     log_flux_at_1_m = np.log(np.where(at_1_m_e > 0.0, at_1_m_e, 1.0))
     at = np.ascontiguousarray(log_range)
     sources = Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.along, nodes.weight, at, log_flux_at_1_m)

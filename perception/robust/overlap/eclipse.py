@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import pixel_turn
 from perception.model.flare import image_radius_px
-from perception.model.layout import Sources, View
+from perception.model.layout import View
 from perception.model.pixels import (
     FIRST_DAMPING,
     LEAST_DAMPING,
@@ -23,12 +23,12 @@ from perception.model.pixels import (
     is_inside,
     objective,
     slopes,
-    spread_nodes,
 )
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.deblend import asks_for_more
+from perception.robust.overlap.hidden import expectation_of_two
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
@@ -38,7 +38,6 @@ LEAST_RADIUS_PX = 1.5
 """Smaller images tell hardly anything of which of two hides the other."""
 
 _SMALLEST_PX = 0.5  # of the one behind
-_RAMP_PX = 0.4  # over which what is hidden begins: about as far as nodes lie apart
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
@@ -188,12 +187,11 @@ class _Eclipse:
         self._fit = fit = Fit(problem, camera)
         self._camera = camera
         box, window = fit.window.box, fit.window
-        self._known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
-        self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, self._known_e)
+        known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
+        self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
         self._prior = fit.layout.prior(fit.structure, 0.0)
-        smooth_px2 = (camera.calibration.psf_sigma_px**2 + 1.0 / 12.0) / _FINER**2
-        sigma_px = math.sqrt(max(smooth_px2 - 1.0 / 12.0, 0.0))
-        self._finer = replace(camera, calibration=replace(camera.calibration, psf_sigma_px=sigma_px))
+        # No finer than what a pixel alone smooths asks for.
+        self._finer = min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))
         self._expected, self._jacobian = self._expectation(fit.values)
         self.objective = self._objective(fit.values, self._expected)
 
@@ -264,98 +262,23 @@ class _Eclipse:
 
     def _expectation(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
-        fit, known, layout = self._fit, self._fit.known, self._fit.layout
+        fit, camera, layout = self._fit, self._camera, self._fit.layout
         own = layout.of_sources(values)
-        background_e = float(values[layout.background])
         by_size = log_range_by_size(own, fit)
-        hidden_px = hidden_px_at_1_m(own, self._camera)
-        hidden_e = None if hidden_px is None else hidden_px * max(background_e, 0.0)
         near = int(np.argmin(by_size))
-        far = 1 - near
-        jacobian = np.zeros((layout.size, fit.window.image_e.size))
-        jacobian[layout.background] = 1.0
-        jacobian[layout.background + 1 :] = fit.structure.columns
-        expected = (
-            background_e + self._known_e.ravel() + values[layout.background + 1 :] @ fit.structure.columns
-        )
-        sigma_px = known.psf_sigma_px
-        if layout.has_width:
-            sigma_px *= math.exp(known.width_spread * float(values[layout.width]))
-        step = layout.per_source
-        for source, camera in ((near, self._camera), (far, self._finer)):
-            these = slice(source, source + 1)
-            of_hidden = None if hidden_e is None else hidden_e[these]
-            laid, imaged = lay_out(camera, own[these, 0], own[these, 1], by_size[these], of_hidden)
-            fit.log_flux_at_1_m[source] = laid.log_flux_at_1_m[0]
-            fit.image_radius_px[source] = laid.reach_px[0]
-            flux = math.exp(float(laid.log_flux_at_1_m[0]) - 2.0 * float(own[source, 2]))
-            flux = flux if imaged[0] else math.nan  # nowhere to go on to
-            by_place, by_near = np.zeros((3, expected.size)), np.zeros((3, expected.size))
-            if source == far:
-                laid, by_place, by_near = self._behind(laid, own, near, sigma_px)
-            image = self._spread(laid, own[source], sigma_px)
-            grown = image[3] + by_place[2]
-            expected = expected + flux * image[0]
-            at, of_near = source * step, near * step
-            jacobian[at : at + 2] += flux * (image[1:3] + by_place[:2])
-            jacobian[at + 2] -= flux * (2.0 * image[0] + grown)
-            jacobian[of_near : of_near + 2] += flux * by_near[:2]
-            jacobian[of_near + 2] -= flux * by_near[2]
-            if layout.has_slack:
-                jacobian[at + 3] += known.tie_spread * flux * grown
-                jacobian[of_near + 3] += known.tie_spread * flux * by_near[2]
-            if layout.has_width:
-                jacobian[layout.width] += known.width_spread * flux * image[4]
-        return expected, jacobian
-
-    def _behind(self, laid: Sources, own: Array, near: int, sigma_px: float) -> tuple[Sources, Array, Array]:
-        """Return of the farther source what stands out, and how that changes.
-
-        The changes, shape (3, pixels) each, are those of its share of light in each pixel by its own column,
-        row and ln size, and by column, row and ln size of the nearer, for what is hidden alone.
-        """
-        camera, far = self._camera, 1 - near
-        offset = np.column_stack([laid.node_u_px, laid.node_v_px])
-        away_px = own[far, :2] + offset - own[near, :2]
+        hidden_px = hidden_px_at_1_m(own, camera)
+        hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
+        finer = np.where(np.arange(2) == near, 1.0, self._finer)
+        laid, imaged = lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=finer)
+        fit.log_flux_at_1_m, fit.image_radius_px = laid.log_flux_at_1_m, laid.reach_px
+        flux = np.exp(laid.log_flux_at_1_m - 2.0 * own[:, 2])
+        flux[~imaged] = math.nan  # nowhere to go on to
         turn = pixel_turn(own[near : near + 1, :2], camera.calibration)[0]
-        away = away_px @ turn
-        apart_rad = np.sqrt((away**2).sum(axis=1))
-        size = math.exp(-float(log_range_by_size(own[near : near + 1], self._fit)[0]))
-        radius_rad = math.asin(min(camera.radius_m * size, 1.0))
-        ramp_rad = _RAMP_PX * float(np.linalg.norm(turn, ord=2))
-        stands_out = 0.5 + (apart_rad - radius_rad) / ramp_rad
-        ramp = (stands_out > 0.0) & (stands_out < 1.0)
-        # By how much more of a node stands out as it moves away, by column and row.
-        slope = (away / (np.maximum(apart_rad, 1e-12) * ramp_rad)[:, None]) @ turn.T
-        weights = laid.weight * np.array(
-            [
-                slope[:, 0],
-                slope[:, 1],
-                (slope * offset).sum(axis=1),
-                np.full(len(slope), -radius_rad / ramp_rad),
-            ]
-        )
-        edge = _chosen(laid, ramp)
-        changes = np.stack(
-            [self._spread(edge._replace(weight=one[ramp]), own[far], sigma_px)[0] for one in weights]
-        )
-        seen = laid._replace(weight=laid.weight * np.clip(stands_out, 0.0, 1.0))
-        return seen, changes[:3], np.stack([-changes[0], -changes[1], changes[3]])
-
-    def _spread(self, laid: Sources, own: Array, sigma_px: float) -> Array:
-        """Return shares of light in each pixel, and derivatives, as `spread_nodes`; shape (5, pixels)."""
-        image = np.zeros((5, *self._fit.window.image_e.shape))
-        place = (float(own[0]) - self._view.left, float(own[1]) - self._view.top)
-        spread_nodes(laid, 0, place, 1.0, (0.0, 0.0), sigma_px, image)
-        return image.reshape(5, -1)
-
-
-def _chosen(laid: Sources, which: NDArray[np.bool_]) -> Sources:
-    """Return some of the nodes of a source."""
-    return laid._replace(
-        first_node=np.array([0, int(which.sum())]),
-        node_u_px=laid.node_u_px[which],
-        node_v_px=laid.node_v_px[which],
-        node_along=laid.node_along[which],
-        weight=laid.weight[which],
-    )
+        radius_rad = math.asin(min(camera.radius_m * math.exp(-float(by_size[near])), 1.0))
+        expected = np.empty(self._view.image_e.size)
+        jacobian = np.zeros((layout.size, len(expected)))
+        expectation_of_two(
+            values, near, flux, turn, radius_rad, self._view, laid, fit.structure, fit.known,
+            expected, jacobian,
+        )  # fmt: skip
+        return expected, jacobian
