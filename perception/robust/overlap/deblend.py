@@ -6,7 +6,7 @@ point spread could give it. (Joint fits of point spreads in crowded fields: Stet
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -50,14 +50,7 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
         return found
     by_flux = sorted(asking, key=lambda index: -float(found[index].flux_e.max()))
     asking, late = sorted(by_flux[:MOST_WINDOWS]), by_flux[MOST_WINDOWS:]
-    lone = [index for index in asking if found[index].count == 1]
-    of_any_width = of_free_width([found[index] for index in lone], camera)
     null = dict(enumerate(found))
-    large = [index for index in lone if float(found[index].image_radius_px[0]) > _LEAST_RADIUS_PX]
-    of_any_size = of_free_size([found[index] for index in large], camera)
-    for index, other in [*zip(lone, of_any_width, strict=True), *zip(large, of_any_size, strict=True)]:
-        if other is not None and other.deviance < null[index].deviance:
-            null[index] = other
     while asking:
         trials = [(index, starts) for index in asking for starts in _more(found[index])]
         fits = solve([_of_more(found[index], starts) for index, starts in trials], camera)
@@ -65,8 +58,11 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
         for (index, _), fit in zip(trials, fits, strict=True):
             if fit is not None and (index not in best or fit.deviance < best[index].deviance):
                 best[index] = fit
+        gaining = [index for index, fit in best.items() if _gain(null[index], fit) >= LEAST_GAIN]
+        null |= _eased({index: found[index] for index in gaining if found[index].count == 1}, camera)
         asking = []
-        for index, fit in best.items():
+        for index in gaining:
+            fit = best[index]
             if _gain(null[index], fit) >= LEAST_GAIN:
                 found[index] = null[index] = fit
                 if asks_for_more(fit):
@@ -74,6 +70,18 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
     for index in late:
         found[index] = replace(found[index], may_be_more=True)
     return found
+
+
+def _eased(lone: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
+    """Return by index lone flares of any width of the point spread, or any size, where that explains more."""
+    eased = dict(lone)
+    large = [index for index, one in lone.items() if float(one.image_radius_px[0]) > _LEAST_RADIUS_PX]
+    of_any_width = of_free_width(list(lone.values()), camera)
+    of_any_size = of_free_size([lone[index] for index in large], camera)
+    for index, other in [*zip(lone, of_any_width, strict=True), *zip(large, of_any_size, strict=True)]:
+        if other is not None and other.deviance < eased[index].deviance:
+            eased[index] = other
+    return eased
 
 
 def asks_for_more(solution: Solution) -> bool:
