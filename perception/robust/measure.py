@@ -208,7 +208,7 @@ def _hidden_log_range(solution: Solution, index: int) -> float:
     light may lack, or be another's. And one that seems farther than another, within two radii of which it
     lies, may be as near as that, most of it hidden behind it. Eclipses are fitted as they are.
     """
-    if solution.is_eclipse:
+    if solution.is_eclipse or solution.count == 1:
         return 0.0
     apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
     others_px = solution.image_radius_px
