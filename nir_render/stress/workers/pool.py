@@ -32,7 +32,9 @@ from nir_render.stress.job.execute import execute
 from nir_render.stress.jobs import Job, is_same, made_by_of
 from nir_render.stress.table import read_part, write_part
 from nir_render.stress.workers.cluster import (
+    SCHEDULER_SETTINGS,
     RefusedError,
+    Scheduler,
     Terms,
     check_this_worker,
     connected,
@@ -44,7 +46,6 @@ from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
 from perception import Estimator
 
-_DEATHS = 3
 _STARTS = 4
 _MEMORY_LIMIT_BYTES = 256 * 2**20
 _ENDS_WITHIN_S = 5
@@ -84,9 +85,9 @@ def part_file(parts: Path, job: Job) -> Path:
 
 
 def run_jobs(
-    work: Work, jobs: Sequence[Job], workers: int, scratch: Path, scheduler: str | None = None
+    work: Work, jobs: Sequence[Job], workers: int, scratch: Path, scheduler: Scheduler | None = None
 ) -> Generator[Done]:
-    """Do jobs in `workers` processes, or by those of a `scheduler` at an address; yield each as it ends.
+    """Do jobs in `workers` processes, or by those of a `scheduler`; yield each as it ends.
 
     The first job of those that share light renders it; the others begin when it has ended, and find it in the
     cache. When the generator is closed, or an exception goes through it, the workers end.
@@ -100,8 +101,7 @@ def run_jobs(
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     settings = {
-        "distributed.scheduler.allowed-failures": _DEATHS - 1,
-        "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
+        **SCHEDULER_SETTINGS,
         "distributed.nanny.pre-spawn-environ": thread_settings(work.threads or 1),
         "temporary-directory": str(scratch),
     }
@@ -113,7 +113,7 @@ def run_jobs(
                 client = stack.enter_context(_client(workers))
             else:
                 terms = stack.enter_context(terms_of((work.parts, work.light)))
-                client = stack.enter_context(connected(scheduler, terms))
+                client = stack.enter_context(connected(scheduler.address, terms))
             plugin = _plugin_name(work)
             _tell_workers(client, _Context(work, terms), plugin)
             if scheduler is not None:  # it outlives this campaign
