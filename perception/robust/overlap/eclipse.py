@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import pixel_turn
+from perception.model.bearing import direction_camera, pixel_turn
 from perception.model.flare import image_radius_px
 from perception.model.layout import Sources, View
 from perception.model.pixels import (
@@ -28,7 +28,8 @@ from perception.model.pixels import (
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.overlap.deblend import asks_for_more
+from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
+from perception.robust.overlap.oval import gain_over_oval
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
@@ -91,10 +92,10 @@ def eclipses(
         good: list[Solution] = []
         for fit in fits:
             pair = fit.solution() if len(good) < _TRIED else None
-            if pair is not None and _is_pair(pair):
+            if pair is not None and _is_pair(pair) and _are_apart(pair, camera):
                 good.append(pair)
-        if good:
-            likeliest = min(good, key=lambda pair: pair.cost)
+        likeliest = min(good, key=lambda pair: pair.cost, default=None)
+        if likeliest is not None and gain_over_oval(likeliest, camera) >= LEAST_GAIN:
             pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
     return pairs
 
@@ -133,6 +134,16 @@ def _is_near(several: Solution) -> bool:
     apart_px = math.hypot(several.u_px[0] - several.u_px[1], several.v_px[0] - several.v_px[1])
     near_px, far_px = float(several.image_radius_px.max()), float(several.image_radius_px.min())
     return near_px > LEAST_RADIUS_PX and far_px > _SMALLEST_PX and apart_px < 2.0 * near_px + far_px
+
+
+def _are_apart(pair: Solution, camera: Camera) -> bool:
+    """Tell whether two spheres may stand where they are said to: middles two radii apart, or more."""
+    place = direction_camera(np.column_stack([pair.u_px, pair.v_px]), camera.calibration)
+    place *= np.exp(pair.log_range)[:, None]
+    between = place[0] - place[1]
+    apart_m = float(np.linalg.norm(between))
+    sigma_m = float(np.hypot(*(place @ between / max(apart_m, 1e-12) * pair.log_range_sigma)))
+    return bool(apart_m + _OTHER_SIGMAS * sigma_m >= 2.0 * camera.radius_m)
 
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
@@ -316,10 +327,11 @@ class _Eclipse:
         """
         camera, far = self._camera, 1 - near
         offset = np.column_stack([laid.node_u_px, laid.node_v_px])
-        away_px = own[far, :2] + offset - own[near, :2]
-        turn = pixel_turn(own[near : near + 1, :2], camera.calibration)[0]
-        away = away_px @ turn
-        apart_rad = np.sqrt((away**2).sum(axis=1))
+        middle_px = own[near : near + 1, :2]
+        turn = pixel_turn(middle_px, camera.calibration)[0]
+        away = direction_camera(own[far, :2] + offset, camera.calibration)
+        away -= direction_camera(middle_px, camera.calibration)
+        apart_rad = 2.0 * np.arcsin(0.5 * np.sqrt((away**2).sum(axis=1)))
         size = math.exp(-float(log_range_by_size(own[near : near + 1], self._fit)[0]))
         radius_rad = math.asin(min(camera.radius_m * size, 1.0))
         ramp_rad = _RAMP_PX * float(np.linalg.norm(turn, ord=2))
