@@ -12,6 +12,7 @@ from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
+from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, deblend, of_free_width
 from perception.robust.overlap.eclipse import LEAST_RADIUS_PX, eclipses
 from perception.robust.overlap.oval import gain_over_oval
@@ -67,6 +68,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         for index, pair in eclipses(found, plain, parted, camera).items():
             if _explains_all(pair, prepared.shape) and _is_better(pair, parted.get(index)):
                 parted[index] = pair
+        for index, piece in cut_discs(found, plain, camera).items():
+            if _explains_all(piece, prepared.shape) and _is_better(piece, parted.get(index)):
+                parted[index] = piece
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
         without = _without_spill(plain, prepared, camera)
         for index, line in moving(plain, camera).items():

@@ -39,7 +39,7 @@ LEAST_RADIUS_PX = 1.5
 """Smaller images tell hardly anything of which of two hides the other."""
 
 _SMALLEST_PX = 0.5  # of the one behind
-_RAMP_PX = 0.4  # over which what is hidden begins: about as far as nodes lie apart
+RAMP_PX = 0.4  # over which what is hidden begins: about as far as nodes lie apart
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
@@ -148,13 +148,10 @@ def _are_apart(pair: Solution, camera: Camera) -> bool:
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     """Return first guesses of two discs: at both ends of what is lit, the wider one at either."""
-    window = cluster.window
-    excess_e = np.where(window.usable, window.image_e - cluster.background_e, 0.0)
-    if not excess_e.max() > 0.0:
+    lit = lit_pixels(cluster)
+    if lit is None:
         return []
-    level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
-    rows, columns = np.nonzero(excess_e > 0.5 * level_e)
-    places = np.column_stack([columns, rows]).astype(np.float64)
+    window, (level_e, places) = cluster.window, lit
     middle = places.mean(axis=0)
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
@@ -165,7 +162,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     u_px, v_px = (corner + middle).tolist()
     at_1_m_px = float(image_radius_px(u_px, v_px, math.asin(min(camera.radius_m, 1.0)), camera.calibration))
     most_e = math.inf if cluster.is_clipped else level_e
-    if not at_1_m_px > 0.0 or not _is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
+    if not at_1_m_px > 0.0 or not is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
         return []
     guesses = []
     for sign in (1.0, -1.0):
@@ -182,7 +179,21 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     return guesses
 
 
-def _is_as_bright(
+def lit_pixels(cluster: Cluster) -> tuple[float, Array] | None:
+    """Return how bright the brighter half of a cluster's light is, and which pixels have half of that.
+
+    The pixels by column and row in the window, shape (pixels, 2); None where nothing is lit.
+    """
+    window = cluster.window
+    excess_e = np.where(window.usable, window.image_e - cluster.background_e, 0.0)
+    if not excess_e.max() > 0.0:
+        return None
+    level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
+    rows, columns = np.nonzero(excess_e > 0.5 * level_e)
+    return level_e, np.column_stack([columns, rows]).astype(np.float64)
+
+
+def is_as_bright(
     least_e: float, most_e: float, place: tuple[float, float], at_1_m_px: float, camera: Camera
 ) -> bool:
     """Tell whether pixels of so much light may be of sources, which are as bright at any range."""
@@ -202,9 +213,7 @@ class _Eclipse:
         self._known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
         self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, self._known_e)
         self._prior = fit.layout.prior(fit.structure, 0.0)
-        smooth_px2 = (camera.calibration.psf_sigma_px**2 + 1.0 / 12.0) / _FINER**2
-        sigma_px = math.sqrt(max(smooth_px2 - 1.0 / 12.0, 0.0))
-        self._finer = replace(camera, calibration=replace(camera.calibration, psf_sigma_px=sigma_px))
+        self._finer = finer(camera)
         self._expected, self._jacobian = self._expectation(fit.values)
         self.objective = self._objective(fit.values, self._expected)
 
@@ -334,7 +343,7 @@ class _Eclipse:
         apart_rad = 2.0 * np.arcsin(0.5 * np.sqrt((away**2).sum(axis=1)))
         size = math.exp(-float(log_range_by_size(own[near : near + 1], self._fit)[0]))
         radius_rad = math.asin(min(camera.radius_m * size, 1.0))
-        ramp_rad = _RAMP_PX * float(np.linalg.norm(turn, ord=2))
+        ramp_rad = RAMP_PX * float(np.linalg.norm(turn, ord=2))
         stands_out = 0.5 + (apart_rad - radius_rad) / ramp_rad
         ramp = (stands_out > 0.0) & (stands_out < 1.0)
         # By how much more of a node stands out as it moves away, by column and row.
@@ -347,7 +356,7 @@ class _Eclipse:
                 np.full(len(slope), -radius_rad / ramp_rad),
             ]
         )
-        edge = _chosen(laid, ramp)
+        edge = chosen(laid, ramp)
         changes = np.stack(
             [self._spread(edge._replace(weight=one[ramp]), own[far], sigma_px)[0] for one in weights]
         )
@@ -362,7 +371,14 @@ class _Eclipse:
         return image.reshape(5, -1)
 
 
-def _chosen(laid: Sources, which: NDArray[np.bool_]) -> Sources:
+def finer(camera: Camera) -> Camera:
+    """Return a camera for which sources are laid out as finer nodes: an edge is sharper than a limb."""
+    smooth_px2 = (camera.calibration.psf_sigma_px**2 + 1.0 / 12.0) / _FINER**2
+    sigma_px = math.sqrt(max(smooth_px2 - 1.0 / 12.0, 0.0))
+    return replace(camera, calibration=replace(camera.calibration, psf_sigma_px=sigma_px))
+
+
+def chosen(laid: Sources, which: NDArray[np.bool_]) -> Sources:
     """Return some of the nodes of a source."""
     return laid._replace(
         first_node=np.array([0, int(which.sum())]),
