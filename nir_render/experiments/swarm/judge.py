@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from nir_render.evaluate.match import MIN_PEAK_SNR, MIN_VISIBLE_FRACTION, match, on_a_lamp
+from nir_render.evaluate.messages import is_of
 from nir_render.evaluate.metrics import source_limits
 from nir_render.truth.lamps import Outline
 from nir_render.truth.sent import SentTruth
 from nir_render.truth.sources import SourceTruth
-from perception import Calibration, Detection
+from perception import Calibration, Detection, Message
 
 WHYS = ("free", "eclipsed", "merged", "faint", "dark", "hidden", "cut")
 """How a robot can be seen, the best first: of its cameras the best one counts."""
@@ -21,7 +22,6 @@ MERGED_PX, NEAR_PX = 2.0, 4.0
 _BESIDE = 0.1  # a neighbour with less of one's light hardly shifts it
 _EDGE_PX = 3.0
 _WHOLE = 0.99
-_SLACK_S = 0.55  # half a frame of eleven bits
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,8 @@ def sights(
 ) -> tuple[list[Sight], int]:
     """Return each robot as a set of frames shows it, and how many detections are of none of them.
 
+    Who sends no light to a camera, dark or hidden whole, is not found by it, whatever is found there.
+
     Parameters
     ----------
     robots
@@ -112,8 +114,9 @@ def sights(
     alarms = 0
     for camera, rows in rows_of.items():
         real = [row for row in rows if row.ghost_of is None]
-        pairs = match(real, found[camera], known[camera])
-        hits = {number: found[camera][hit] for number, hit in pairs.pairs}
+        shining = [number for number, row in enumerate(real) if row.direct_e > 0.0]
+        pairs = match([real[number] for number in shining], found[camera], known[camera])
+        hits = {shining[number]: found[camera][hit] for number, hit in pairs.pairs}
         alarms += sum(
             not (found[camera][hit].ghost or on_a_lamp(found[camera][hit], lamps_px[camera]))
             for hit in pairs.unmatched
@@ -145,12 +148,13 @@ def _unseen(robot: str) -> Sight:
 
 @dataclass(frozen=True)
 class Word:
-    """A word that was told: of whom it was, by truth, as far as its track was one's, and by which track."""
+    """A word that was told, and of whom it is by truth: whom its track followed meanwhile.
 
-    robot: str | None
-    track: int
-    start_s: float
-    word: int
+    Two where the message says that another track may have said it instead; none where they followed nobody.
+    """
+
+    robots: tuple[str, ...]
+    message: Message
 
 
 @dataclass(frozen=True)
@@ -160,7 +164,7 @@ class Packets:
     Attributes
     ----------
     received
-        For each packet whether it was told, with the sender's track.
+        For each packet whether it was told, of all five frames or of some, with the sender's track.
     misattributed
         How many words were told that another one sent just then: the wrong one is said to speak.
     wrong
@@ -173,18 +177,15 @@ class Packets:
 
 
 def judged_packets(sent: Sequence[SentTruth], told: Sequence[Word]) -> Packets:
-    """Hold words against packets: one is a packet's that begins within half a frame, 0.55 s, of it."""
+    """Hold words against packets (`evaluate.messages.is_of`)."""
     received = [False] * len(sent)
     misattributed = wrong = 0
     for word in told:
-        same = [
-            number
-            for number, packet in enumerate(sent)
-            if packet.word == word.word and abs(packet.start_s - word.start_s) < _SLACK_S
-        ]
-        own = [number for number in same if sent[number].robot == word.robot]
+        same = [number for number, packet in enumerate(sent) if is_of(word.message, packet)]
+        own = [number for number in same if sent[number].robot in word.robots]
         if own:
-            received[own[0]] = True
+            # Two may say one word at once, each perhaps the other: that is one packet of each.
+            received[next((number for number in own if not received[number]), own[0])] = True
         elif same:
             misattributed += 1
         else:

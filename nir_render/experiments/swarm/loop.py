@@ -16,6 +16,7 @@ from nir_render.camera.timing.shutter import mid_exposure_s
 from nir_render.evaluate.match import MIN_VISIBLE_FRACTION
 from nir_render.experiments.loop.journal import Told
 from nir_render.experiments.loop.measurement_sight import MeasurementSight
+from nir_render.experiments.swarm.followed import Followed
 from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of
 from nir_render.experiments.swarm.identity import MOST, number_of, words_of
 from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights
@@ -53,8 +54,6 @@ SECONDS = "seconds.jsonl"
 OFF = 0.01
 """Of a block's temporal variance: by so much may light that many share be off in the mean square."""
 
-_GATE_CHI2 = 25.0
-_FLOOR_M = 0.02  # a track is not held to a place better than that
 _PAIR_S = 9.0  # the second word of a robot begins 6.65 s after the first
 
 
@@ -118,7 +117,9 @@ class SwarmLoop:
         self._pipeline = Pipeline.of("robust", self._known)
         self._sight: MeasurementSight | None = None
         self._rates: dict[str, Rates] = {}
-        self._followed: dict[int, str | None] = {}
+        others_m = np.array([self._world.sources[f"{name}.top"].pose.position_m for name in self._others])
+        observer = self._world.robots[OBSERVER].pose
+        self._followed = Followed(self._others, observer.to_local(others_m))
         self._done = 0
         self._told: list[Word] = []
         self._sights: list[list[Any]] = []
@@ -236,7 +237,7 @@ class SwarmLoop:
             "misattributed": packets.misattributed,
             "wrong_words": packets.wrong,
             "identities": self._identities(),
-            "tracks": list(self._followed.values()),
+            "tracks": list(self._followed.now().values()),
             "shared": {name: asdict(one) for name, one in self._shared.items()},
         }
 
@@ -255,16 +256,12 @@ class SwarmLoop:
             self._rates[name] = electron_rates(light, self._world, self._shared[name].groups)
 
     def _hear(self, words: Sequence[Message], tracks: Sequence[Track]) -> None:
-        """Note of whom each word is, by truth: of the robot that its track follows."""
-        place = self._world.robots[OBSERVER].pose
-        others_m = np.array([self._world.sources[f"{name}.top"].pose.position_m for name in self._others])
-        others_body_m = place.to_local(others_m)
-        for track in tracks:
-            if track.ghost != "yes":
-                self._followed[track.track] = _nearest(track, others_body_m, self._others)
-        self._told += [
-            Word(self._followed.get(word.track), word.track, word.start_s, word.word) for word in words
-        ]
+        """Note of whom each word is, by truth."""
+        self._followed.update(tracks)
+        for word in words:
+            meant = [word.track] if word.ambiguous_with is None else [word.track, word.ambiguous_with]
+            whom = (self._followed.during(track, word.start_s, word.end_s) for track in meant)
+            self._told.append(Word(tuple(one for one in whom if one is not None), word))
 
     def _judge(
         self, means: dict[str, MeanFrame], frames: Sequence[RawFrame], found: Sequence[Sequence[Detection]]
@@ -295,26 +292,28 @@ class SwarmLoop:
     def _identities(self) -> dict[str, Any]:
         """Return who was told to be who: numbers right, wrong, and robots that told it in full.
 
-        A track's two words are one robot's where they follow each other as a robot sends them.
+        A track's two words are one robot's where they follow each other as a robot sends them. A word that
+        may be another track's tells nobody's number.
         """
         robots = self.plan.robots
         right: set[str] = set()
         wrong = 0
         by_track: dict[int, list[Word]] = {}
         for word in self._told:
-            by_track.setdefault(word.track, []).append(word)
+            if word.message.ambiguous_with is None:
+                by_track.setdefault(word.message.track, []).append(word)
         length = len(words_of(0, robots))
         for words in by_track.values():
-            in_time = sorted(words, key=lambda word: word.start_s)
+            in_time = sorted(words, key=lambda word: word.message.start_s)
             for first in range(len(in_time) - length + 1):
                 some = in_time[first : first + length]
-                if some[-1].start_s - some[0].start_s > _PAIR_S * (length - 1) + 1e-9:
+                if some[-1].message.start_s - some[0].message.start_s > _PAIR_S * (length - 1) + 1e-9:
                     continue
-                number = number_of(tuple(word.word for word in some), robots)
+                number = number_of(tuple(word.message.word for word in some), robots)
                 if number is None:
                     continue
                 told = names_of(robots)[number]
-                if told == some[-1].robot:
+                if all(told in word.robots for word in some):
                     right.add(told)
                 else:
                     wrong += 1
@@ -327,15 +326,6 @@ def _standing(robot: str, pose: Pose) -> dict[str, Any]:
     half_rad = 0.5 * math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
     turned = (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
     return PoseTruth(robot, 0.0, (x, y, z), turned, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)).record()
-
-
-def _nearest(track: Track, others_m: Array, names: Sequence[str]) -> str | None:
-    """Return the robot that a track follows: the likeliest, where one is within five σ."""
-    off_m = others_m - track.position_body_m
-    covariance = track.covariance[:3, :3] + _FLOOR_M**2 * np.eye(3)
-    chi2 = np.einsum("ni,ij,nj->n", off_m, np.linalg.inv(covariance), off_m)
-    best = int(np.argmin(chi2))
-    return names[best] if chi2[best] < _GATE_CHI2 else None
 
 
 @dataclass(frozen=True)

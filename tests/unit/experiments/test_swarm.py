@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nir_render import load_scene
+from nir_render.experiments.swarm.followed import Followed
 from nir_render.experiments.swarm.hall import HALL, OBSERVER, hall_scene, places_m, side_m
 from nir_render.experiments.swarm.identity import number_of, words_of
 from nir_render.experiments.swarm.judge import Word, judged_packets, whys
@@ -19,6 +20,8 @@ from nir_render.simulation.calibration import calibration
 from nir_render.simulation.sent import sent_packets
 from nir_render.truth.sent import SentTruth
 from nir_render.truth.sources import SourceTruth
+from perception import Message, Track
+from perception.types import Ghost
 
 CAMERA = f"{OBSERVER}.front"
 
@@ -69,18 +72,43 @@ def test_how_robots_can_be_seen() -> None:
     assert [near for _, near in whys(rows, known)][:4] == [True] * 4
 
 
+def _message(start_s: float, end_s: float, word: int, track: int = 1) -> Message:
+    return Message("o", track, start_s, end_s, word, "x", confidence=1.0, frames=5)
+
+
 def test_words_are_held_against_packets() -> None:
+    """A packet of which one frame of five was read is received; who says two robots' word is none of them."""
     sent = [SentTruth("a", "top", 3.0, 8.5, 7, "x"), SentTruth("b", "top", 3.2, 8.7, 7, "x"),
-            SentTruth("c", "top", 9.0, 14.5, 8, "x")]  # fmt: skip
+            SentTruth("c", "top", 9.0, 14.5, 8, "x"), SentTruth("d", "top", 9.1, 14.6, 8, "x")]  # fmt: skip
     told = [
-        Word("a", 1, 3.1, 7),  # its own
-        Word("c", 2, 3.3, 7),  # of a or b, but its track is c's
-        Word("c", 2, 9.6, 8),  # begins too late
-        Word(None, 3, 9.0, 8),  # of nobody's track
+        Word(("a",), _message(7.4, 8.5, 7)),  # its own, the last frame alone
+        Word(("c",), _message(3.3, 8.8, 7)),  # of a or b, but its track is c's
+        Word(("c",), _message(9.7, 15.2, 8)),  # ends too late
+        Word((), _message(8.4, 13.9, 8)),  # begins too early, of nobody's track
+        Word(("c", "d"), _message(9.0, 14.5, 8)),  # c's or d's: one of them
+        Word(("d", "c"), _message(9.1, 14.6, 8)),  # and the other
     ]
     packets = judged_packets(sent, told)
-    assert packets.received == (True, False, False)
-    assert (packets.misattributed, packets.wrong) == (2, 1)
+    assert packets.received == (True, False, True, True)
+    assert (packets.misattributed, packets.wrong) == (1, 2)
+
+
+def _track(time_s: float, x_m: float, number: int = 1, ghost: Ghost = "no") -> Track:
+    place, still = np.array([x_m, 0.0, 0.0]), np.zeros(3)
+    return Track("o", time_s, number, place, still, 1e-4 * np.eye(6), ghost=ghost)
+
+
+def test_a_word_is_of_whom_its_track_followed_for_most_of_it() -> None:
+    """σ and floor are 1 and 2 cm, so 5 σ are 11.2 cm."""
+    followed = Followed(["a", "b"], np.array([[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+    for time_s, x_m in ((0.0, 2.11), (1.0, 2.0), (4.0, 2.12), (9.0, 2.98), (10.0, 3.0)):
+        followed.update([_track(time_s, x_m), _track(time_s, 3.0, 2, "yes")])
+    assert followed.now() == {1: "b"}
+    assert followed.during(1, 0.0, 10.0) == "a"  # for four seconds; b for one, nobody for five
+    assert followed.during(1, 3.5, 9.4) == "a"
+    assert followed.during(1, 3.5, 9.6) == "b"
+    assert followed.during(1, 5.0, 8.0) is None
+    assert followed.during(2, 0.0, 10.0) is None
 
 
 @pytest.mark.parametrize("density_per_m2", [0.5, 2.0])
