@@ -26,19 +26,22 @@ class Followed:
     def __init__(self, names: Sequence[str], places_body_m: Array) -> None:
         self._names, self._places_m = names, places_body_m
         self._since: dict[int, list[tuple[float, str | None]]] = defaultdict(list)
+        self._now: list[str | None] = []
 
     def update(self, tracks: Iterable[Track]) -> None:
         """Take in the tracks of a set of frames; those of mirror images follow nobody, and are left out."""
+        self._now.clear()
         for track in tracks:
             if track.ghost == "yes":
                 continue
             robot, so_far = self._nearest(track), self._since[track.track]
             if not so_far or so_far[-1][1] != robot:
                 so_far.append((track.time_s, robot))
+            self._now.append(robot)
 
-    def now(self) -> dict[int, str | None]:
-        """Return whom each track followed last."""
-        return {track: so_far[-1][1] for track, so_far in self._since.items()}
+    def now(self) -> list[str | None]:
+        """Return whom each track of the last set follows."""
+        return list(self._now)
 
     def during(self, track: int, start_s: float, end_s: float) -> str | None:
         """Return whom a track followed for most of a time, of those that it followed; None if nobody."""

@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from nir_render.evaluate.match import MIN_PEAK_SNR, MIN_VISIBLE_FRACTION, match, on_a_lamp
+from nir_render.evaluate.match import (
+    GATE_PX,
+    MIN_PEAK_SNR,
+    MIN_VISIBLE_FRACTION,
+    image_radius_px,
+    match,
+    on_a_lamp,
+)
 from nir_render.evaluate.messages import is_of
 from nir_render.evaluate.metrics import source_limits
 from nir_render.truth.lamps import Outline
@@ -60,6 +67,26 @@ class Sight:
         return [self.robot, self.why, self.near, self.found, *floats]
 
 
+@dataclass(frozen=True)
+class InSet:
+    """A set of frames held against truth.
+
+    Attributes
+    ----------
+    sights
+        Each of the other robots.
+    false_alarms
+        How many detections are of no robot, lamp or mirror image.
+    parts
+        How many are further ones of a robot of which a body hides a part, and which has one already: what is
+        left of it is taken for several.
+    """
+
+    sights: tuple[Sight, ...]
+    false_alarms: int
+    parts: int
+
+
 def whys(rows: Sequence[SourceTruth], known: Calibration) -> list[tuple[str, bool]]:
     """Return how each source of a frame can be seen, and whether another shines within 4 px of it.
 
@@ -98,8 +125,8 @@ def sights(
     found: Mapping[str, Sequence[Detection]],
     lamps_px: Mapping[str, Sequence[Outline]],
     known: Mapping[str, Calibration],
-) -> tuple[list[Sight], int]:
-    """Return each robot as a set of frames shows it, and how many detections are of none of them.
+) -> InSet:
+    """Return each robot as a set of frames shows it, and what the detections are that are of none of them.
 
     Who sends no light to a camera, dark or hidden whole, is not found by it, whatever is found there.
 
@@ -111,16 +138,18 @@ def sights(
         By camera: truth, detections, lamps, what is known of it.
     """
     best: dict[str, Sight] = {}
-    alarms = 0
+    alarms = parts = 0
     for camera, rows in rows_of.items():
         real = [row for row in rows if row.ghost_of is None]
         shining = [number for number, row in enumerate(real) if row.direct_e > 0.0]
         pairs = match([real[number] for number in shining], found[camera], known[camera])
         hits = {shining[number]: found[camera][hit] for number, hit in pairs.pairs}
-        alarms += sum(
-            not (found[camera][hit].ghost or on_a_lamp(found[camera][hit], lamps_px[camera]))
-            for hit in pairs.unmatched
-        )
+        for hit in (found[camera][number] for number in pairs.unmatched):
+            if hit.ghost or on_a_lamp(hit, lamps_px[camera]):
+                continue
+            is_part = any(_is_part(hit, real[number], known[camera]) for number in shining)
+            parts += is_part
+            alarms += not is_part
         for number, (row, (why, near)) in enumerate(zip(real, whys(real, known[camera]), strict=True)):
             hit = hits.get(number)
             limit_m = math.nan
@@ -131,7 +160,14 @@ def sights(
                 math.nan if hit is None else hit.range_m, math.nan if hit is None else hit.range_sigma_m,
             )  # fmt: skip
             best[row.robot] = _better(best.get(row.robot), one)
-    return [best.get(robot, _unseen(robot)) for robot in robots], alarms
+    return InSet(tuple(best.get(robot, _unseen(robot)) for robot in robots), alarms, parts)
+
+
+def _is_part(hit: Detection, row: SourceTruth, known: Calibration) -> bool:
+    """Tell whether a detection lies on a source of which something hides more than a hundredth."""
+    gate_px = max(GATE_PX, image_radius_px(row, known))
+    apart_px = math.hypot(hit.u_px - row.u_px, hit.v_px - row.v_px)
+    return row.visible_fraction < _WHOLE and apart_px <= gate_px
 
 
 def _better(known: Sight | None, other: Sight) -> Sight:

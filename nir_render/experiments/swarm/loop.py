@@ -123,7 +123,7 @@ class SwarmLoop:
         self._done = 0
         self._told: list[Word] = []
         self._sights: list[list[Any]] = []
-        self._alarms = 0
+        self._alarms = self._parts = 0
         self._standing: list[list[Any]] = []
         self._shared: dict[str, SharedLight] = {}
 
@@ -230,6 +230,7 @@ class SwarmLoop:
             "standing": self._standing,
             "sights": self._sights,
             "false_alarms": self._alarms,
+            "parts": self._parts,
             "packets": [
                 [packet.robot, packet.word, round(packet.start_s, 4), received]
                 for packet, received in zip(sent, packets.received, strict=True)
@@ -237,7 +238,7 @@ class SwarmLoop:
             "misattributed": packets.misattributed,
             "wrong_words": packets.wrong,
             "identities": self._identities(),
-            "tracks": list(self._followed.now().values()),
+            "tracks": self._followed.now(),
             "shared": {name: asdict(one) for name, one in self._shared.items()},
         }
 
@@ -272,11 +273,12 @@ class SwarmLoop:
             name: [lamp.outline_px for lamp in lamp_truth(self._world, name, self._done)] for name in means
         }
         rows = {name: list(truth_of(mean, by_camera[name])) for name, mean in means.items()}
-        seen, alarms = sights(self._others, rows, hits, lamps_px, self._known)
-        self._sights.append([one.record() for one in seen])
-        self._alarms += alarms
+        seen = sights(self._others, rows, hits, lamps_px, self._known)
+        self._sights.append([one.record() for one in seen.sights])
+        self._alarms += seen.false_alarms
+        self._parts += seen.parts
 
-    def _lit(self) -> list[Sight]:
+    def _lit(self) -> tuple[Sight, ...]:
         """Return each robot as it could be seen were all lit at once: the ceiling of what is heard."""
         rows = {}
         for name, rates in self._rates.items():
@@ -287,7 +289,7 @@ class SwarmLoop:
             rows[name] = [replace(row, on_fraction=1.0) for row in truth_of(lit, frame)]
         none: dict[str, list[Detection]] = {name: [] for name in rows}
         lamps_px: dict[str, list[Outline]] = {name: [] for name in rows}
-        return sights(self._others, rows, none, lamps_px, self._known)[0]
+        return sights(self._others, rows, none, lamps_px, self._known).sights
 
     def _identities(self) -> dict[str, Any]:
         """Return who was told to be who: numbers right, wrong, and robots that told it in full.

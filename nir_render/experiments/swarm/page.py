@@ -34,7 +34,9 @@ RULES = {
     ),
     "recall": (
         "robots that are lit, of which a detection is within 3 px; of all, those that are hidden, cut, faint "
-        "and merged too, and of those that stand free."
+        "and merged too, and of those that stand free. False alarms are of no robot, lamp or mirror image; "
+        "parts are further detections of a robot of which a column hides a part, and which has one already: "
+        "a disc with a dark edge through it is taken for several, each merged, of hardly known range."
     ),
     "ranges": (
         "of robots that stand free and are lit all through the exposure, held against the Cramér–Rao bound "
@@ -42,8 +44,9 @@ RULES = {
         "median of the errors in place of their mean square. σ is what the detector claims."
     ),
     "packets": (
-        "sent in full while the observer looked; received if the track of that robot says the word. A word "
-        "that another one sent just then is misattributed, one that nobody sent is wrong."
+        "sent in full while the observer looked; received if the track of that robot says the word, read in "
+        "all five frames or in some. A word that another one sent just then is misattributed, one that "
+        "nobody sent is wrong."
     ),
     "identity": (
         "each says its number once a minute: one word up to 128 robots, beyond that two, one after the "
@@ -137,11 +140,13 @@ def _seen(figures: dict[str, Any]) -> Table:
             (*_where(one), _part(one["found"], one["lit"]), _part(one["free"], one["lit"]),
              _of(one["free_found"], one["free"]),
              *(share(could[why], more=1) for why in ("eclipsed", "merged", "hidden", "faint", "cut")),
-             share(one["within_4_px"], more=1), f"{one['false_alarms']} in {one['sets_judged']}")
+             share(one["within_4_px"], more=1), f"{one['false_alarms']} in {one['sets_judged']}",
+             f"{one['parts']} in {one['sets_judged']}")
         )  # fmt: skip
     headings = (
         "bodies", "per m²", "recall", "ceiling: stand free", "found of the free", "eclipsed", "merged",
         "hidden", "faint", "cut", "another within 4 px", "false alarms in sets",
+        "parts in sets",
     )  # fmt: skip
     return Table(headings, rows)
 
@@ -170,11 +175,13 @@ def _heard(figures: dict[str, Any]) -> Table:
             (*_where(one), _of(one["packets_received"], one["packets"]),
              *(f"{received} of {sent}" if sent else "–" for sent, received in by_sight),
              str(one["misattributed"]), str(one["wrong_words"]),
-             f"{one['identities_right']} of {one['told_in_full']}", str(one["identities_wrong"]))
+             f"{one['identities_right']} of {one['told_in_full']}", str(one["identities_wrong"]),
+             *(str(one[name]) for name in ("tracks", "tracks_of_nobody", "tracks_twice")))
         )  # fmt: skip
     headings = (
         "bodies", "per m²", "packets received", "from the free", "from the merged", "from the hidden",
         "misattributed", "wrong words", "identities right", "identities wrong",
+        "tracks at the end", "of nobody", "of one robot twice",
     )  # fmt: skip
     return Table(headings, rows)
 

@@ -12,7 +12,7 @@ from nir_render import load_scene
 from nir_render.experiments.swarm.followed import Followed
 from nir_render.experiments.swarm.hall import HALL, OBSERVER, hall_scene, places_m, side_m
 from nir_render.experiments.swarm.identity import number_of, words_of
-from nir_render.experiments.swarm.judge import Word, judged_packets, whys
+from nir_render.experiments.swarm.judge import Word, judged_packets, sights, whys
 from nir_render.experiments.swarm.loop import Swarm, SwarmLoop
 from nir_render.experiments.swarm.outcome import Condition, Outcome
 from nir_render.experiments.swarm.page import write_outcome
@@ -20,7 +20,7 @@ from nir_render.simulation.calibration import calibration
 from nir_render.simulation.sent import sent_packets
 from nir_render.truth.sent import SentTruth
 from nir_render.truth.sources import SourceTruth
-from perception import Message, Track
+from perception import Detection, Message, Track
 from perception.types import Ghost
 
 CAMERA = f"{OBSERVER}.front"
@@ -72,6 +72,38 @@ def test_how_robots_can_be_seen() -> None:
     assert [near for _, near in whys(rows, known)][:4] == [True] * 4
 
 
+def _hit(u_px: float, v_px: float = 400.0, **changes: Any) -> Detection:
+    given: dict[str, Any] = {
+        "camera": CAMERA, "index": 0, "time_s": 0.0, "u_px": u_px, "v_px": v_px, "u_sigma_px": 0.1, "v_sigma_px": 0.1,
+        "flux_dn": 100.0, "mean_dn": 64.0, "background_dn": 64.0, "area_px": 9, "saturated": False, "merged": False,
+        "ghost": False, "range_m": 3.0, "range_sigma_m": 0.1, "bearing_body": (1.0, 0.0, 0.0),
+    }  # fmt: skip
+    return Detection(**(given | changes))
+
+
+def test_detections_of_nobody_and_parts_of_who_is_partly_hidden() -> None:
+    """Each robot has one detection; a second one on it is a part only where something hides some of it."""
+    rows = [
+        _row(100.0, robot="whole"), _row(200.0, visible_fraction=0.9, robot="part"),
+        _row(300.0, direct_e=0.0, on_fraction=0.0, robot="dark"), _row(400.0, direct_e=0.0, visible_fraction=0.0, robot="gone"),
+    ]  # fmt: skip
+    hits = [
+        _hit(100.1), _hit(101.5),  # the second one is of nobody
+        _hit(200.2), _hit(201.0), _hit(198.0), _hit(203.1),  # one, two parts, and one beyond 3 px
+        _hit(300.0), _hit(400.0),  # where no light comes from
+        _hit(500.0, ghost=True),
+    ]  # fmt: skip
+    known = {CAMERA: calibration(load_scene(HALL), CAMERA)}
+    in_set = sights(
+        ["whole", "part", "dark", "gone", "away"], {CAMERA: rows}, {CAMERA: hits}, {CAMERA: []}, known
+    )
+    assert [(one.robot, one.why, one.found) for one in in_set.sights] == [
+        ("whole", "free", True), ("part", "eclipsed", True), ("dark", "dark", False), ("gone", "hidden", False),
+        ("away", "cut", False),
+    ]  # fmt: skip
+    assert (in_set.parts, in_set.false_alarms) == (2, 4)
+
+
 def _message(start_s: float, end_s: float, word: int, track: int = 1) -> Message:
     return Message("o", track, start_s, end_s, word, "x", confidence=1.0, frames=5)
 
@@ -103,7 +135,7 @@ def test_a_word_is_of_whom_its_track_followed_for_most_of_it() -> None:
     followed = Followed(["a", "b"], np.array([[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
     for time_s, x_m in ((0.0, 2.11), (1.0, 2.0), (4.0, 2.12), (9.0, 2.98), (10.0, 3.0)):
         followed.update([_track(time_s, x_m), _track(time_s, 3.0, 2, "yes")])
-    assert followed.now() == {1: "b"}
+    assert followed.now() == ["b"]
     assert followed.during(1, 0.0, 10.0) == "a"  # for four seconds; b for one, nobody for five
     assert followed.during(1, 3.5, 9.4) == "a"
     assert followed.during(1, 3.5, 9.6) == "b"
@@ -203,10 +235,10 @@ def _record(seed: int) -> dict[str, Any]:
     return {
         "format": 1, "seed": seed, "places_m": [[0.0, 0.0], [2.0, 0.0], [0.0, 3.0], [4.0, 0.0], [1.0, 0.0]],
         "standing": [[*sights[0]], [*sights[1]], [*sights[2]], ["r0004", "free", *sights[3][2:]]],
-        "sights": [sights, sights], "false_alarms": 3,
+        "sights": [sights, sights], "false_alarms": 3, "parts": 5,
         "packets": [["r0001", 1, 5.0, True], ["r0003", 3, 7.0, False], ["r0004", 4, 7.0, True]],
         "misattributed": 1, "wrong_words": 0, "identities": {"right": ["r0001", "r0004"], "wrong": 1},
-        "tracks": ["r0001", None], "shared": {"front": {"groups": [1, 2], "mean_share": 1e-5, "worst_share": 0.004}},
+        "tracks": ["r0001", None, "r0001"], "shared": {"front": {"groups": [1, 2], "mean_share": 1e-5, "worst_share": 0.004}},
     }  # fmt: skip
 
 
@@ -226,6 +258,8 @@ def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
     assert figures["range"]["rmse_m"] == pytest.approx(0.02)
     assert figures["packets_by_sight"] == {"free": [4, 4], "merged": [2, 0]}
     assert (figures["told_in_full"], figures["identities_right"], figures["identities_wrong"]) == (6, 4, 2)
+    assert (figures["tracks"], figures["tracks_of_nobody"], figures["tracks_twice"]) == (6, 2, 2)
+    assert (figures["false_alarms"], figures["parts"]) == (6, 10)
     assert figures["seconds"]["light_of_a_set"] == 9.0
     page = write_outcome(Outcome(5, "hall", [0, 1], [condition]), tmp_path)
     text = page.read_text()
