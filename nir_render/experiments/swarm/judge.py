@@ -119,6 +119,15 @@ def whys(rows: Sequence[SourceTruth], known: Calibration) -> list[tuple[str, boo
     return found
 
 
+def unlike(rows: Sequence[SourceTruth], known: Calibration) -> list[str]:
+    """Return the robots whose flare is not their whole light alone: partly hidden, or one within 4 px."""
+    return [
+        row.robot
+        for row, (_, near) in zip(rows, whys(rows, known), strict=True)
+        if row.direct_e > 0.0 and (near or row.visible_fraction < _WHOLE)
+    ]
+
+
 def sights(
     robots: Iterable[str],
     rows_of: Mapping[str, Sequence[SourceTruth]],

@@ -16,11 +16,12 @@ from nir_render.camera.timing.shutter import mid_exposure_s
 from nir_render.evaluate.match import MIN_VISIBLE_FRACTION
 from nir_render.experiments.loop.journal import Told
 from nir_render.experiments.loop.measurement_sight import MeasurementSight
+from nir_render.experiments.swarm.film import MOST_PICTURES, encoded, picture_file
 from nir_render.experiments.swarm.followed import Followed
-from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of
-from nir_render.experiments.swarm.identity import MOST, number_of, words_of
-from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights
-from nir_render.experiments.swarm.views import TRACKS
+from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of, side_m
+from nir_render.experiments.swarm.identity import MOST, numbers_told
+from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights, unlike
+from nir_render.experiments.swarm.picture import Moment, SwarmPicture
 from nir_render.randomness import RandomKey
 from nir_render.run.folder import POSES, SENT
 from nir_render.scene.pose import Pose
@@ -33,6 +34,7 @@ from nir_render.simulation.sent import sent_packets
 from nir_render.simulation.truth import truth_of
 from nir_render.truth.lamps import Outline
 from nir_render.truth.poses import PoseTruth
+from nir_render.truth.sources import SourceTruth
 from perception import (
     Calibration,
     Detection,
@@ -48,13 +50,12 @@ from perception import (
 
 Array = NDArray[np.float64]
 
+TRACKS = "tracks.robust.jsonl"
 SECONDS = "seconds.jsonl"
 """How long each part of each set took, in a run's folder."""
 
 OFF = 0.01
 """Of a block's temporal variance: by so much may light that many share be off in the mean square."""
-
-_PAIR_S = 9.0  # the second word of a robot begins 6.65 s after the first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,9 +118,7 @@ class SwarmLoop:
         self._pipeline = Pipeline.of("robust", self._known)
         self._sight: MeasurementSight | None = None
         self._rates: dict[str, Rates] = {}
-        others_m = np.array([self._world.sources[f"{name}.top"].pose.position_m for name in self._others])
-        observer = self._world.robots[OBSERVER].pose
-        self._followed = Followed(self._others, observer.to_local(others_m))
+        self._followed = Followed(self._others, np.empty((0, 3)), {}, self._known)
         self._done = 0
         self._told: list[Word] = []
         self._sights: list[list[Any]] = []
@@ -152,7 +151,9 @@ class SwarmLoop:
             self._render()
             clock.lap("render")
         if not self._standing:
-            self._standing = [one.record() for one in self._lit()]
+            rows = self._lit()
+            self._standing = [one.record() for one in self._could_be_seen(rows)]
+            self._followed = self._nobody_yet(rows)
             clock.lap("ceiling")
         if self.plan.level != "frames":
             return self._measured(clock)
@@ -178,10 +179,26 @@ class SwarmLoop:
             self._judge(means, frames, found)
             clock.lap("judge")
         self._done += 1
+        files = self._pictured(frames, heard.tracks, last)
+        clock.lap("draw")
         lines = self._lines(words, clock)
         if last:
             lines[TRACKS] = [track_record(track) for track in heard.tracks]
-        return Told(lines, frames if last else [])
+        return Told(lines, frames if last else [], files)
+
+    def _pictured(self, frames: Sequence[RawFrame], tracks: Sequence[Track], last: bool) -> dict[str, bytes]:
+        """Draw the set that is done, where the film has it, or the run ends."""
+        number = self._done - 1
+        if not last and number % math.ceil(self.steps / MOST_PICTURES):
+            return {}
+        places_m = np.array(
+            [self._world.robots[name].pose.position_m[:2] for name in names_of(self.plan.robots)]
+        )
+        side = side_m(self.plan.robots, self.plan.density_per_m2)
+        picture = SwarmPicture(places_m, self._world.robots[OBSERVER].pose, self._known, side)
+        words = [word.message for word in self._told]
+        drawn = picture.drawn(Moment(number / self.plan.rate_hz, frames, tracks, words))
+        return {picture_file(number, last): encoded(drawn, last)}
 
     def _measured(self, clock: "_Clock") -> Told:
         """Draw the detections of a set, and read them."""
@@ -278,48 +295,45 @@ class SwarmLoop:
         self._alarms += seen.false_alarms
         self._parts += seen.parts
 
-    def _lit(self) -> tuple[Sight, ...]:
-        """Return each robot as it could be seen were all lit at once: the ceiling of what is heard."""
+    def _lit(self) -> dict[str, list[SourceTruth]]:
+        """Return by camera the truth of a set in which all are lit at once, mirror images left out."""
         rows = {}
         for name, rates in self._rates.items():
             setting = own_setting(rates.camera, 0)
             lit = fully_lit_frame(rates, setting.exposure_s)
             key = RandomKey(self.seed, "read_out", name, 0)
             frame = frame_of(lit.electrons, rates.camera, setting, 0.0, key)
-            rows[name] = [replace(row, on_fraction=1.0) for row in truth_of(lit, frame)]
+            real = [row for row in truth_of(lit, frame) if row.ghost_of is None]
+            rows[name] = [replace(row, on_fraction=1.0) for row in real]
+        return rows
+
+    def _could_be_seen(self, rows: dict[str, list[SourceTruth]]) -> tuple[Sight, ...]:
+        """Return each robot as it could be seen were all lit at once: the ceiling of what is heard."""
         none: dict[str, list[Detection]] = {name: [] for name in rows}
         lamps_px: dict[str, list[Outline]] = {name: [] for name in rows}
         return sights(self._others, rows, none, lamps_px, self._known).sights
 
-    def _identities(self) -> dict[str, Any]:
-        """Return who was told to be who: numbers right, wrong, and robots that told it in full.
+    def _nobody_yet(self, rows: dict[str, list[SourceTruth]]) -> Followed:
+        """Return whom tracks follow before there are any."""
+        others_m = np.array([self._world.sources[f"{name}.top"].pose.position_m for name in self._others])
+        places_m = self._world.robots[OBSERVER].pose.to_local(others_m)
+        return Followed(
+            self._others,
+            places_m,
+            {name: unlike(some, self._known[name]) for name, some in rows.items()},
+            self._known,
+        )
 
-        A track's two words are one robot's where they follow each other as a robot sends them. A word that
-        may be another track's tells nobody's number.
-        """
-        robots = self.plan.robots
-        right: set[str] = set()
-        wrong = 0
-        by_track: dict[int, list[Word]] = {}
-        for word in self._told:
-            if word.message.ambiguous_with is None:
-                by_track.setdefault(word.message.track, []).append(word)
-        length = len(words_of(0, robots))
-        for words in by_track.values():
-            in_time = sorted(words, key=lambda word: word.message.start_s)
-            for first in range(len(in_time) - length + 1):
-                some = in_time[first : first + length]
-                if some[-1].message.start_s - some[0].message.start_s > _PAIR_S * (length - 1) + 1e-9:
-                    continue
-                number = number_of(tuple(word.message.word for word in some), robots)
-                if number is None:
-                    continue
-                told = names_of(robots)[number]
-                if all(told in word.robots for word in some):
-                    right.add(told)
-                else:
-                    wrong += 1
-        return {"right": sorted(right), "wrong": wrong}
+    def _identities(self) -> dict[str, Any]:
+        """Return who was told to be who: numbers right, wrong, and robots that told it in full."""
+        robots, names = self.plan.robots, names_of(self.plan.robots)
+        whom = {word.message: word.robots for word in self._told}
+        told = [
+            (names[number], all(names[number] in whom[word] for word in words))
+            for number, words in numbers_told(whom, robots)
+        ]
+        right = {name for name, is_right in told if is_right}
+        return {"right": sorted(right), "wrong": sum(not is_right for _, is_right in told)}
 
 
 def _standing(robot: str, pose: Pose) -> dict[str, Any]:

@@ -89,11 +89,16 @@ class Condition:
         return {why: counts for why, counts in found.items() if counts[0]}
 
     def _tracks(self) -> dict[str, int]:
-        """Return how many tracks there are as runs end, of nobody, and of whom another one is already."""
+        """Return how many tracks there are as runs end.
+
+        How many of them are off on the bearing of a robot whose flare is not its own, of nobody, of whom
+        another one is already.
+        """
         each = [record["tracks"] for record in self.records]
-        known = [[robot for robot in tracks if robot is not None] for tracks in each]
+        known = [[robot for robot, _ in tracks if robot is not None] for tracks in each]
         return {
             "tracks": sum(map(len, each)),
+            "tracks_off": sum(robot is not None and off for tracks in each for robot, off in tracks),
             "tracks_of_nobody": sum(map(len, each)) - sum(map(len, known)),
             "tracks_twice": sum(len(tracks) - len(set(tracks)) for tracks in known),
         }

@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,24 @@ def test_how_robots_can_be_seen() -> None:
     assert [near for _, near in whys(rows, known)][:4] == [True] * 4
 
 
+def test_a_track_off_on_the_bearing_of_who_is_partly_hidden_is_its() -> None:
+    """As the camera sees it, 6 cm before the middle of the robot; within 3 px, and only of those given."""
+    known = {CAMERA: calibration(load_scene(HALL), CAMERA)}
+    lens_m, px_rad = known[CAMERA].position_body_m, 1.0 / known[CAMERA].fx_px
+    place_m = lens_m + 2.0 * np.array([math.cos(0.4), math.sin(0.4), 0.0])
+    for off_px, unlike, whom in (
+        (2.9, {CAMERA: ["a"]}, ("a", True)), (3.1, {CAMERA: ["a"]}, (None, True)), (0.0, {CAMERA: []}, (None, True)),
+    ):  # fmt: skip
+        followed = Followed(["b", "a"], np.stack([-place_m, place_m]), unlike, known)
+        turn_rad = 0.4 + off_px * px_rad
+        track = replace(
+            _track(0.0, 0.0),
+            position_body_m=lens_m + 3.5 * np.array([math.cos(turn_rad), math.sin(turn_rad), 0.0]),
+        )
+        followed.update([track])
+        assert followed.now() == [whom]
+
+
 def _hit(u_px: float, v_px: float = 400.0, **changes: Any) -> Detection:
     given: dict[str, Any] = {
         "camera": CAMERA, "index": 0, "time_s": 0.0, "u_px": u_px, "v_px": v_px, "u_sigma_px": 0.1, "v_sigma_px": 0.1,
@@ -132,10 +151,11 @@ def _track(time_s: float, x_m: float, number: int = 1, ghost: Ghost = "no") -> T
 
 def test_a_word_is_of_whom_its_track_followed_for_most_of_it() -> None:
     """σ and floor are 1 and 2 cm, so 5 σ are 11.2 cm."""
-    followed = Followed(["a", "b"], np.array([[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+    known = {CAMERA: calibration(load_scene(HALL), CAMERA)}
+    followed = Followed(["a", "b"], np.array([[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), {}, known)
     for time_s, x_m in ((0.0, 2.11), (1.0, 2.0), (4.0, 2.12), (9.0, 2.98), (10.0, 3.0)):
         followed.update([_track(time_s, x_m), _track(time_s, 3.0, 2, "yes")])
-    assert followed.now() == ["b"]
+    assert followed.now() == [("b", False)]
     assert followed.during(1, 0.0, 10.0) == "a"  # for four seconds; b for one, nobody for five
     assert followed.during(1, 3.5, 9.4) == "a"
     assert followed.during(1, 3.5, 9.6) == "b"
@@ -238,7 +258,7 @@ def _record(seed: int) -> dict[str, Any]:
         "sights": [sights, sights], "false_alarms": 3, "parts": 5,
         "packets": [["r0001", 1, 5.0, True], ["r0003", 3, 7.0, False], ["r0004", 4, 7.0, True]],
         "misattributed": 1, "wrong_words": 0, "identities": {"right": ["r0001", "r0004"], "wrong": 1},
-        "tracks": ["r0001", None, "r0001"], "shared": {"front": {"groups": [1, 2], "mean_share": 1e-5, "worst_share": 0.004}},
+        "tracks": [["r0001", False], [None, True], ["r0001", True]], "shared": {"front": {"groups": [1, 2], "mean_share": 1e-5, "worst_share": 0.004}},
     }  # fmt: skip
 
 
@@ -258,7 +278,8 @@ def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
     assert figures["range"]["rmse_m"] == pytest.approx(0.02)
     assert figures["packets_by_sight"] == {"free": [4, 4], "merged": [2, 0]}
     assert (figures["told_in_full"], figures["identities_right"], figures["identities_wrong"]) == (6, 4, 2)
-    assert (figures["tracks"], figures["tracks_of_nobody"], figures["tracks_twice"]) == (6, 2, 2)
+    names = ("tracks", "tracks_off", "tracks_of_nobody", "tracks_twice")
+    assert [figures[name] for name in names] == [6, 2, 2, 2]
     assert (figures["false_alarms"], figures["parts"]) == (6, 10)
     assert figures["seconds"]["light_of_a_set"] == 9.0
     page = write_outcome(Outcome(5, "hall", [0, 1], [condition]), tmp_path)
