@@ -29,6 +29,7 @@ MERGED_PX, NEAR_PX = 2.0, 4.0
 _BESIDE = 0.1  # a neighbour with less of one's light hardly shifts it
 _EDGE_PX = 3.0
 _WHOLE = 0.99
+_HALO_SIGMAS = 20.0  # more than flares are told apart by
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class Sight:
     near
         Whether another source shines within 4 px of it, in the camera that shows it best.
     range_m, limit_m
-        The true distance from that camera, and the Cramér–Rao bound of it, overlapping flares told apart.
+        The true distance from that camera, and the Cramér–Rao bound of it, overlapping flares told apart;
+        NaN where it is not found.
     found
         Whether a detection is its.
     said_m, sigma_m
@@ -159,17 +161,34 @@ def sights(
             is_part = any(_is_part(hit, real[number], known[camera]) for number in shining)
             parts += is_part
             alarms += not is_part
+        reach = _Reach(real, known[camera])
         for number, (row, (why, near)) in enumerate(zip(real, whys(real, known[camera]), strict=True)):
             hit = hits.get(number)
             limit_m = math.nan
-            if why in ("free", "merged") and row.on_fraction >= 1.0:
-                limit_m, _ = source_limits(row, known[camera], real)
+            if hit is not None and why in ("free", "merged") and row.on_fraction >= 1.0:
+                limit_m, _ = source_limits(row, known[camera], reach.of(number))
             one = Sight(
                 row.robot, why, near, row.range_m, limit_m, hit is not None,
                 math.nan if hit is None else hit.range_m, math.nan if hit is None else hit.range_sigma_m,
             )  # fmt: skip
             best[row.robot] = _better(best.get(row.robot), one)
     return InSet(tuple(best.get(robot, _unseen(robot)) for robot in robots), alarms, parts)
+
+
+class _Reach:
+    """Which sources of a frame may overlap which: for each a few, where there are hundreds."""
+
+    def __init__(self, rows: Sequence[SourceTruth], known: Calibration) -> None:
+        self._rows = rows
+        self._places_px = np.array([(row.u_px, row.v_px) for row in rows]).reshape(-1, 2)
+        self._radii_px = np.array([image_radius_px(row, known) for row in rows])
+        self._halo_px = _HALO_SIGMAS * known.psf_sigma_px
+
+    def of(self, number: int) -> list[SourceTruth]:
+        """Return the sources whose images may reach that of one, itself among them."""
+        apart_px = np.hypot(*(self._places_px - self._places_px[number]).T)
+        near = apart_px < self._radii_px + self._radii_px[number] + self._halo_px
+        return [self._rows[row] for row in np.flatnonzero(near)]
 
 
 def _is_part(hit: Detection, row: SourceTruth, known: Calibration) -> bool:
