@@ -7,12 +7,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.errors import InputError
+
 FILM, PICTURE = "film.mp4", "swarm.png"
 PICTURES = "pictures"
 """Where they lie in a run's folder, by the number of their set."""
 
 MOST_PICTURES = 450
 _RATE_HZ = 30.0
+_SMALL = (cv2.IMWRITE_PNG_COMPRESSION, 9)
 _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 90)
 
 
@@ -23,7 +26,7 @@ def picture_file(number: int, last: bool) -> str:
 
 def encoded(picture: NDArray[np.uint8], last: bool) -> bytes:
     """Return a picture as that file."""
-    done, buffer = cv2.imencode(".png", picture) if last else cv2.imencode(".jpg", picture, _QUALITY)
+    done, buffer = cv2.imencode(".png", picture, _SMALL) if last else cv2.imencode(".jpg", picture, _QUALITY)
     if not done:
         raise RuntimeError("OpenCV could not encode a picture of the swarm")
     return buffer.tobytes()
@@ -36,23 +39,33 @@ def show_run(run: Path, folder: Path) -> tuple[str | None, str | None]:
     -------
     Their names; None of a film where the run has no two pictures or OpenCV cannot write VP9, None of a
     picture where the run has none.
+
+    Raises
+    ------
+    InputError
+        A picture of the run is broken.
     """
     files = sorted((run / PICTURES).glob("*.*g"))
     if not files:
         return None, None
     shutil.copyfile(files[-1], folder / PICTURE)
-    pictures = [cv2.imread(str(file)) for file in files]
-    shown = [np.asarray(one, dtype=np.uint8) for one in pictures if one is not None]
-    if len(shown) < 2:
+    if len(files) < 2:
         return None, PICTURE
-    rows, columns = shown[0].shape[:2]
+    rows, columns = _read(files[0]).shape[:2]
     aside = folder / f".partial-{FILM}"
     writer = cv2.VideoWriter(str(aside), cv2.VideoWriter.fourcc(*"vp09"), _RATE_HZ, (columns, rows))
     if not writer.isOpened():
         aside.unlink(missing_ok=True)
         return None, PICTURE
-    for one in shown:
-        writer.write(one)
+    for file in files:
+        writer.write(_read(file))
     writer.release()
     aside.replace(folder / FILM)
     return FILM, PICTURE
+
+
+def _read(file: Path) -> NDArray[np.uint8]:
+    picture = cv2.imread(str(file))
+    if picture is None:
+        raise InputError(f"{file}: no picture; remove the folder of this seed, and it runs anew")
+    return np.asarray(picture, dtype=np.uint8)
