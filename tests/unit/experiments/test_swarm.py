@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from nir_render import load_scene
+from nir_render.evaluate.metrics import source_limits
 from nir_render.experiments.swarm.followed import Followed
 from nir_render.experiments.swarm.hall import HALL, OBSERVER, hall_scene, places_m, side_m
 from nir_render.experiments.swarm.identity import number_of, words_of
@@ -121,6 +122,23 @@ def test_detections_of_nobody_and_parts_of_who_is_partly_hidden() -> None:
         ("away", "cut", False),
     ]  # fmt: skip
     assert (in_set.parts, in_set.false_alarms) == (2, 4)
+
+
+def test_limits_are_those_beside_all_others() -> None:
+    """Of two that overlap by a little, of a large near one, and of one alone: as if all rows were asked."""
+    known = calibration(load_scene(HALL), CAMERA)
+    rows = [
+        _row(200.0, robot="a"), _row(203.5, robot="b"), _row(300.0, 1e5, range_m=0.4, robot="near"),
+        _row(330.0, robot="beside"), _row(900.0, robot="alone"),
+    ]  # fmt: skip
+    hits = [_hit(row.u_px) for row in rows]
+    in_set = sights(
+        [row.robot for row in rows], {CAMERA: rows}, {CAMERA: hits}, {CAMERA: []}, {CAMERA: known}
+    )
+    for row, one in zip(rows, in_set.sights, strict=True):
+        assert one.limit_m == source_limits(row, known, rows)[0]
+    lone_m = source_limits(rows[0], known)[0]
+    assert in_set.sights[0].limit_m > 1.05 * lone_m
 
 
 def _message(start_s: float, end_s: float, word: int, track: int = 1) -> Message:
