@@ -155,10 +155,10 @@ def sights(
         shining = [number for number, row in enumerate(real) if row.direct_e > 0.0]
         pairs = match([real[number] for number in shining], found[camera], known[camera])
         hits = {shining[number]: found[camera][hit] for number, hit in pairs.pairs}
-        for hit in (found[camera][number] for number in pairs.unmatched):
-            if hit.ghost or on_a_lamp(hit, lamps_px[camera]):
+        for other in (found[camera][number] for number in pairs.unmatched):
+            if other.ghost or on_a_lamp(other, lamps_px[camera]):
                 continue
-            is_part = any(_is_part(hit, real[number], known[camera]) for number in shining)
+            is_part = any(_is_part(other, real[number], known[camera]) for number in shining)
             parts += is_part
             alarms += not is_part
         reach = _Reach(real, known[camera])
@@ -188,7 +188,7 @@ class _Reach:
         """Return the sources whose images may reach that of one, itself among them."""
         apart_px = np.hypot(*(self._places_px - self._places_px[number]).T)
         near = apart_px < self._radii_px + self._radii_px[number] + self._halo_px
-        return [self._rows[row] for row in np.flatnonzero(near)]
+        return [self._rows[row] for row in np.flatnonzero(near).tolist()]
 
 
 def _is_part(hit: Detection, row: SourceTruth, known: Calibration) -> bool:

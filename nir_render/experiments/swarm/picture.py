@@ -178,7 +178,12 @@ class SwarmPicture:
         scale, first = self._scale(known), self._first_row(known)
         rows = frame.data_dn[first : first + _ROWS[1] - _ROWS[0]].astype(np.float32)
         means_dn = cv2.resize(rows, (_STRIP_WIDTH, height), interpolation=cv2.INTER_AREA)
-        shown = tone_map(np.asarray(means_dn), frame.black_level_dn, float(known.saturation_dn), _SOFTENING)
+        shown = tone_map(
+            np.asarray(means_dn, dtype=np.float32),
+            frame.black_level_dn,
+            float(known.saturation_dn),
+            _SOFTENING,
+        )
         few = shown // _STEP * _STEP  # levels, so that the dark ground is even and its file small
         canvas[top : top + height, left : left + _STRIP_WIDTH] = few[..., None]
         taken: list[tuple[float, float]] = []
