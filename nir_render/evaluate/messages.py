@@ -208,9 +208,7 @@ def _judged(
         meant = [
             k
             for k, (observer, packet) in enumerate(in_view)
-            if observer == robot
-            and (packet.robot, packet.source, None) in sources
-            and is_of(message, packet)
+            if observer == robot and (packet.robot, packet.source, None) in sources and is_of(message, packet)
         ]
         if meant:
             # Two may say one word at once, each ambiguous with the other: that is one packet of each.

@@ -62,7 +62,9 @@ def test_a_film_and_the_last_picture(tmp_path: Path) -> None:
         (run / picture_file(number, number == 3)).write_bytes(encoded(picture, number == 3))
     film, last = show_run(run, tmp_path)
     assert last == PICTURE
-    assert np.unique(cv2.imread(str(tmp_path / PICTURE))).tolist() == [180]
+    drawn = cv2.imread(str(tmp_path / PICTURE))
+    assert drawn is not None
+    assert np.unique(drawn).tolist() == [180]
     if film is None:
         pytest.skip("this OpenCV cannot write VP9")
     shown = cv2.VideoCapture(str(tmp_path / FILM))
