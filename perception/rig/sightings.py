@@ -92,7 +92,7 @@ def sightings_of(
         ]
     ).reshape(-1, 10).T  # fmt: skip
     u_px, v_px, u_sigma_px, v_sigma_px, range_m, sigma_m, common_m = columns[:7]
-    saturated, merged, ghost = columns[7:].astype(bool)
+    saturated, merged, ghost = np.ascontiguousarray(columns[7:].astype(bool))
     axes = bearing_axes(_bearings(hits, calibrations))
     ranged = (range_m > 0.0) & (range_m < FARTHEST_KNOWN_M)
     # Of a clipped flare that was not recovered the range is but a bound.

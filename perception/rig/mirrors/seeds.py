@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.rig.mirrors.flares import Flares
-from perception.rig.mirrors.model import NEAREST_MIRROR_M, explained_by
+from perception.rig.mirrors.model import CONSTANT, NEAREST_MIRROR_M, SEED_GATE_CHI2, match_all
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -112,14 +112,20 @@ def best_seeds(
     flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int, most: int
 ) -> tuple[Array, Indices]:
     """Return the planes that explain most images, shape (most, 5) or less, and how many each does."""
-    count, misfit, mark = explained_by(flares, parents, images, seeds, kind)
-    chosen = _chosen(seeds, count, misfit, mark, most)
+    # A seed has the noise of one or two pairs, and that of a dielectric a guessed index, so gates are wide.
+    gate_chi2 = SEED_GATE_CHI2 if kind == CONSTANT else 0.0
+    pairs, count, misfit = match_all(flares, parents, images, seeds, kind, gate_chi2)
+    chosen = _chosen(seeds, pairs, count, misfit, most)
     return seeds[chosen], count[chosen]
 
 
 @compiled
-def _chosen(seeds: Array, count: Indices, misfit: Array, mark: Indices, most: int) -> Indices:
+def _chosen(seeds: Array, pairs: Indices, count: Indices, misfit: Array, most: int) -> Indices:
     """Return which planes to try, the best first."""
+    mark = np.zeros(len(seeds), dtype=np.int64)  # of which pairs, in whatever order
+    for seed in range(len(seeds)):
+        for k in range(count[seed]):
+            mark[seed] += (pairs[seed, 0, k] + 1) * (pairs[seed, 1, k] + 31) ** 4
     taken = np.zeros(len(seeds), dtype=np.bool_)
     chosen = np.empty(min(most, len(seeds)), dtype=np.int64)
     ranks = 0
