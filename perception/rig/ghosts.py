@@ -38,7 +38,7 @@ from perception.rig.mirrors.odds import (
     one_of_each,
 )
 from perception.rig.mirrors.planes import KINDS, mirror_plane, prior_of
-from perception.rig.mirrors.seeds import best_seeds, seeds_of_constant
+from perception.rig.mirrors.seeds import best_seeds, dim_pairs, plausible_pairs, seeds_of_constant
 from perception.types import Ghost, MirrorPlane, bearing_axes
 
 Array = NDArray[np.float64]
@@ -62,7 +62,6 @@ _UNCLAIMED_RAD = 1e-3
 _MOST_PAIRS_OF_PAIRS = 40_000
 _MOST_PLANES = 4
 _SEED_INDICES = (1.4, 1.45, 1.5, 1.55, 1.6)
-_DIM_RATIO = 1.5
 _OWN_SIGMA_M = 2e-3
 
 
@@ -186,7 +185,7 @@ def _best_plane(
         for one in _fitted(flares, robots, images, log_chance, trial):
             if one is not None and one.log_odds > _LOG_YES:
                 return one
-    parents, shown = _plausible_pairs(flares, robots, images)
+    parents, shown = plausible_pairs(flares, robots, images)
     chosen = [
         (*best_seeds(flares, robots, images, seeds, kind, _MOST_TRIED), kind)
         for kind, seeds in _seeds(flares, parents, shown)
@@ -219,23 +218,12 @@ def _trials_of(seeds: Array, kinds: Indices) -> _Trials:
     return _Trials(seeds, kinds, priors, precisions)
 
 
-def _plausible_pairs(flares: Flares, robots: Indices, images: Indices) -> tuple[Indices, Indices]:
-    """Return whom each flare may show: an image is farther than what it shows, from anywhere before it."""
-    i, j = (grid.ravel() for grid in np.meshgrid(robots, images, indexing="ij"))
-    near_m = np.linalg.norm(flares.place_m[i] - flares.origin_m[j], axis=1)
-    usable = (i != j) & (flares.seems_m[j] > near_m)
-    return i[usable], j[usable]
-
-
 def _seeds(flares: Flares, parents: Indices, images: Indices) -> list[tuple[int, Array]]:
     """Return guesses of planes, by kind of reflectance."""
     pairs = len(parents)
     stride = max(1, pairs * (pairs - 1) // 2 // _MOST_PAIRS_OF_PAIRS)
     seeds = [(CONSTANT, seeds_of_constant(flares, parents, images, stride, _MOST_SEEDS))]
-    # A dielectric takes more than half of the light but at grazing angles.
-    near_m = np.linalg.norm(flares.place_m[parents] - flares.origin_m[images], axis=1)
-    dim = flares.seems_m[images] > _DIM_RATIO * near_m
-    parents, images = parents[dim], images[dim]
+    parents, images = dim_pairs(flares, parents, images)
     seeds += [(kind, seeds_of_kind(flares, parents, images, kind, _SEED_INDICES)) for kind in (SURFACE, PANE)]
     return [(kind, planes) for kind, planes in seeds if len(planes)]
 
