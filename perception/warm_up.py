@@ -20,7 +20,7 @@ _ROWS, _COLUMNS = 256, 320
 
 
 def warm_up() -> None:
-    """Compile the loops of detector, limits, rig, track and messages, where that was not done on this machine.
+    """Compile the loops of detector, limits, rig and messages, where that was not done on this machine.
 
     It takes a minute once, when the package is new, and a moment after: to be called where a robot is set up,
     or starts, so that no frame waits for it.

@@ -55,6 +55,9 @@ def gated_pairs(
     settings
         Gates and costs.
     """
+    if not (len(bank.number) and len(seen.range_m)):
+        nothing, none = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return Pairs(none, none, nothing, nothing, none)
     track, measurement = _near(bank.states, seen, observer_m)
     states, there = taken_states(bank.states, track), seen.taken(measurement)
     found = innovations(states, there)
