@@ -14,13 +14,14 @@ from perception.pairs import inseparable
 from perception.photometry import Expected, sample_at
 from perception.rig.measure_set import measure_set
 from perception.robust.detect import detect_robust
+from perception.track.tracker import Tracker
 from perception.types import Calibration, Detection, Layout, RawFrame, Signal
 
 _ROWS, _COLUMNS = 256, 320
 
 
 def warm_up() -> None:
-    """Compile the loops of detector, limits, rig and messages, where that was not done on this machine.
+    """Compile the loops of detector, limits, rig, tracks, decoders, where that was not done on this machine.
 
     It takes a minute once, when the package is new, and a moment after: to be called where a robot is set up,
     or starts, so that no frame waits for it.
@@ -54,7 +55,7 @@ def _decode_sample() -> None:
 
 
 def _measure_sample_set(calibration: Calibration) -> None:
-    """Measure a set of two cameras: three robots, one with two sources, and their images in a mirror."""
+    """Measure and follow what two cameras see: robots, one with two sources, and their mirror images."""
     pair = Layout("pair", ((0.05, 0.0, 0.0), (-0.05, 0.0, 0.0)), (1.0, 1.0))
     calibration = replace(calibration, layouts=(pair,))
     side = replace(calibration, camera="side", position_body_m=np.array([0.1, 0.0, 0.0]))
@@ -94,7 +95,10 @@ def _measure_sample_set(calibration: Calibration) -> None:
                 )
             )
         detections.append(own)
-    measure_set(frames, detections, {camera.camera: camera for camera in (calibration, side)})
+    seen = measure_set(frames, detections, {camera.camera: camera for camera in (calibration, side)})
+    tracker = Tracker()
+    for time_s in (0.0, 0.05):
+        tracker.update(time_s, seen.measurements)
 
 
 def _sample() -> tuple[RawFrame, Calibration]:
