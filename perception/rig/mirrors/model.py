@@ -83,6 +83,8 @@ def residual(
     """
     left, up, along, path_m, across_m = shown_at(flares, image, plane, x, y, z)
     off = off_in_range(flares, image, plane, kind, path_m, across_m)
+    if along > 0.0:  # which is quicker
+        return -math.atan(left / along), -math.atan(up / along), off
     return -math.atan2(left, along), -math.atan2(up, along), off
 
 
@@ -209,7 +211,7 @@ def fit_plane(
         # What its own pairs contradict after three steps is not worth polishing.
         if settled or step == FIT_STEPS - 1 or (step > 2 and normal[4, 4] > HOPELESS_CHI2 * len(parents)):
             break
-        length, settled = 0.0, True
+        settled = True
         for k in range(4):
             change = 0.0
             for m in range(4):
@@ -217,10 +219,7 @@ def fit_plane(
             settled &= change**2 < SETTLED2 * information[k, k]
             for m in range(5):
                 plane[m] += min(max(change, -MOST_STEP[k]), MOST_STEP[k]) * moves[k, m]
-        for k in range(3):
-            length += plane[k] ** 2
-        for k in range(3):
-            plane[k] /= math.sqrt(length)
+        plane[:3] /= math.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
     return normal[4, 4], log_peak, information
 
 
