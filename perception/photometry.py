@@ -192,7 +192,7 @@ def sample_at(
                 shapes.append(flare_image(hit.u_px, hit.v_px, hit_rad, window, calibration).fraction)
             else:
                 shapes.append(_gaussian(hit.u_px, hit.v_px, hit_px, *box))
-    image_e = (counts.ravel() - frame.black_level_dn) / gain
+    image_e = np.asarray((counts.ravel() - frame.black_level_dn) / gain, dtype=np.float64)
     columns = np.array(shapes).reshape(len(shapes), -1)
     flux_e, sigma_e = _fitted_flux(columns, image_e, floor_e2)
     if not 0.0 < sigma_e < lit_e:

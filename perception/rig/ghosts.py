@@ -165,7 +165,7 @@ def _flares_of(joined: Joined, rows: Indices, own_sources_body_m: Array) -> Flar
     flares.place_m[:n] = flares.origin_m[:n] + joined.range_m[rows, None] * bearing
     flares.seems_m[:n] = joined.seems_m[rows]
     flares.axes[:n], flares.axes[n:] = bearing_axes(bearing), np.eye(3)
-    claimed = np.isfinite(covariance).all(axis=(1, 2))[:, None, None]
+    claimed = np.isfinite(covariance).all(axis=(1, 2), keepdims=True)
     flares.angular_rad2[:n] = np.where(claimed, covariance[:, :2, :2], _UNCLAIMED_RAD**2 * np.eye(2))
     flares.noise[:n], flares.common[:n] = joined.noise[rows], joined.common[rows]
     flares.noise_m2[:n], flares.noise_m2[n:] = joined.noise_m2[rows], _OWN_SIGMA_M**2 * np.eye(3)
@@ -301,4 +301,4 @@ def _lone_probability(count: int, own: int, has_mirror: bool) -> Array:
     """
     share = math.exp(log_share(1, max(count + own - 2, 0)))
     odds = 0.0 if has_mirror else MIRROR_PROBABILITY * share / count
-    return np.minimum(odds * (np.arange(count) + own), 0.5)
+    return np.asarray(np.minimum(odds * (np.arange(count) + own), 0.5))

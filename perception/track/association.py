@@ -136,7 +136,7 @@ def _near_pairs(
 @compiled
 def _length2(one: Array, other: Array) -> float:
     """Return the squared distance of two places."""
-    return (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2
+    return float((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
 
 
 def _likelihood(

@@ -69,7 +69,7 @@ def off_in_range(
     """Return ln of how much farther an image seems than its path, but for the light that the mirror takes."""
     off = math.log(flares.seems_m[image] / path_m)
     if kind == CONSTANT:
-        return off - plane[4]
+        return float(off - plane[4])
     return off + 0.5 * math.log(of_dielectric(kind, plane[4], abs(across_m) / path_m))
 
 

@@ -52,7 +52,7 @@ def test_truth_says_how_far_a_flare_moves_within_an_exposure(scene: nr.Scene) ->
     slow = scene.with_({"robots.r1.rig.cameras.front.exposure": "10 ms"}).at(0.0)
     across = Velocity(np.array([0.0, -0.6, 0.0]), np.zeros(3))
     turning = Velocity(np.zeros(3), np.array([0.0, 0.0, 0.5]))
-    cases = (
+    cases: tuple[tuple[float, float, dict[str, Velocity]], ...] = (
         (3.0, 0.0, {"r2": across}),
         (3.0, 0.6, {"r1": turning}),
         (3.0, 0.0, {}),
