@@ -122,8 +122,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         (place / "scene.yaml").write_text(yaml.safe_dump(SCENE))
-        axis = {"path": "robots.r2.position.x", "from": "0.7 m", "to": "2.5 m", "count": asked.jobs}
-        document = {"format": 1, "name": "memory", "scene": "scene.yaml", "axes": {"place": axis}}
+        axis = {"path": "robots.r2.position.x", "from": "0.7 m", "to": "2.5 m"}
+        sample = {"design": "random", "count": asked.jobs}
+        document = {
+            "format": 1, "name": "memory", "scene": "scene.yaml", "axes": {"place": axis}, "sample": sample
+        }  # fmt: skip
         (place / "campaign.yaml").write_text(yaml.safe_dump(document))
         campaign = load_campaign(place / "campaign.yaml")
         jobs = plan(campaign)

@@ -7,7 +7,8 @@ would fail; all else of a check follows from no seed, and is held once (`holds`,
 `sensor`: defects behind the light, on the reference's own light: that needs no render, and no repetition.
 `light`: defects of the light alone, each `trials` times with seeds of its own, judged in the family of the
 whole suite, the direct table left out: what is caught is caught by the indirect light. A wall's albedo is 5 %
-lower; where several walls share a material, one of them gets its own. `-P` keeps this folder off Python's path.
+lower; where several walls share a material, one of them gets its own. `-P` keeps this folder off Python's
+path.
 """
 
 import argparse

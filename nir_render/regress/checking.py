@@ -15,6 +15,7 @@ from nir_render.regress.repeatable import check_repeatable
 from nir_render.regress.scenes_of import references_folder, scenes_of
 from nir_render.regress.stages.camera import compare_calibration, compare_electrons, compare_frame
 from nir_render.regress.stages.direct import compare_tables
+from nir_render.regress.stages.exposure import compare_choices
 from nir_render.regress.stages.light import GroupTests, compare_indirect, finding_of
 from nir_render.regress.stages.perception import compare_detections
 from nir_render.regress.statistics import judge
@@ -226,11 +227,7 @@ def _findings_after_light(case: _SceneCase) -> tuple[list[Finding], list[ImagePa
         for camera, calibration in reference.calibrations.items()
         if camera in scene.all_cameras()
     ]
-    findings += [
-        Finding("camera", f"{name} automatic exposure", "skipped", "not judged: exposed as the reference was")
-        for name in scene.cameras()
-        if scene.camera(name)[1].auto_exposure is not None
-    ]
+    findings += compare_choices(scene, reference.shots, exact=exact)
     pairs, taken = [], []
     for shot in reference.shots:
         setting = case.settings.get((shot.frame.camera, shot.frame.index))
