@@ -14,6 +14,7 @@ path.
 import argparse
 import json
 import math
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -75,7 +76,7 @@ def sensor_defects(scene: Scene) -> Iterator[tuple[str, Changes]]:
     sensor = camera.sensor
     yield "gain 1 %", {f"{place}.sensor.system_gain": f"{1.01 * sensor.system_gain_dn_per_e!r} DN/e"}
     if camera.auto_exposure is None:
-        yield "exposure 1 %", {f"{place}.exposure": f"{1.01e3 * camera.exposure_s[0]!r} ms"}
+        yield "exposure 1 %", {f"{place}.exposure": f"{1.01e3 * camera.exposure_s!r} ms"}
     else:
         yield "exposure control 1 %", {f"{place}.auto_exposure.target": 1.01 * camera.auto_exposure.target}
     yield "1 nm", {f"{place}.filter.centre": "941 nm"}
@@ -125,6 +126,7 @@ def main() -> None:
     for number in range(asked.clean):
         seen = [tests_of(scenes[name], references[name], 10_000 + number) for name in scenes]
         alarms += alarm([one for tests, _ in seen for one in tests]) or any(certain for _, certain in seen)
+        print(f"{alarms} false alarms in {number + 1} suites", file=sys.stderr)
     told["clean"] = {"suites": asked.clean, "alarms": alarms}
 
     told["sensor"] = {
@@ -143,6 +145,7 @@ def main() -> None:
                 own, certain = tests_of(faulty, references[name], 20_000 + trial)
                 caught += certain or alarm([*own, *others])
             told["light"][f"{name}: {defect}"] = f"{caught} of {asked.trials}"
+            print(f"{name}: {defect}: {caught} of {asked.trials}", file=sys.stderr)
     print(json.dumps(told))
 
 

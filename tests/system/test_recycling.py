@@ -15,7 +15,7 @@ from tests.system.test_stress import campaign
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.verify]
 
-JOBS, FRAMES = 12, 2
+JOBS, FRAMES = 8, 2
 # Says who has seen which exposure: a line for each frame.
 NOTING = """
 import os
@@ -30,7 +30,7 @@ def noting(frame, calibration):
 def test_workers_that_begin_anew_lose_nothing_and_do_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Twelve jobs, two to a process: by one worker, with its six processes, and by eight; the same files."""
+    """Eight jobs, two to a process: by one worker, with its four processes, and by eight; the same files."""
     file = campaign(tmp_path, ranges=1, exposures=JOBS)
     (tmp_path / "mine.py").write_text(NOTING)
     document = yaml.safe_load(file.read_text()) | {"estimators": ["mine.py:noting", "paper"]}

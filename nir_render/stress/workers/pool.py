@@ -45,6 +45,7 @@ from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
 from perception import Estimator
 
+PART_KIND = ".parquet"
 _DEATHS = 3
 _STARTS = 4
 _MEMORY_LIMIT_BYTES = 256 * 2**20
@@ -83,7 +84,7 @@ class Done:
 
 def part_file(parts: Path, job: Job) -> Path:
     """Return where a job leaves its rows."""
-    return parts / f"{job.key}.parquet"
+    return parts / f"{job.key}{PART_KIND}"
 
 
 def run_jobs(
@@ -104,6 +105,7 @@ def run_jobs(
     scratch.mkdir(parents=True)
     settings = {
         "distributed.scheduler.allowed-failures": _DEATHS - 1,
+        "distributed.deploy.lost-worker-timeout": "1 hour",  # one that takes long to begin anew is not lost
         "distributed.scheduler.worker-saturation": 1.0,  # none waits at a worker, which may end after its job
         "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
         "distributed.nanny.pre-spawn-environ": thread_settings(work.threads or 1),
