@@ -26,6 +26,7 @@ from nir_render.regress.checking import check_scenes
 from nir_render.regress.reference import Reference
 from nir_render.regress.scenes_of import references_folder, scenes_of
 from nir_render.regress.stages.light import compare_indirect
+from nir_render.regress.stages.view import compare_view
 from nir_render.regress.statistics import PartTests, judge
 from nir_render.regress.store import read_reference
 from nir_render.scene.scene import Scene
@@ -45,6 +46,8 @@ def tests_of(scene: Scene, reference: Reference, seed: int) -> tuple[list[PartTe
             continue
         light = render(scene, known.light.camera, known.light.time_s, seed)
         findings, pending = compare_indirect(known, light, "", alike=True)
+        calibration = reference.calibrations[light.camera]
+        findings.append(compare_view(scene, light.time_s, calibration, ""))
         certain |= any(finding.verdict == "fail" for finding in findings)
         tests += [group.parts for group in pending]
     return tests, certain
