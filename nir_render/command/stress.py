@@ -61,6 +61,9 @@ def stress(
     only_plan: Annotated[
         bool, typer.Option("--plan", help="Only check the campaign, and say how many jobs it has.")
     ] = False,
+    status: Annotated[
+        bool, typer.Option("--status", help="Only say how many of the jobs that were begun are done.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Sweep a scene along axes, and show where estimators fail; goes on where it was stopped."""
@@ -82,6 +85,9 @@ def stress(
     campaign = load_campaign(file)
     limit_bytes = light_limit_bytes(light_gib)
     folder = output if output is not None else Path("outputs") / campaign.name
+    if status:
+        _show_status(campaign, folder, as_json)
+        return
     with progress_bar("check") as progress:
         jobs = plan(campaign, progress)
     if only_plan:
@@ -375,6 +381,19 @@ def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: b
         )
         if record["refined"]:
             typer.echo(f"limits along {', '.join(record['refined'])} are refined: that adds jobs")
+
+
+def _show_status(campaign: "Campaign", folder: Path, as_json: bool) -> None:
+    from nir_render.command.terminal.console import print_json
+    from nir_render.stress.sweep import status_record
+
+    record = status_record(campaign, folder)
+    if as_json:
+        print_json(record)
+        return
+    typer.echo(f"{campaign.name}: {record['done']} of {record['jobs']} jobs are done in {folder}")
+    if record["others"]:
+        typer.echo(f"{record['others']} more are of the campaign or the program as it was before")
 
 
 def _show(result: "Sweep", as_json: bool) -> None:

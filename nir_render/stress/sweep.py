@@ -19,13 +19,13 @@ from nir_render.stress.jobs import Job
 from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
 from nir_render.stress.workers.cluster import MARK, Scheduler
-from nir_render.stress.workers.pool import Work, part_file, run_jobs
+from nir_render.stress.workers.pool import PART_KIND, Work, part_file, run_jobs
 from nir_render.transport.backend.cores import cores, usual_workers
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.backend.variant import backend
 
 MANIFEST = "campaign.json"
-TABLE, PAGE, JOBS = "table.parquet", "report.html", "jobs.jsonl"
+TABLE, PAGE, JOBS, PLANNED = "table.parquet", "report.html", "jobs.jsonl", "planned.json"
 QUEUE_LOGS = ".queue"  # what workers say that a job queue has started
 _PARTS, _LIGHT, _SCRATCH, _LOCK = "jobs", "light", ".workers", ".lock"
 
@@ -96,6 +96,7 @@ def sweep(
     _claim(folder, campaign)
     with locked(folder / _LOCK, f"{folder}: another nir-render works on this campaign; wait for its end"):
         parts = folder / _PARTS
+        write_json(folder / PLANNED, {"format": 1, "jobs": [job.key for job in jobs]})
         missing = [job for job in jobs if read_part(part_file(parts, job)) is None]
         done, failed = len(jobs) - len(missing), dict[str, str]()
         progress(done, len(jobs))
@@ -143,6 +144,30 @@ def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[s
         "done": done,
         "geometries": geometries,
         "refined": [axis.name for axis in campaign.axes if axis.refinement is not None],
+    }
+
+
+def status_record(campaign: Campaign, folder: Path) -> dict[str, Any]:
+    """Return how far the last sweep of a folder has come, as one JSON object, without planning anew.
+
+    `jobs` are those that it planned, `done` those of them whose files are there; `others` are files of jobs
+    that it did not plan: of the campaign before it was edited, or of another program.
+
+    Raises
+    ------
+    InputError
+        The folder is not this campaign's, or no sweep has begun there.
+    """
+    check_folder(folder, campaign)
+    if not (folder / PLANNED).is_file():
+        raise InputError(f"{folder}: no sweep has begun there; without --status it begins")
+    planned = {f"{key}{PART_KIND}" for key in read_json(folder / PLANNED)["jobs"]}
+    held = {path.name for path in (folder / _PARTS).glob(f"*{PART_KIND}") if not path.name.startswith(".")}
+    return {
+        "campaign": campaign.name,
+        "jobs": len(planned),
+        "done": len(planned & held),
+        "others": len(held - planned),
     }
 
 

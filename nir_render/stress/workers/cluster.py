@@ -30,6 +30,7 @@ MARK = ".seen-"  # not one of the names that a cache takes for a killed writer's
 DEATHS = 3  # of workers, that a job is given up after
 SCHEDULER_SETTINGS = {
     "distributed.scheduler.allowed-failures": DEATHS - 1,
+    "distributed.scheduler.worker-saturation": 1.0,  # none waits at a worker, which may end after its job
     "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
 }
 _THREADS = "start workers with '--nthreads 1', and '--nworkers' for more"
