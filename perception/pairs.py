@@ -11,7 +11,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from perception.compiled import compiled
 from perception.messages.pair import decode_pair
 from perception.messages.settings import DecoderSettings
 from perception.photometry import (
@@ -26,8 +28,8 @@ from perception.types import Calibration, Detection, Message, RawFrame
 UNLIKE = 0.05
 """Standard deviation of a source's flux over what its track predicts, relative, beside the track's own."""
 
-_APART = 1.5
-_SURE_PX = 2.0
+APART = 1.5
+SURE_PX = 2.0
 """Images are one up to this many widths apart; a place less certain than so many pixels says less of that."""
 
 _PARTED_S = 1.5
@@ -39,6 +41,7 @@ _IDLE_S = 1.4
 """Longer than any packet is lit, with a bit to spare: what lies before and after is read by itself."""
 _IDLE_SIGMAS = 5.0
 
+Array = NDArray[np.float64]
 Tracks = tuple[int, int]
 
 
@@ -60,17 +63,26 @@ class SumSample:
 
 def inseparable(expected: Mapping[int, Expected]) -> list[Tracks]:
     """Return the pairs of tracks, by number, whose images in a frame are one, as far as places are known."""
+    if len(expected) < 2:
+        return []
     numbers = list(expected)
-    images = list(expected.values())
-    place_px = np.array([[one.u_px, one.v_px] for one in images]).reshape(-1, 2)
-    width_px = np.array([one.width_px for one in images])
-    unsure_px = np.array([one.sigma_px for one in images])
-    apart_px = np.hypot(*(place_px[:, None] - place_px).transpose(2, 0, 1))
-    blurred_px = np.hypot(
-        np.maximum.outer(width_px, width_px), np.minimum(np.hypot.outer(unsure_px, unsure_px), _SURE_PX)
-    )
-    close = np.argwhere(np.triu(apart_px < _APART * blurred_px, 1))
-    return [(numbers[k], numbers[n]) for k, n in close.tolist()]
+    images = np.array([(one.u_px, one.v_px, one.width_px, one.sigma_px) for one in expected.values()])
+    return [(numbers[k], numbers[n]) for k, n in _inseparable(images).tolist()]
+
+
+@compiled
+def _inseparable(images: Array) -> NDArray[np.int64]:
+    """Return the pairs of images (u, v, width, uncertainty), shape (n, 4), that are one, shape (pairs, 2)."""
+    n, count = len(images), 0
+    pairs = np.empty((n * (n - 1) // 2, 2), dtype=np.int64)
+    for k in range(n):
+        for m in range(k + 1, n):
+            apart_px = math.hypot(images[k, 0] - images[m, 0], images[k, 1] - images[m, 1])
+            unsure_px = min(math.hypot(images[k, 3], images[m, 3]), SURE_PX)
+            if apart_px < APART * math.hypot(max(images[k, 2], images[m, 2]), unsure_px):
+                pairs[count] = k, m
+                count += 1
+    return pairs[:count]
 
 
 def sample_of_sum(
@@ -97,7 +109,7 @@ def sample_of_sum(
         width_px=one.width_px,
     )
     apart_px = math.hypot(one.u_px - other.u_px, one.v_px - other.v_px)
-    reach_px = apart_px + 2.0 * _APART * math.hypot(one.width_px, min(between.sigma_px, _SURE_PX))
+    reach_px = apart_px + 2.0 * APART * math.hypot(one.width_px, min(between.sigma_px, SURE_PX))
     theirs = [
         hit
         for number, hit in enumerate(found)

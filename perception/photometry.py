@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
 from perception.model.bearing import pixel_turn
 from perception.model.flare import PixelBox, flare_image, has_image, image_radius_px
-from perception.model.lens import project
+from perception.model.lens import project, stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards
 from perception.model.sensor import gain_dn_per_e, noise_floor_e2, saturation_dn
 from perception.types import Calibration, Detection, RawFrame, Signal
@@ -110,9 +111,11 @@ def expected_images(
     axes = turn / (turn**2).sum(axis=2, keepdims=True) / range_m[:, None, None]
     axes = axes @ calibration.rotation_body_camera.T
     place_px2 = axes @ covariance_m2[seen] @ axes.swapaxes(1, 2)
-    sigma_px = np.sqrt(np.maximum(np.linalg.eigvalsh(place_px2)[:, -1], 0.0))
+    across2, down2 = place_px2[:, 0, 0], place_px2[:, 1, 1]
+    longest2 = 0.5 * (across2 + down2) + np.hypot(0.5 * (across2 - down2), place_px2[:, 0, 1])
+    sigma_px = np.sqrt(np.maximum(longest2, 0.0))
     disc_rad = angular_radius_rad(range_m, calibration.source_radius_m)
-    width_px = _width_px(place_px[:, 0], place_px[:, 1], disc_rad, calibration)
+    width_px = _width_px(stretch(direction, calibration) * np.tan(disc_rad), disc_rad, calibration)
     columns = np.column_stack([place_px, sigma_px, range_m, flux_dn, width_px])
     for index, row, flux in zip(seen.tolist(), columns.tolist(), flux_dn.tolist(), strict=True):
         if flux > 0.0:
@@ -176,10 +179,11 @@ def sample_at(
     half_px = _REACH * blurred_px + 1.0
     window = PixelBox.around(expected.u_px, expected.v_px, half_px, calibration)
     counts = frame.data_dn[window.slices]
-    if counts.size < _LEAST_PIXELS or (counts >= saturation_dn(calibration, frame.gain)).any():
+    if counts.size < _LEAST_PIXELS or counts.max() >= saturation_dn(calibration, frame.gain):
         return None
     # The image of a source whose place is not known well is its mean over where it may be.
-    shapes = [_gaussian(expected.u_px, expected.v_px, blurred_px, window)]
+    box = window.left, window.top, window.width, window.height
+    shapes = [_gaussian(expected.u_px, expected.v_px, blurred_px, *box)]
     near = [hit for hit in found if _may_reach(hit, expected, half_px, calibration)]
     for hit, hit_rad, hit_px in _sizes(near, calibration):
         if max(abs(hit.u_px - expected.u_px), abs(hit.v_px - expected.v_px)) < half_px + _REACH * hit_px:
@@ -187,19 +191,10 @@ def sample_at(
             if resolved and has_image(hit.u_px, hit.v_px, hit_rad, calibration):
                 shapes.append(flare_image(hit.u_px, hit.v_px, hit_rad, window, calibration).fraction)
             else:
-                shapes.append(_gaussian(hit.u_px, hit.v_px, hit_px, window))
-    columns = np.column_stack([shape.ravel() for shape in [*shapes, np.ones(counts.shape)]])
-    image_e = (counts.ravel() - frame.black_level_dn) / gain
-    # Weights by single pixels would favour those that are low by chance: an even ground has its mean's.
-    level_e2 = max(float(np.median(image_e)), 0.0) + floor_e2
-    variance_e2 = np.maximum(image_e + floor_e2, level_e2) if len(shapes) > 1 else level_e2
-    weighted = (columns.T / variance_e2).T
-    try:
-        covariance = np.linalg.inv(columns.T @ weighted)
-    except np.linalg.LinAlgError:
-        return None
-    flux_e = float((covariance @ (weighted.T @ image_e))[0])
-    sigma_e = math.sqrt(max(float(covariance[0, 0]), 0.0))
+                shapes.append(_gaussian(hit.u_px, hit.v_px, hit_px, *box))
+    image_e = np.asarray((counts.ravel() - frame.black_level_dn) / gain, dtype=np.float64)
+    columns = np.array(shapes).reshape(len(shapes), -1)
+    flux_e, sigma_e = _fitted_flux(columns, image_e, floor_e2)
     if not 0.0 < sigma_e < lit_e:
         return None
     return _sample(flux_e / lit_e, sigma_e / lit_e, expected, frame, calibration)
@@ -221,7 +216,7 @@ def _sizes(found: Sequence[Detection], calibration: Calibration) -> list[tuple[D
     u_px, v_px, range_m = np.array([(hit.u_px, hit.v_px, hit.range_m) for hit in found]).T
     radius_rad = angular_radius_rad(np.maximum(range_m, 0.01), calibration.source_radius_m)
     radius_rad = np.where(np.isfinite(radius_rad), radius_rad, 0.0)
-    width_px = _width_px(u_px, v_px, radius_rad, calibration)
+    width_px = _width_px(image_radius_px(u_px, v_px, radius_rad, calibration), radius_rad, calibration)
     return list(zip(found, radius_rad.tolist(), width_px.tolist(), strict=True))
 
 
@@ -258,16 +253,69 @@ def _sample(
     return Sample(middle_s, frame.exposure_s, level, sigma_dark, lit)
 
 
-def _width_px(u_px: Array, v_px: Array, disc_rad: Array, calibration: Calibration) -> Array:
+def _width_px(radius_px: Array, disc_rad: Array, calibration: Calibration) -> Array:
     """Return the standard deviations of images, the pixel's own aperture left out, shape (sources,)."""
-    radius_px = image_radius_px(u_px, v_px, disc_rad, calibration)
     return np.asarray(np.hypot(calibration.psf_sigma_px, 0.5 * np.where(disc_rad > 0.0, radius_px, 0.0)))
 
 
-def _gaussian(u_px: float, v_px: float, sigma_px: float, window: PixelBox) -> Array:
+@compiled
+def _gaussian(
+    u_px: float, v_px: float, sigma_px: float, left: int, top: int, width: int, height: int
+) -> Array:
     """Return the share of a Gaussian in each pixel of a window."""
-    from scipy.special import ndtr
+    across, down, shares = np.empty(width), np.empty(height), np.empty((height, width))
+    for share, first, middle_px in ((across, left, u_px), (down, top, v_px)):
+        before = _below((first - 0.5 - middle_px) / sigma_px)
+        for k in range(len(share)):
+            after = _below((k + 0.5 + first - middle_px) / sigma_px)
+            share[k], before = after - before, after
+    for row in range(height):
+        for column in range(width):
+            shares[row, column] = down[row] * across[column]
+    return shares
 
-    across = np.diff(ndtr((np.arange(window.width + 1) - 0.5 + window.left - u_px) / sigma_px))
-    down = np.diff(ndtr((np.arange(window.height + 1) - 0.5 + window.top - v_px) / sigma_px))
-    return np.asarray(down[:, None] * across)
+
+@compiled
+def _below(sigmas: float) -> float:
+    """Return the share of a Gaussian below so many standard deviations."""
+    return 0.5 * math.erfc(-sigmas / math.sqrt(2.0))
+
+
+@compiled
+def _fitted_flux(shapes: Array, image_e: Array, floor_e2: float) -> tuple[float, float]:
+    """Fit images to pixels beside a level background: flux of the first and its σ; 0 where these are alike.
+
+    Parameters
+    ----------
+    shapes
+        Share of each image in each pixel, shape (images, pixels).
+    image_e
+        Electrons, shape (pixels,).
+    floor_e2
+        Variance of a dark pixel.
+    """
+    images = len(shapes)
+    # Weights by single pixels would favour those that are low by chance: an even ground has its mean's.
+    level_e2 = max(np.median(image_e), 0.0) + floor_e2
+    normal, seen = np.zeros((images + 1, images + 1)), np.zeros(images + 1)
+    column = np.ones(images + 1)
+    for pixel in range(len(image_e)):
+        variance_e2 = max(image_e[pixel] + floor_e2, level_e2) if images > 1 else level_e2
+        column[:images] = shapes[:, pixel]
+        for a in range(images + 1):
+            weighed = column[a] / variance_e2
+            seen[a] += weighed * image_e[pixel]
+            for b in range(images + 1):
+                normal[a, b] += weighed * column[b]
+    # The others are eliminated, the last first; what is left is of the first alone.
+    for pivot in range(images, 0, -1):
+        if not normal[pivot, pivot] > 0.0:
+            return 0.0, 0.0
+        for a in range(pivot):
+            factor = normal[a, pivot] / normal[pivot, pivot]
+            seen[a] -= factor * seen[pivot]
+            for b in range(pivot):
+                normal[a, b] -= factor * normal[pivot, b]
+    if not normal[0, 0] > 0.0:
+        return 0.0, 0.0
+    return seen[0] / normal[0, 0], 1.0 / math.sqrt(normal[0, 0])

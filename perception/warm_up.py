@@ -10,15 +10,18 @@ from perception.messages.pair import decode_pair
 from perception.messages.uart import encode, packet_levels
 from perception.model.fisher import flare_limit
 from perception.model.flare import PixelBox, flare_image
+from perception.pairs import inseparable
+from perception.photometry import Expected, sample_at
 from perception.rig.measure_set import measure_set
 from perception.robust.detect import detect_robust
+from perception.track.tracker import Tracker
 from perception.types import Calibration, Detection, Layout, RawFrame, Signal
 
 _ROWS, _COLUMNS = 256, 320
 
 
 def warm_up() -> None:
-    """Compile the loops of detector, limits and decoders, where that was not done on this machine.
+    """Compile the loops of detector, limits, rig, tracks, decoders, where that was not done on this machine.
 
     It takes a minute once, when the package is new, and a moment after: to be called where a robot is set up,
     or starts, so that no frame waits for it.
@@ -28,7 +31,15 @@ def warm_up() -> None:
     flare_limit(calibration, 40.3, 60.2, 4.0, 9e3, 20.0)
     flare_image(40.3, 60.2, 0.0025, PixelBox(50, 30, 21, 21), calibration)
     _measure_sample_set(calibration)
+    _measure_brightness(frame, calibration)
     _decode_sample()
+
+
+def _measure_brightness(frame: RawFrame, calibration: Calibration) -> None:
+    """Look at a dark place beside another."""
+    place = Expected(u_px=200.3, v_px=60.2, sigma_px=0.1, range_m=3.0, flux_dn=9e3, width_px=0.8)
+    sample_at(place, (), frame, calibration)
+    inseparable({1: place, 2: replace(place, u_px=201.0)})
 
 
 def _decode_sample() -> None:
@@ -44,7 +55,7 @@ def _decode_sample() -> None:
 
 
 def _measure_sample_set(calibration: Calibration) -> None:
-    """Measure a set of two cameras: three robots, one with two sources, and their images in a mirror."""
+    """Measure and follow what two cameras see: robots, one with two sources, and their mirror images."""
     pair = Layout("pair", ((0.05, 0.0, 0.0), (-0.05, 0.0, 0.0)), (1.0, 1.0))
     calibration = replace(calibration, layouts=(pair,))
     side = replace(calibration, camera="side", position_body_m=np.array([0.1, 0.0, 0.0]))
@@ -84,7 +95,10 @@ def _measure_sample_set(calibration: Calibration) -> None:
                 )
             )
         detections.append(own)
-    measure_set(frames, detections, {camera.camera: camera for camera in (calibration, side)})
+    seen = measure_set(frames, detections, {camera.camera: camera for camera in (calibration, side)})
+    tracker = Tracker()
+    for time_s in (0.0, 0.05):
+        tracker.update(time_s, seen.measurements)
 
 
 def _sample() -> tuple[RawFrame, Calibration]:

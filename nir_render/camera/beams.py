@@ -19,6 +19,8 @@ from nir_render.scene.documents.camera import Camera
 from nir_render.scene.emission import Emitter
 from nir_render.spectra.nodes import ONE_NODE, Node
 
+_TRUNCATE = 6.0  # of a Gaussian, in σ
+
 
 @dataclass(frozen=True, eq=False)
 class Beam:
@@ -113,8 +115,14 @@ def blur(camera: Camera, image_e: NDArray[np.float64]) -> NDArray[np.float64]:
     sigma_px = core.gaussian_px
     if sigma_px is None:
         return share * convolve(core, image_e)
-    blurred_e = np.asarray(gaussian_filter(image_e, sigma_px, mode="nearest", truncate=6.0))
+    blurred_e = np.asarray(gaussian_filter(image_e, sigma_px, mode="nearest", truncate=_TRUNCATE))
     return blurred_e if share == 1.0 else share * blurred_e
+
+
+def blur_reach_px(camera: Camera) -> int | None:
+    """Return how far `blur` takes light; None where that is not cut off."""
+    sigma_px = core_of(camera).gaussian_px
+    return None if sigma_px is None else math.ceil(_TRUNCATE * sigma_px) + 1
 
 
 def _collected_per_radiance(camera: Camera) -> float:

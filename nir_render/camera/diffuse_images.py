@@ -6,13 +6,15 @@ from itertools import zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.beams import blur, diffuse_electrons
+from nir_render.camera.beams import blur, blur_reach_px, diffuse_electrons
 from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
 from nir_render.camera.optics.psf import Window
 from nir_render.camera.optics.veil import veil
 from nir_render.light.enlarge import enlarge
 from nir_render.light.light import Indirect, Light
 from nir_render.scene.snapshot import Snapshot
+
+Place = tuple[slice, slice]
 
 
 def images_of(
@@ -44,13 +46,32 @@ def images_of(
     return images
 
 
-def blurred_image(light: Light, snapshot: Snapshot, flux: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the electrons per second of indirect light of groups of given fluxes, never below 0."""
+def blurred_image(
+    light: Light, snapshot: Snapshot, flux: NDArray[np.float64], place: Place | None = None
+) -> NDArray[np.float64]:
+    """Return the electrons per second of indirect light of groups of given fluxes, never below 0.
+
+    `place` are the rows and columns that are wanted; by default all. What lies beyond is not blurred, where
+    the blur does not reach from there.
+    """
     camera = snapshot.camera(light.camera).camera
+    shape = camera.sensor.rows, camera.sensor.columns
+    whole = slice(0, shape[0]), slice(0, shape[1])
+    wanted = whole if place is None else place
     if light.indirect is None:
-        return np.zeros((camera.sensor.rows, camera.sensor.columns))
-    image = blur(camera, diffuse_image(light, light.indirect, snapshot, flux))
-    return np.asarray(np.maximum(image, 0.0))  # what is enlarged along edges can dip below
+        return np.zeros(shape)[wanted]
+    around = whole
+    if place is not None and (reach := blur_reach_px(camera)) is not None:
+        around = (
+            slice(max(place[0].start - reach, 0), min(place[0].stop + reach, shape[0])),
+            slice(max(place[1].start - reach, 0), min(place[1].stop + reach, shape[1])),
+        )
+    image = blur(camera, diffuse_image(light, light.indirect, snapshot, flux)[around])
+    inside = tuple(
+        slice(own.start - begin.start, own.stop - begin.start)
+        for own, begin in zip(wanted, around, strict=True)
+    )
+    return np.asarray(np.maximum(image[inside], 0.0))  # what is enlarged along edges can dip below
 
 
 def diffuse_image(

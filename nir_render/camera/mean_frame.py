@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.beams import Beam, beam_window
 from nir_render.camera.by_spectrum import group_emitters, group_fluxes, row_response
-from nir_render.camera.diffuse_images import blurred_image, images_of, images_shared
+from nir_render.camera.diffuse_images import Place, blurred_image, images_of, images_shared
 from nir_render.camera.motion_blur import (
     STILL_PX,
     drawn_out,
@@ -89,20 +89,24 @@ class Rates:
         for group in np.unique(self.light.direct.group) if self.light.indirect is not None else ():
             of_group = np.flatnonzero(self.light.direct.group == group)
             rows = [row for row in of_group if self.windows[row].values.any()]
+            if len(rows) == 1:
+                found[rows[0]] = self.group_image(int(group), place_of(self.windows[rows[0]])).copy()
+                continue
             image = self.group_image(int(group)) if rows else None
             for row in rows:
                 assert image is not None
                 found[row] = image[place_of(self.windows[row])].copy()
         return tuple(found)
 
-    def group_image(self, group: int) -> NDArray[np.float64]:
-        """Return the electrons per second that one group's indirect light brings, shape (rows, columns)."""
+    def group_image(self, group: int, place: Place | None = None) -> NDArray[np.float64]:
+        """Return the electrons per second that a group's indirect light brings to some pixels, or to all."""
         if self.between:
             images = [weight * one.kept_group_image(group) for weight, one in self.between]
-            return np.asarray(np.sum(images, axis=0, dtype=np.float64))
+            image = np.asarray(np.sum(images, axis=0, dtype=np.float64))
+            return image if place is None else image[place]
         only = np.zeros(len(self.light.groups))
         only[group] = group_fluxes(self.light, self.snapshot)[group]
-        return blurred_image(self.light, self.snapshot, only)
+        return blurred_image(self.light, self.snapshot, only, place)
 
     def kept_group_image(self, group: int) -> NDArray[np.float32]:
         """Return a group's image as float32, kept for the next frame."""

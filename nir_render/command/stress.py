@@ -1,5 +1,6 @@
 """The commands of many runs: stress, over axes of a scene, and experiment, the paper's own over seeds."""
 
+import contextlib
 import math
 import shlex
 import signal
@@ -47,42 +48,68 @@ def stress(
             help="Have the workers of a Dask scheduler do it: tcp://host:8786.",
         ),
     ] = None,
+    cluster: Annotated[
+        Path | None,
+        typer.Option(
+            "--cluster",
+            metavar="FILE",
+            help="Have the job queue of a cluster start workers: which, and how many, by a file (YAML).",
+        ),
+    ] = None,
     light_folder: LightFolder = None,
     light_gib: LightLimit = 4.0,
     only_plan: Annotated[
         bool, typer.Option("--plan", help="Only check the campaign, and say how many jobs it has.")
+    ] = False,
+    status: Annotated[
+        bool, typer.Option("--status", help="Only say how many of the jobs that were begun are done.")
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Sweep a scene along axes, and show where estimators fail; goes on where it was stopped."""
     from nir_render.command.terminal.console import note
     from nir_render.command.terminal.progress import progress_bar
+    from nir_render.report.wording import counted
     from nir_render.stress.campaign import load_campaign
     from nir_render.stress.jobs import plan
     from nir_render.stress.refine import sweep_refined
-    from nir_render.stress.sweep import StoppedError
+    from nir_render.stress.sweep import QUEUE_LOGS, StoppedError, check_folder
+    from nir_render.stress.workers.cluster import Scheduler
+    from nir_render.stress.workers.queue import load_queue, queued
 
-    if scheduler is not None and workers is not None:
-        raise InputError("--workers: the scheduler has its own; leave out one of both")
+    if sum(where is not None for where in (scheduler, workers, cluster)) > 1:
+        raise InputError(
+            "--workers, --scheduler, --cluster: each says whose workers do it; leave out all but one of them"
+        )
+    queue = None if cluster is None else load_queue(cluster)
     campaign = load_campaign(file)
     limit_bytes = light_limit_bytes(light_gib)
     folder = output if output is not None else Path("outputs") / campaign.name
+    if status:
+        _show_status(campaign, folder, as_json)
+        return
     with progress_bar("check") as progress:
         jobs = plan(campaign, progress)
     if only_plan:
         _show_plan(campaign, jobs, folder, as_json)
         return
     try:
-        result = sweep_refined(
-            campaign,
-            jobs,
-            folder,
-            workers=workers,
-            bar=progress_bar,
-            light=light_folder,
-            light_limit_bytes=limit_bytes,
-            scheduler=scheduler,
-        )
+        with contextlib.ExitStack() as stack:
+            others = None if scheduler is None else Scheduler(scheduler)
+            if cluster is not None and queue is not None:
+                check_folder(folder, campaign)
+                note(f"{queue.system}: {counted(queue.jobs, 'job')} asked for; the first to start begins")
+                others = stack.enter_context(queued(cluster, queue, folder / QUEUE_LOGS))
+            result = sweep_refined(
+                campaign,
+                jobs,
+                folder,
+                workers=workers,
+                bar=progress_bar,
+                light=light_folder,
+                light_limit_bytes=limit_bytes,
+                scheduler=others,
+            )
     except StoppedError as stopped:
         note(f"{stopped}; the same command goes on: {shlex.join(['nir-render', *sys.argv[1:]])}")
         raise typer.Exit(128 + signal.SIGINT) from None
@@ -354,6 +381,19 @@ def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: b
         )
         if record["refined"]:
             typer.echo(f"limits along {', '.join(record['refined'])} are refined: that adds jobs")
+
+
+def _show_status(campaign: "Campaign", folder: Path, as_json: bool) -> None:
+    from nir_render.command.terminal.console import print_json
+    from nir_render.stress.sweep import status_record
+
+    record = status_record(campaign, folder)
+    if as_json:
+        print_json(record)
+        return
+    typer.echo(f"{campaign.name}: {record['done']} of {record['jobs']} jobs are done in {folder}")
+    if record["others"]:
+        typer.echo(f"{record['others']} more are of the campaign or the program as it was before")
 
 
 def _show(result: "Sweep", as_json: bool) -> None:

@@ -208,9 +208,7 @@ def _judged(
         meant = [
             k
             for k, (observer, packet) in enumerate(in_view)
-            if observer == robot
-            and (packet.robot, packet.source, None) in sources
-            and _is_of(message, packet)
+            if observer == robot and (packet.robot, packet.source, None) in sources and is_of(message, packet)
         ]
         if meant:
             # Two may say one word at once, each ambiguous with the other: that is one packet of each.
@@ -219,7 +217,7 @@ def _judged(
             if new:
                 found.heard[new[0]] = told
             continue
-        right = [packet for packet in sent if _is_of(message, packet) and packet.robot != robot]
+        right = [packet for packet in sent if is_of(message, packet) and packet.robot != robot]
         if any((packet.robot, packet.source, None) in sources for packet in right):
             continue  # not all of it was in view: neither received nor wrong
         if not sources and any((robot, packet) not in in_view for packet in right):
@@ -234,7 +232,7 @@ def _judged(
     return found
 
 
-def _is_of(message: Message, packet: SentTruth) -> bool:
+def is_of(message: Message, packet: SentTruth) -> bool:
     """Tell whether a message, of all five frames or of some, lies in a packet and has its word."""
     slack_s = _SLACK * (packet.end_s - packet.start_s)
     return (

@@ -172,13 +172,16 @@ def source_limits(
 
     They are those of a camera that has the frame's gain for good, of the light that is in the flare, with the
     light of elsewhere and the dark signal as background. Flares of the same frame, `rows`, whose images
-    overlap have to be told from it: their places and ranges are not known either. The bearing's, in degrees,
+    overlap have to be told from it: their places and ranges are not known either. Flares that move while they
+    are exposed are drawn out, by how much is not known either. The bearing's, in degrees,
     is the root of the mean squared angle, both directions together. NaN without light.
     """
     if not truth.direct_e > 0.0:
         return math.nan, math.nan
     camera = at_gain(calibration, truth.gain)
-    flares = [_as_flare(row) for row in (truth, *_overlapping(truth, calibration, rows))]
+    together = (truth, *_overlapping(truth, calibration, rows))
+    flares = [_as_flare(row) for row in together]
+    motions_px = [(row.moved_u_px, row.moved_v_px) for row in together]
     background_e = truth.background_e + truth.dark_e
     box = limit_box(camera, flares[:1])
     if len(flares) > 1 and box.height * box.width > 0:
@@ -186,7 +189,8 @@ def source_limits(
         own, *others = (_share(flare, box, camera) * flare[3] for flare in flares)
         shone_e = sum(other[own > 0.01 * own.max()].mean() for other in others)
         background_e = max(background_e - float(shone_e), truth.dark_e)
-    limit = flare_limits(camera, flares, background_e)[0]
+    moves = any(map(any, motions_px))
+    limit = flare_limits(camera, flares, background_e, motions_px=motions_px if moves else None)[0]
     ((turn_u, turn_v),) = pixel_turn([[truth.u_px, truth.v_px]], calibration)
     along_u_rad = float(np.linalg.norm(turn_u)) * limit.u_sigma_px
     along_v_rad = float(np.linalg.norm(turn_v)) * limit.v_sigma_px

@@ -15,8 +15,10 @@ from nir_render.regress.repeatable import check_repeatable
 from nir_render.regress.scenes_of import references_folder, scenes_of
 from nir_render.regress.stages.camera import compare_calibration, compare_electrons, compare_frame
 from nir_render.regress.stages.direct import compare_tables
+from nir_render.regress.stages.exposure import compare_choices
 from nir_render.regress.stages.light import GroupTests, compare_indirect, finding_of
 from nir_render.regress.stages.perception import compare_detections
+from nir_render.regress.stages.view import compare_view
 from nir_render.regress.statistics import judge
 from nir_render.regress.store import names_in, read_reference
 from nir_render.scene.scene import Scene
@@ -208,6 +210,9 @@ def _light_findings(case: _SceneCase, step: Callable[[], None], rendered: Render
             found.findings.append(Finding("transport", f"{label}light", "skipped", str(error)))
             continue
         findings, tests = compare_indirect(reference, light, label, alike=before == after)
+        calibration = case.reference.calibrations[setting.camera]
+        if light.indirect is not None and not after:
+            found.findings.append(compare_view(scene, setting.middle_s, calibration, label))
         same_bits = light_hash(light) == reference.own_hash if case.same_seed else None
         found.findings.extend([compare_tables(reference.light, light, label, exact=exact), *findings])
         found.pending.extend((group, same_bits) for group in tests)
@@ -226,11 +231,7 @@ def _findings_after_light(case: _SceneCase) -> tuple[list[Finding], list[ImagePa
         for camera, calibration in reference.calibrations.items()
         if camera in scene.all_cameras()
     ]
-    findings += [
-        Finding("camera", f"{name} automatic exposure", "skipped", "not judged: exposed as the reference was")
-        for name in scene.cameras()
-        if scene.camera(name)[1].auto_exposure is not None
-    ]
+    findings += compare_choices(scene, reference.shots, exact=exact)
     pairs, taken = [], []
     for shot in reference.shots:
         setting = case.settings.get((shot.frame.camera, shot.frame.index))

@@ -1,6 +1,6 @@
 """A reference, made: the scene's light rendered many times, and what camera and perception make of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,6 +103,8 @@ def make_reference(
         shot_of(scene, setting, lights[light].light, light)
         for setting, light in zip(settings, number, strict=True)
     )
+    chosen = choices(scene, [shot.frame for shot in shots])
+    shots = tuple(replace(shot, chosen=chosen.get((shot.frame.camera, shot.frame.index))) for shot in shots)
     calibrations = {name: calibration(scene, name) for name in scene.cameras()}
     frames = [shot.frame for shot in shots]
     return Reference(
@@ -136,6 +138,26 @@ def frame_of(camera: Camera, setting: FrameSetting, electrons: NDArray[np.float3
     key = RandomKey(seed, "read_out", setting.camera, setting.index)
     chosen = exposure_control.Setting(setting.exposure_s, setting.gain)
     return taken(electrons, camera, chosen, setting.time_s, key)
+
+
+def choices(scene: Scene, frames: Iterable[RawFrame]) -> dict[tuple[str, int], exposure_control.Setting]:
+    """Return what automatic exposure chooses after each frame, by camera and index.
+
+    From these frames alone, in their order, each taken as its camera's first choice: what frames before them
+    have told a camera that has settled does not count.
+    """
+    found: dict[tuple[str, int], exposure_control.Setting] = {}
+    states: dict[str, exposure_control.ExposureState] = {}
+    for frame in frames:
+        camera = scene.camera(frame.camera)[1]
+        control = camera.auto_exposure
+        if control is None:
+            continue
+        taken_with = (exposure_control.Setting(frame.exposure_s, frame.gain),)
+        state = states.get(frame.camera, exposure_control.ExposureState(taken_with * control.latency))
+        states[frame.camera] = exposure_control.next_state(state, control, camera, frame)
+        found[frame.camera, frame.index] = states[frame.camera].upcoming[-1]
+    return found
 
 
 def detections_of(

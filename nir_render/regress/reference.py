@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.timing.exposure_control import Setting
 from nir_render.light.light import Light
 from nir_render.scene.documents.materials import texture_of
 from nir_render.scene.documents.shapes import Mesh
@@ -52,12 +53,14 @@ class ReferenceLight:
 class ReferenceShot:
     """One frame: the reference's light through the scene's camera.
 
-    `light` counts the reference's lights; `electrons` are the expected ones, shape (rows, columns).
+    `light` counts the reference's lights; `electrons` are the expected ones, shape (rows, columns). `chosen`
+    is what automatic exposure makes of this frame and those before it (`make.choices`); None without one.
     """
 
     light: int
     electrons: NDArray[np.float32]
     frame: RawFrame
+    chosen: Setting | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,12 +8,14 @@ import hashlib
 import io
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.timing.exposure_control import Setting
 from nir_render.errors import InputError
 from nir_render.light.npz import read_light, write_light
 from nir_render.regress.reference import Reference, ReferenceLight, ReferenceShot
@@ -140,6 +142,9 @@ def _write(folder: Path, reference: Reference) -> None:
         "renders": reference.renders,
         "lights": lights,
         "light_of_frames": [shot.light for shot in reference.shots],
+        "chosen_after_frames": [
+            None if shot.chosen is None else asdict(shot.chosen) for shot in reference.shots
+        ],
         "history": list(reference.history),
         "made_by": reference.made_by,
         "document": reference.document,
@@ -163,9 +168,16 @@ def _read(folder: Path) -> Reference:
     ]
     electrons = _arrays(folder / "expected.npz")
     frames = [read_frame(folder, record) for record in read_frame_records(folder)]
+    # References that were made before exposure control was judged have none.
+    chosen = facts.get("chosen_after_frames", [None] * len(frames))
     shots = [
-        ReferenceShot(light, electrons[f"{frame.camera}.{frame.index}"], frame)
-        for light, frame in zip(facts["light_of_frames"], frames, strict=True)
+        ReferenceShot(
+            light,
+            electrons[f"{frame.camera}.{frame.index}"],
+            frame,
+            None if setting is None else Setting(**setting),
+        )
+        for light, frame, setting in zip(facts["light_of_frames"], frames, chosen, strict=True)
     ]
     detections = {
         name: tuple(map(parse_detection, run_folder.read_lines(file)))

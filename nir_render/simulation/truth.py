@@ -1,5 +1,6 @@
 """What is true about each source in a frame, and about each of its mirror images: made while rendering."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.mean_frame import MeanFrame
+from nir_render.camera.motion_blur import STILL_PX, may_move, path_of
 from nir_render.camera.optics.lens import intrinsics_of
 from nir_render.camera.optics.psf import place_of
 from nir_render.camera.sensor.read_out import dark_variance_e2, saturation_dn
@@ -43,6 +45,7 @@ def truth_of(mean: MeanFrame, frame: RawFrame) -> Iterator[SourceTruth]:
         on = on_fractions(
             camera, drive_of(snapshot.emitters[light.groups[group]]), mean.time_s, mean.exposure_s
         )
+        moved_u_px, moved_v_px = _moved_px(mean, row)
         yield SourceTruth(
             camera=light.camera,
             index=frame.index,
@@ -68,7 +71,22 @@ def truth_of(mean: MeanFrame, frame: RawFrame) -> Iterator[SourceTruth]:
             gain=frame.gain,
             dark_e=camera.sensor.dark_rate_e_per_s * mean.exposure_s,
             flare_share=flare_spread(camera, snapshot.sources[light.groups[group]].source).share,
+            moved_u_px=moved_u_px,
+            moved_v_px=moved_v_px,
         )
+
+
+def _moved_px(mean: MeanFrame, row: int) -> tuple[float, float]:
+    """Return how far a flare moves along u and v over a row's exposure; 0 where it is drawn in one place."""
+    light, snapshot = mean.light, mean.rates.snapshot
+    group = light.groups[light.direct.group[row]]
+    if not may_move(snapshot, light.camera, group):
+        return 0.0, 0.0
+    ends_s = mean.exposure_s * np.array([-0.5, 0.5])
+    path = path_of(snapshot, light.camera, group, light.direct, row, ends_s)
+    begin_px, end_px = intrinsics_of(mean.camera).project(path.direction)
+    u_px, v_px = (end_px - begin_px).tolist()
+    return (u_px, v_px) if math.hypot(u_px, v_px) >= STILL_PX else (0.0, 0.0)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from nir_render.stress.jobs import Job, plan
 from nir_render.stress.reach import Reach, campaign_reaches
 from nir_render.stress.sums import job_sums
 from nir_render.stress.sweep import Progress, Sweep, sweep
+from nir_render.stress.workers.cluster import Scheduler
 
 _REASONS = ("crossing", "not defined")
 
@@ -31,7 +32,7 @@ def sweep_refined(
     bar: Callable[[str], AbstractContextManager[Progress]],
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
-    scheduler: str | None = None,
+    scheduler: Scheduler | None = None,
 ) -> Sweep:
     """Do a campaign's jobs (`sweep`); then add values where bounds are crossed, until limits are exact.
 

@@ -18,14 +18,15 @@ from nir_render.stress.campaign import Campaign
 from nir_render.stress.jobs import Job
 from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
-from nir_render.stress.workers.cluster import MARK
-from nir_render.stress.workers.pool import Work, part_file, run_jobs
+from nir_render.stress.workers.cluster import MARK, Scheduler
+from nir_render.stress.workers.pool import PART_KIND, Work, part_file, run_jobs
 from nir_render.transport.backend.cores import cores, usual_workers
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.backend.variant import backend
 
 MANIFEST = "campaign.json"
-TABLE, PAGE, JOBS = "table.parquet", "report.html", "jobs.jsonl"
+TABLE, PAGE, JOBS, PLANNED = "table.parquet", "report.html", "jobs.jsonl", "planned.json"
+QUEUE_LOGS = ".queue"  # what workers say that a job queue has started
 _PARTS, _LIGHT, _SCRATCH, _LOCK = "jobs", "light", ".workers", ".lock"
 
 
@@ -66,7 +67,7 @@ def sweep(
     progress: Progress,
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
-    scheduler: str | None = None,
+    scheduler: Scheduler | None = None,
 ) -> Sweep:
     """Do the jobs of a campaign that the folder does not hold yet, and gather all into its table.
 
@@ -83,7 +84,7 @@ def sweep(
     light_limit_bytes
         How large that may grow.
     scheduler
-        The address of a Dask scheduler whose workers do the jobs instead; `workers` then has no say.
+        One whose workers do the jobs instead; `workers` then has no say.
 
     Raises
     ------
@@ -95,6 +96,7 @@ def sweep(
     _claim(folder, campaign)
     with locked(folder / _LOCK, f"{folder}: another nir-render works on this campaign; wait for its end"):
         parts = folder / _PARTS
+        write_json(folder / PLANNED, {"format": 1, "jobs": [job.key for job in jobs]})
         missing = [job for job in jobs if read_part(part_file(parts, job)) is None]
         done, failed = len(jobs) - len(missing), dict[str, str]()
         progress(done, len(jobs))
@@ -102,7 +104,7 @@ def sweep(
             workers = min(usual_workers() if workers is None else workers, len(missing))
             # Links are kept: on another machine the same name may lead elsewhere.
             kept = (folder / _LIGHT if light is None else light).absolute()
-            threads = max(cores() // workers, 1) if scheduler is None else None
+            threads = max(cores() // workers, 1) if scheduler is None else scheduler.threads
             scene = replace(campaign.scene, folder=campaign.scene.folder.absolute())
             work = Work(
                 scene, campaign.estimators, parts.absolute(), kept, light_limit_bytes, threads, cpu_name()
@@ -145,6 +147,30 @@ def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[s
     }
 
 
+def status_record(campaign: Campaign, folder: Path) -> dict[str, Any]:
+    """Return how far the last sweep of a folder has come, as one JSON object, without planning anew.
+
+    `jobs` are those that it planned, `done` those of them whose files are there; `others` are files of jobs
+    that it did not plan: of the campaign before it was edited, or of another program.
+
+    Raises
+    ------
+    InputError
+        The folder is not this campaign's, or no sweep has begun there.
+    """
+    check_folder(folder, campaign)
+    if not (folder / PLANNED).is_file():
+        raise InputError(f"{folder}: no sweep has begun there; without --status it begins")
+    planned = {f"{key}{PART_KIND}" for key in read_json(folder / PLANNED)["jobs"]}
+    held = {path.name for path in (folder / _PARTS).glob(f"*{PART_KIND}") if not path.name.startswith(".")}
+    return {
+        "campaign": campaign.name,
+        "jobs": len(planned),
+        "done": len(planned & held),
+        "others": len(held - planned),
+    }
+
+
 def sweep_record(result: Sweep) -> dict[str, Any]:
     """Return what a sweep has done and found, as one JSON object."""
     return {
@@ -162,7 +188,7 @@ def check_folder(folder: Path, campaign: Campaign) -> None:
     if folder.is_file():
         raise InputError(f"{folder}: is a file; give a folder for the campaign")
     # One that was killed as it began has left no more than these.
-    begun = (_LOCK, f".{MANIFEST}.partial-")
+    begun = (_LOCK, QUEUE_LOGS, f".{MANIFEST}.partial-")
     if folder.is_dir() and not all(path.name.startswith(begun) for path in folder.iterdir()):
         if not (folder / MANIFEST).is_file():
             raise InputError(f"{folder}: holds files that are no campaign's; give a new folder")

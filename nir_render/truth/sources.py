@@ -25,7 +25,9 @@ class SourceTruth:
     the mean dark current's, in every pixel. `peak_snr` is the flare's brightest pixel over the temporal noise
     there, before the ADC: shot noise of light and dark current, read noise. `flare_share` is the share of
     `direct_e` that is in the flare as perception knows it: 1 under a Gaussian point spread, less with glare,
-    ghosts and diffraction. `gain` is the frame's, a factor on the calibrated system gain.
+    ghosts and diffraction. `gain` is the frame's, a factor on the calibrated system gain. `moved_u_px,
+    moved_v_px` is how far the flare moves over a row's exposure, from its place at the begin to that at the
+    end, at the velocities of mid-exposure; 0 where it is drawn in one place.
 
     A ghost, the image of a source in one flat smooth surface, has a row of its own: `ghost_of` is the name
     `robot.source` of whom it shows (None for a source itself), place and range are those of the image behind
@@ -60,6 +62,8 @@ class SourceTruth:
     gain: float = 1.0
     dark_e: float = 0.0
     flare_share: float = 1.0
+    moved_u_px: float = 0.0
+    moved_v_px: float = 0.0
 
     def record(self) -> dict[str, Any]:
         """Return the line of `truth.jsonl`."""
@@ -78,7 +82,7 @@ _BOUNDS = {
     "index": (0, 2**63 - 1),
     "time_s": (-1e12, 1e12),
     "saturated_px": (0, 2**53),
-    **dict.fromkeys(("u_px", "v_px"), (-1e6, 1e6)),
+    **dict.fromkeys(("u_px", "v_px", "moved_u_px", "moved_v_px"), (-1e6, 1e6)),
     "flare_share": (0.0, 1e3),
     **dict.fromkeys(("visible_fraction", "on_fraction"), (0.0, 1.0)),
     "gain": (1e-6, 1e6),

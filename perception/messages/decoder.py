@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.messages.foreign import foreign_light
-from perception.messages.lattice import STEPS_PER_BIT, Clocks, Lattice, moved_on
+from perception.messages.lattice import STEPS_PER_BIT, Lattice, clocks_of, moved_on
 from perception.messages.samples import ROWS, AnyLevels, LevelScale, add_samples, usable_samples
 from perception.messages.settings import DecoderSettings
-from perception.messages.uart import IDLE_BITS, aliases, meaning
+from perception.messages.uart import IDLE_BITS, could_be_rotated, meaning
 from perception.types import Message, Signal
 
 Array = NDArray[np.float64]
@@ -64,18 +64,14 @@ class Decoder:
         self._again = True  # what another's light leaves of a packet is read by a decoder that asks no more
         self._robot, self._track = robot, track
         self._settings = DecoderSettings() if settings is None else settings
-        self._clocks = Clocks(self._settings)
+        self._clocks = clocks_of(self._settings)
         self._begin_at = _BACK + self._clocks.longest  # the block's first step in the window
         self._complete = self._begin_at + _BLOCK - _MARGIN  # the last step of which all samples are in
         self._size = self._begin_at + _BLOCK + 2 * _MARGIN + self._clocks.longest
         step_rate = self._settings.packets_per_s * self._clocks.step_s
         self._log_start = float(np.log(step_rate / len(self._settings.words)))
         self._log_garbage = float(np.log(step_rate)) + _GARBAGE
-        known = set(self._settings.words)
-        self._rotated = [
-            any(other in known and other != word for _, other in aliases(word))
-            for word in self._settings.words
-        ]
+        self._rotated = could_be_rotated(self._settings.words)
         self._restart()
 
     def _restart(self) -> None:
@@ -103,9 +99,11 @@ class Decoder:
         """Take in samples of the track, later than those before; return the messages that they complete."""
         columns = (signal.time_s, signal.exposure_s, signal.level, signal.sigma_dark, signal.sigma_lit)
         rows = np.array(columns, float)
+        if rows.shape[1] == 1 and 0.0 < rows[0, 0] - self._last_s <= _FORGET_S:
+            return tuple(self._take(rows))  # as it is in a stream, and quicker
         since = rows[0] - np.append(self._last_s, rows[0, :-1])
         if ((since > 0.0) & (since <= _FORGET_S)).all():
-            return tuple(self._take(rows))  # as it is in a stream, and quicker
+            return tuple(self._take(rows))
         messages: list[Message] = []
         while rows.shape[1]:
             time_s = rows[0]

@@ -42,6 +42,8 @@ def foreign_light(rows: Array, amplitude: float, settings: DecoderSettings) -> N
     one = usable_samples(time_s, exposure_s, level, dark, lit, settings)
     emitted = _emitted(one.level, one.dark_variance, one.lit_variance, amplitude, _AMPLITUDES)
     probability = _posterior(one.time_s, emitted)
+    if not (probability > _SURE).any():
+        return np.zeros(len(touched), dtype=np.bool_)
     possible = probability > _POSSIBLE
     stretch = np.cumsum(np.diff(possible, prepend=False))  # odd where it is possible, and how many there were
     touched[touched] = possible & np.isin(stretch, stretch[probability > _SURE])

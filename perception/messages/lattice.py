@@ -8,6 +8,7 @@ by itself and the bit before it: the score of any word is the sum of eleven of t
 """
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,12 @@ class Clocks:
         self.idle: Numbers = np.ceil(STEPS_PER_BIT * IDLE_BITS * (1.0 + self.drifts)).astype(np.int64)
         self.longest = int(self.lengths.max())
         self.ways = _ways(settings.words)
+
+
+@cache
+def clocks_of(settings: DecoderSettings) -> Clocks:
+    """Return the clocks of some settings; those of all decoders are the same."""
+    return Clocks(settings)
 
 
 def _ways(words: tuple[int, ...]) -> Numbers:

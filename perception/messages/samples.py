@@ -83,7 +83,7 @@ class AnyLevels:
 
     def stays(self, time_s: Array) -> Array:
         """Return how probably the level stayed since the sample before, shape (n,); times go on."""
-        since_s = np.diff(time_s, prepend=self._last_s)
+        since_s = time_s - np.concatenate([[self._last_s], time_s[:-1]])
         self._last_s = float(time_s[-1])
         return np.asarray(np.exp(-since_s / _GARBAGE_STAYS_S))
 

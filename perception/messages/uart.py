@@ -133,6 +133,12 @@ def aliases(word: int) -> tuple[tuple[int, int], ...]:
     return tuple((shift, alias) for shift, alias in read if alias is not None)
 
 
+@cache
+def could_be_rotated(words: tuple[int, ...]) -> tuple[bool, ...]:
+    """Return of each of some words whether it could be another of them, read at a wrong phase."""
+    return tuple(any(other in words and other != word for _, other in aliases(word)) for word in words)
+
+
 def packet_levels(
     start_s: NDArray[np.float64],
     duration_s: NDArray[np.float64],

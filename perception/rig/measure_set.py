@@ -9,8 +9,8 @@ import numpy as np
 from perception.estimators import Estimator, detect_frames
 from perception.rig.extinction import Extinction, corrected, estimated_extinction
 from perception.rig.frame_sets import Exposed, robot_of
-from perception.rig.fusion import associated, fused
-from perception.rig.ghosts import told_ghosts
+from perception.rig.fusion import associated, fused, measurements_of
+from perception.rig.ghosts import called, told_ghosts
 from perception.rig.mirrors.planes import check_planes
 from perception.rig.moving import OneTime, at_one_time
 from perception.rig.robots import told_robots
@@ -140,5 +140,8 @@ def _measured(
     known = at_one_time(sightings_of(frames, detections, calibrations), odometry)
     found = known.sightings
     own_sources_body_m = calibrations[frames[0].camera].own_sources_body_m if frames else np.empty((0, 3))
-    measurements, mirrors = told_ghosts(fused(found, associated(found)), own_sources_body_m, planes)
-    return known, known.back(measurements), mirrors
+    groups = associated(found)
+    sources = fused(found, groups)
+    probability, mirrors = told_ghosts(sources, own_sources_body_m, planes)
+    ghosts = [called(each) for each in probability.tolist()]
+    return known, known.back(measurements_of(sources, groups, found, ghosts, probability)), mirrors

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.rig.joined import Joined
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 UNKNOWN_RANGE = 10.0
 """Standard deviation of the logarithm of a range that is not known."""
@@ -23,6 +25,9 @@ NEAREST_M, FARTHEST_M = 0.2, 50.0
 
 LEAST_COSINE = 0.5
 """Rays that differ by more than 60 degrees are not of one source."""
+
+KNOWN_RANGE = 0.3
+"""A fused range that is open to more than this, relatively, is none."""
 
 STEPS, SCALE_STEPS = 4, 4
 LEAST_FACTOR = 0.1
@@ -100,6 +105,7 @@ def chi2_of_pairs(rays: Rays, one: Indices, other: Indices, speed_m_per_s: float
     """
     chi2 = np.full((len(one), len(other)), np.inf)
     scaled = np.full((len(one), len(other)), np.inf)
+    room = np.empty((5, 3))
     for row in range(len(one)):
         for column in range(len(other)):
             i, j = one[row], other[column]
@@ -108,18 +114,24 @@ def chi2_of_pairs(rays: Rays, one: Indices, other: Indices, speed_m_per_s: float
                 cosine += rays.axes[i, 2, k] * rays.axes[j, 2, k]
             if cosine < LEAST_COSINE:
                 continue
-            chi2[row, column], factor = _chi2_of_pair(rays, i, j, 1.0, speed_m_per_s)
+            chi2[row, column], factor = _chi2_of_pair(rays, i, j, 1.0, speed_m_per_s, room)
             if not (math.isnan(rays.range_m[i]) or math.isnan(rays.range_m[j])):
                 for _ in range(SCALE_STEPS):
                     factor = min(max(factor, LEAST_FACTOR), 1.0)
-                    scaled[row, column], factor = _chi2_of_pair(rays, i, j, factor, speed_m_per_s)
+                    found = _chi2_of_pair(rays, i, j, factor, speed_m_per_s, room)
+                    scaled[row, column], factor = found
     return chi2, scaled
 
 
 @compiled
-def _chi2_of_pair(rays: Rays, i: int, j: int, factor: float, speed_m_per_s: float) -> tuple[float, float]:
-    """Return χ² of two sightings' being of one source, and the factor on both ranges that suits best."""
-    apart_m, grown_m, covariance = np.empty(3), np.empty(3), np.empty((3, 3))
+def _chi2_of_pair(
+    rays: Rays, i: int, j: int, factor: float, speed_m_per_s: float, room: Array
+) -> tuple[float, float]:
+    """Return χ² of two sightings' being of one source, and the factor on both ranges that suits best.
+
+    `room`, shape (5, 3), is what it works in.
+    """
+    apart_m, grown_m, covariance = room[0], room[1], room[2:]
     range_i, range_j = ranges_of_pair(rays, i, j)
     moved_m = speed_m_per_s * (rays.time_s[i] - rays.time_s[j])
     for k in range(3):
@@ -230,3 +242,158 @@ def placed(rays: Rays, rows: Indices, time_s: float, speed_m_per_s: float) -> tu
             else:
                 shared += step
     return place_m, information
+
+
+@compiled
+def joined(
+    rays: Rays, together: Rays, camera: Indices, claimed: Flags, saturated: Flags, merged: Flags,
+    ghost: Flags, members: Indices, ends: Indices, agree: Flags, speed_m_per_s: float,
+) -> Joined:  # fmt: skip
+    """Return sources from their sightings.
+
+    Parameters
+    ----------
+    rays, together
+        Sightings, and the same where several are compared, n of them.
+    camera
+        The number of the camera of each, shape (n,).
+    claimed, saturated, merged, ghost
+        As of `Sightings`, shape (n,).
+    members, ends
+        The sightings of the first source, then those of the second, ..., shape (n,); where each one's end.
+    agree
+        Whether ranges agree with where the rays meet, for each source.
+    """
+    n, begin = len(ends), 0
+    found = Joined(
+        np.empty(n), np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty((n, 3, 3)), np.empty(n),
+        np.empty(n), np.empty(n), np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)),
+        np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), np.ones(n, dtype=np.bool_),
+    )  # fmt: skip
+    used = np.empty(len(members), dtype=np.int64)
+    for source in range(n):
+        own, begin = members[begin : ends[source]], ends[source]
+        for k in own:
+            found.merged[source] |= merged[k]
+            found.ghost[source] &= ghost[k]
+        count = _counting(own, camera, claimed, rays.noise, used)
+        best = used[0]
+        if count == 1 or not agree[source]:
+            count = 1
+            _alone_into(found, source, rays, best)
+        else:
+            _together_into(found, source, rays, together, used[:count], speed_m_per_s)
+        for k in used[:count]:
+            found.saturated[source] &= saturated[k]
+        found.noise[source], found.common[source] = rays.noise[best], rays.common[best]
+        common_m = 0.0
+        for k in range(3):
+            common_m += found.moved_m[source, k] * found.bearing[source, k]
+        found.common_m[source] = abs(common_m)
+        if not claimed[best]:
+            found.covariance[source] = np.nan
+            found.common_m[source] = np.nan
+    return found
+
+
+@compiled
+def _counting(members: Indices, camera: Indices, claimed: Flags, noise: Array, used: Indices) -> int:
+    """Write which of a source's sightings count: the least noisy of each camera, by noise; tell how many."""
+    any_claimed, count, kept = False, 0, 0
+    for k in members:
+        any_claimed |= claimed[k]
+    for k in members:
+        if any_claimed and not claimed[k]:
+            continue
+        place = count
+        while place > 0 and noise[used[place - 1]] > noise[k]:
+            used[place] = used[place - 1]
+            place -= 1
+        used[place] = k
+        count += 1
+    for one in range(count):
+        known = False
+        for other in range(kept):
+            known |= camera[used[other]] == camera[used[one]]
+        if not known:
+            used[kept] = used[one]
+            kept += 1
+    return kept
+
+
+@compiled
+def _alone_into(found: Joined, source: int, rays: Rays, k: int) -> None:
+    """Write what a sighting says by itself."""
+    range_m, noise2 = rays.range_m[k], rays.noise[k] ** 2
+    found.time_s[source] = rays.time_s[k]
+    found.range_m[source] = found.seems_m[source] = range_m
+    covariance, axes = found.covariance[source], rays.axes[k]
+    covariance[:] = 0.0
+    covariance[:2, :2] = rays.angular_rad2[k]
+    covariance[2, 2] = range_m**2 * (noise2 + rays.common[k] ** 2)
+    if math.isnan(range_m):
+        covariance[2, :] = covariance[:, 2] = np.nan
+    for x in range(3):
+        found.origin_m[source, x] = rays.origin_m[k, x]
+        found.bearing[source, x] = axes[2, x]
+        found.moved_m[source, x] = rays.common[k] * range_m * axes[2, x]
+        for y in range(3):
+            total = noise2 * axes[2, x] * axes[2, y]
+            for a in range(2):
+                for b in range(2):
+                    total += axes[a, x] * rays.angular_rad2[k, a, b] * axes[b, y]
+            found.noise_m2[source, x, y] = range_m**2 * total
+
+
+@compiled
+def _together_into(
+    found: Joined, source: int, rays: Rays, together: Rays, rows: Indices, speed_m_per_s: float
+) -> None:
+    """Write what several say together; a range that is still open to more than 30 % is none."""
+    best, weights, time_s = rows[0], 0.0, 0.0
+    origin_m, bearing = found.origin_m[source], found.bearing[source]
+    origin_m[:] = 0.0
+    for k in rows:
+        weight = 1.0 / (together.angular_rad2[k, 0, 0] + together.angular_rad2[k, 1, 1])
+        weights += weight
+        time_s += weight * rays.time_s[k]
+        origin_m += together.origin_m[k]
+    time_s /= weights
+    origin_m /= len(rows)
+    place_m, of_all = placed(together, rows, time_s, speed_m_per_s)
+    range2, seems2 = 0.0, 0.0
+    for x in range(3):
+        range2 += (place_m[x] - origin_m[x]) ** 2
+        seen_m = rays.origin_m[best, x] + rays.range_m[best] * rays.axes[best, 2, x]
+        seems2 += (seen_m - origin_m[x]) ** 2
+    range_m = math.sqrt(range2)
+    for x in range(3):
+        bearing[x] = (place_m[x] - origin_m[x]) / range_m
+        # A fit with a prior of variance 1 answers an error a of what it assumed by −C a.
+        found.moved_m[source, x] = -of_all[x, 3]
+    turn, covariance = np.empty((3, 3)), found.covariance[source]
+    _axes_into(turn, bearing)
+    turn[:2] /= range_m
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] = 0.0
+            found.noise_m2[source, a, b] = of_all[a, b] - of_all[a, 3] * of_all[b, 3]
+            for x in range(3):
+                for y in range(3):
+                    covariance[a, b] += turn[a, x] * of_all[x, y] * turn[b, y]
+    if not math.sqrt(covariance[2, 2]) < KNOWN_RANGE * range_m:
+        covariance[2, :] = covariance[:, 2] = range_m = np.nan
+    found.time_s[source], found.range_m[source], found.seems_m[source] = time_s, range_m, math.sqrt(seems2)
+
+
+@compiled
+def _axes_into(axes: Array, bearing: Array) -> None:
+    """Write unit vectors to the left, upwards and along a bearing (`bearing_axes`)."""
+    x, y, z = bearing
+    level = math.hypot(x, y)
+    left_x, left_y = 0.0, 1.0
+    if level > 1e-12:
+        left_x, left_y = -y / level, x / level
+    axes[0, 0], axes[0, 1], axes[0, 2] = left_x, left_y, 0.0
+    axes[1, 0], axes[1, 1], axes[1, 2] = -z * left_y, z * left_x, x * left_y - y * left_x
+    axes[2, 0], axes[2, 1], axes[2, 2] = x, y, z

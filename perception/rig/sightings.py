@@ -92,7 +92,7 @@ def sightings_of(
         ]
     ).reshape(-1, 10).T  # fmt: skip
     u_px, v_px, u_sigma_px, v_sigma_px, range_m, sigma_m, common_m = columns[:7]
-    saturated, merged, ghost = columns[7:].astype(bool)
+    saturated, merged, ghost = np.ascontiguousarray(columns[7:].astype(bool))
     axes = bearing_axes(_bearings(hits, calibrations))
     ranged = (range_m > 0.0) & (range_m < FARTHEST_KNOWN_M)
     # Of a clipped flare that was not recovered the range is but a bound.
@@ -106,27 +106,26 @@ def sightings_of(
     noise2 = np.where(claimed, np.nan_to_num(sigma_m) / at_m, 0.0) ** 2 - of_source2
     noise = np.where(claimed, np.sqrt(np.maximum(noise2, LEAST_NOISE**2)), UNCLAIMED_RANGE)
     common = np.sqrt(of_source2)
-    origin_m, time_s, angular_rad2 = (
-        np.empty((len(hits), 3)),
-        np.empty(len(hits)),
-        np.empty((len(hits), 2, 2)),
-    )
     sigmas_px = np.column_stack([u_sigma_px, v_sigma_px])
     sigmas_px = np.maximum(np.where(np.isfinite(sigmas_px), sigmas_px, UNCLAIMED_PX), LEAST_PX)
-    end, mounting_rad2 = 0, np.empty(len(hits))
-    for taken, found in zip(frames, detections, strict=True):
-        these = slice(end, end := end + len(found))
-        if not found:
-            continue
-        calibration = calibrations[taken.camera]
-        origin_m[these] = calibration.position_body_m
-        time_s[these] = taken.time_s + 0.5 * taken.exposure_s + taken.line_time_s * v_px[these]
-        places_px = np.column_stack([u_px[these], v_px[these]])
-        angular_rad2[these] = _angular_rad2(places_px, sigmas_px[these], axes[these], calibration)
-        turned_rad = calibration.sigma.get("rotation_body_camera", 0.0)
-        moved_rad = calibration.sigma.get("position_body_m", 0.0) / at_m[these]
-        mounting_rad2[these] = turned_rad**2 + moved_rad**2
-        angular_rad2[these] += mounting_rad2[these, None, None] * np.eye(2)
+    places_px, end, turn = np.column_stack([u_px, v_px]), 0, np.empty((len(hits), 2, 3))
+    of_frame = np.empty((len(frames), 7))
+    for row, (taken, found) in enumerate(zip(frames, detections, strict=True)):
+        these, calibration = slice(end, end := end + len(found)), calibrations[taken.camera]
+        if found:
+            turn[these] = pixel_turn(places_px[these], calibration) @ calibration.rotation_body_camera.T
+        of_frame[row, :3] = calibration.position_body_m
+        of_frame[row, 3:] = (
+            taken.time_s + 0.5 * taken.exposure_s,
+            taken.line_time_s,
+            calibration.sigma.get("rotation_body_camera", 0.0),
+            calibration.sigma.get("position_body_m", 0.0),
+        )
+    middle_s, line_s, turned_rad, moved_m = of_frame[frame, 3:].T
+    slope = axes[:, :2] @ np.swapaxes(turn, 1, 2) * sigmas_px[:, None, :]
+    mounting_rad2 = turned_rad**2 + (moved_m / at_m) ** 2
+    origin_m, time_s = of_frame[frame, :3], middle_s + line_s * v_px
+    angular_rad2 = slope @ np.swapaxes(slope, 1, 2) + mounting_rad2[:, None, None] * np.eye(2)
     rays = Rays(
         origin_m,
         axes,
@@ -157,10 +156,3 @@ def _bearings(hits: Sequence[Detection], calibrations: Mapping[str, Calibration]
     for k in np.flatnonzero(~np.isfinite(bearing).all(axis=1)).tolist():
         bearing[k] = bearing_body([[hits[k].u_px, hits[k].v_px]], calibrations[hits[k].camera])[0]
     return bearing
-
-
-def _angular_rad2(places_px: Array, sigmas_px: Array, axes: Array, calibration: Calibration) -> Array:
-    """Return the covariance of bearings' angles to the left and upwards, shape (n, 2, 2)."""
-    turn = pixel_turn(places_px, calibration) @ calibration.rotation_body_camera.T
-    slope = axes[:, :2] @ np.swapaxes(turn, 1, 2) * sigmas_px[:, None, :]
-    return np.asarray(slope @ np.swapaxes(slope, 1, 2))

@@ -12,8 +12,10 @@ from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving, weighed
-from perception.robust.overlap.deblend import asks_for_more, deblend, of_free_width
-from perception.robust.overlap.eclipse import eclipses
+from perception.robust.overlap.cut import cut_discs
+from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, deblend, of_free_width
+from perception.robust.overlap.eclipse import LEAST_RADIUS_PX, eclipses
+from perception.robust.overlap.oval import gain_over_oval
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.search.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
@@ -66,6 +68,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         for index, pair in eclipses(found, plain, parted, camera).items():
             if _explains_all(pair, prepared.shape) and _is_better(pair, parted.get(index)):
                 parted[index] = pair
+        for index, piece in cut_discs(found, plain, camera).items():
+            if _explains_all(piece, prepared.shape) and _is_better(piece, parted.get(index)):
+                parted[index] = piece
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
         without = _without_spill(plain, prepared, camera)
         for index, line in moving(plain, camera).items():
@@ -140,14 +145,16 @@ def _parted(
 ) -> dict[int, Solution]:
     """Deblend, and return by index what explains all that is seen: enough flares explain anything by half.
 
-    Flares that would shine where a window does not look explain nothing. Adds to `cut_short` where there may
+    Flares that would shine where a window does not look explain nothing, nor do those in the place of a lone
+    source that one that is not quite round explains as well. Adds to `cut_short` where there may
     be more than were looked for.
     """
     tried = [(index, one) for index, one in enumerate(plain) if one is not None]
     more = deblend([one for _, one in tried], camera)
     cut_short.update(index for (index, _), several in zip(tried, more, strict=True) if several.may_be_more)
     divided: list[Solution | None] = [
-        several if several.count > one.count else None for (_, one), several in zip(tried, more, strict=True)
+        several if several.count > one.count and not _is_oval(one, several, camera) else None
+        for (_, one), several in zip(tried, more, strict=True)
     ]
     # What was divided had the halo of the flares that were there before.
     fit_beside_forward_light(divided, camera)
@@ -156,6 +163,17 @@ def _parted(
         for (index, _), several in zip(tried, divided, strict=True)
         if several is not None and several.most_motion_px <= MOST_MOTION_PX and _explains_all(several, shape)
     }
+
+
+def _is_oval(one: Solution, several: Solution, camera: Camera) -> bool:
+    """Tell whether a lone resolved source whose axes differ explains as well what takes several flares."""
+    if (
+        one.count > 1
+        or one.motion_px is not None
+        or not float(several.image_radius_px.max()) > LEAST_RADIUS_PX
+    ):
+        return False
+    return gain_over_oval(several, camera) < LEAST_GAIN
 
 
 def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:

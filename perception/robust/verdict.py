@@ -73,19 +73,26 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
     """Tell whether a flare stands on the flank of something larger that is not explained, as a lit patch.
 
     Light falls off around a flare, on all sides. Where a quarter of a ring around it, all flares taken away,
-    still exceeds the background by half of the flare's own peak, it is a part of what lies there. `shape` is
-    the frame's: what a window shows beyond it does not count.
+    still exceeds the background by half of the flare's own peak, it is a part of what lies there. Of a lone
+    one that is its brightest pixel: an edge may hide its middle. `shape` is the frame's: what a window shows
+    beyond it does not count.
     """
     window = solution.window
     seen = window.box.inside(shape)
     part = seen.seen_from(window.box).slices
     reach_px = float(solution.image_radius_px[index])
     inner_px = reach_px + 2.0 * solution.psf_sigma_px + 1.0
+    place = float(solution.u_px[index]) - seen.left, float(solution.v_px[index]) - seen.top
+    flares_e = np.ascontiguousarray(solution.flares_e[part])
+    row, column = (
+        min(max(round(at), 0), most - 1) for at, most in zip(place[::-1], flares_e.shape, strict=True)
+    )
     share = _share_above(
         np.ascontiguousarray(window.image_e[part]),
-        np.ascontiguousarray(solution.flares_e[part]),
+        flares_e,
         solution.background_e,
-        (float(solution.u_px[index]) - seen.left, float(solution.v_px[index]) - seen.top),
+        float(flares_e.max() if solution.count == 1 else flares_e[row, column]),
+        place,
         inner_px,
         inner_px + _FLANK_PX,
     )
@@ -94,13 +101,12 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
 
 @compiled
 def _share_above(
-    image_e: Array, flares_e: Array, background_e: float, place: tuple[float, float],
+    image_e: Array, flares_e: Array, background_e: float, peak_e: float, place: tuple[float, float],
     inner_px: float, outer_px: float,
 ) -> float:  # fmt: skip
-    """Return the share of a ring where what is no flare exceeds half of the flares' light in its middle."""
+    """Return the share of a ring where what is no flare exceeds half of a flare's peak."""
     rows, columns = image_e.shape
-    middle_row, middle = min(max(round(place[1]), 0), rows - 1), min(max(round(place[0]), 0), columns - 1)
-    half_peak, count, above = 0.5 * flares_e[middle_row, middle], 0, 0
+    half_peak, count, above = 0.5 * peak_e, 0, 0
     for row in range(rows):
         for column in range(columns):
             if inner_px <= math.hypot(column - place[0], row - place[1]) <= outer_px:

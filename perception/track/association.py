@@ -1,10 +1,12 @@
 """Which measurement is of which track: gates, likelihoods against clutter, and the paper's cost."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
 from perception.track.bank import Bank, taken_states
 from perception.track.kalman import States, innovation_covariance
 from perception.track.observations import LEAST_RANGE_M, Observations, innovations
@@ -16,7 +18,7 @@ Indices = NDArray[np.int64]
 RANGE_NATS = 3.4
 """Logarithm of the farthest over the nearest range of false detections, as likely at every scale."""
 
-_GATE_SIGMAS = 5.0
+GATE_SIGMAS = 5.0
 
 
 class Pairs(NamedTuple):
@@ -55,6 +57,9 @@ def gated_pairs(
     settings
         Gates and costs.
     """
+    if not (len(bank.number) and len(seen.range_m)):
+        nothing, none = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return Pairs(none, none, nothing, nothing, none)
     track, measurement = _near(bank.states, seen, observer_m)
     states, there = taken_states(bank.states, track), seen.taken(measurement)
     found = innovations(states, there)
@@ -72,30 +77,66 @@ def gated_pairs(
 
 def _near(states: States, seen: Observations, observer_m: Array) -> tuple[Indices, Indices]:
     """Return pairs with room to spare, by bearing and then by place: what is left for the exact gate."""
-    arm_m = states.mean[:, :3] - observer_m
-    far_m = np.maximum(np.linalg.norm(arm_m, axis=1), LEAST_RANGE_M)
-    along = arm_m / far_m[:, None]
-    place = states.covariance[:, :3, :3]
-    on_m2 = np.einsum("ni,nij,nj->n", along, place, along)
-    across_m2 = np.maximum(np.trace(place, axis1=1, axis2=2) - on_m2, 0.0)
-    late_s = float(np.max(np.abs(seen.after_s), initial=0.0))
-    room_m = _GATE_SIGMAS * np.sqrt(across_m2) + late_s * np.linalg.norm(states.mean[:, 3:], axis=1)
-    noise = _GATE_SIGMAS * np.sqrt(np.trace(seen.angle_rad2, axis1=1, axis2=2))
-    origins_m = np.max(np.linalg.norm(seen.origin_m - observer_m, axis=1), initial=0.0)
-    shaken_m = _GATE_SIGMAS * np.sqrt(2.0 * np.max(seen.shaken_m2, initial=0.0))
-    widest = np.minimum(((room_m + origins_m + shaken_m) / far_m)[:, None] + noise, np.pi)
-    track, measurement = np.nonzero(along @ seen.bearing.T > np.cos(widest))
-    # Now from where each camera stands, and by range where there is one.
-    bearing, range_m = seen.bearing[measurement], seen.range_m[measurement]
-    apart_m = states.mean[track, :3] - seen.origin_m[measurement]
-    depth_m = np.sum(apart_m * bearing, axis=1)
-    aside_m = np.sqrt(np.maximum(np.sum(apart_m**2, axis=1) - depth_m**2, 0.0))
-    reach_m = np.maximum(depth_m, np.nan_to_num(range_m))
-    inside = (depth_m > 0.0) & (aside_m < room_m[track] + shaken_m + noise[measurement] * reach_m)
-    sigma_m = np.sqrt(seen.noise_m2[measurement]) * np.maximum(depth_m / range_m, 1.0) ** 3
-    deep_m = np.sqrt(on_m2[track] + across_m2[track]) + sigma_m + seen.common_m[measurement] + shaken_m
-    inside &= ~(np.abs(depth_m - range_m) > 1.5 * _GATE_SIGMAS * deep_m)
-    return track[inside], measurement[inside]
+    columns = (
+        states.mean, states.covariance, seen.origin_m, seen.axes, seen.range_m, seen.angle_rad2,
+        seen.noise_m2, seen.common_m, seen.shaken_m2, seen.after_s, observer_m,
+    )  # fmt: skip
+    return _near_pairs(*map(np.ascontiguousarray, columns))
+
+
+@compiled
+def _near_pairs(
+    mean: Array, covariance: Array, origin_m: Array, axes: Array, range_m: Array, angle_rad2: Array,
+    noise_m2: Array, common_m: Array, shaken_m2: Array, after_s: Array, observer_m: Array,
+) -> tuple[Indices, Indices]:  # fmt: skip
+    tracks, seen, count = len(mean), len(range_m), 0
+    found = np.empty((2, tracks * seen), dtype=np.int64)
+    late_s = origins2 = shaken2 = 0.0
+    noise = np.empty(seen)
+    for m in range(seen):
+        late_s, shaken2 = max(late_s, abs(after_s[m])), max(shaken2, shaken_m2[m])
+        noise[m] = GATE_SIGMAS * math.sqrt(angle_rad2[m, 0, 0] + angle_rad2[m, 1, 1])
+        origins2 = max(origins2, _length2(origin_m[m], observer_m))
+    shaken_m = GATE_SIGMAS * math.sqrt(2.0 * shaken2)
+    for n in range(tracks):
+        far_m = max(math.sqrt(_length2(mean[n, :3], observer_m)), LEAST_RANGE_M)
+        on_m2 = trace_m2 = speed2 = 0.0
+        for x in range(3):
+            trace_m2 += covariance[n, x, x]
+            speed2 += mean[n, 3 + x] ** 2
+            for y in range(3):
+                on_m2 += (mean[n, x] - observer_m[x]) * covariance[n, x, y] * (mean[n, y] - observer_m[y])
+        on_m2 /= far_m**2
+        across_m2 = max(trace_m2 - on_m2, 0.0)
+        room_m = GATE_SIGMAS * math.sqrt(across_m2) + late_s * math.sqrt(speed2)
+        widest = (room_m + math.sqrt(origins2) + shaken_m) / far_m
+        for m in range(seen):
+            cosine = depth_m = 0.0
+            for x in range(3):
+                cosine += (mean[n, x] - observer_m[x]) / far_m * axes[m, 2, x]
+                depth_m += (mean[n, x] - origin_m[m, x]) * axes[m, 2, x]
+            if not (depth_m > 0.0 and cosine > math.cos(min(widest + noise[m], math.pi))):
+                continue
+            # Now from where each camera stands, and by range where there is one.
+            aside_m = math.sqrt(max(_length2(mean[n, :3], origin_m[m]) - depth_m**2, 0.0))
+            ranged = math.isfinite(range_m[m])
+            reach_m = max(depth_m, range_m[m]) if ranged else depth_m
+            if not aside_m < room_m + shaken_m + noise[m] * reach_m:
+                continue
+            if ranged:
+                sigma_m = math.sqrt(noise_m2[m]) * max(depth_m / range_m[m], 1.0) ** 3
+                deep_m = math.sqrt(on_m2 + across_m2) + sigma_m + common_m[m] + shaken_m
+                if abs(depth_m - range_m[m]) > 1.5 * GATE_SIGMAS * deep_m:
+                    continue
+            found[0, count], found[1, count] = n, m
+            count += 1
+    return found[0, :count].copy(), found[1, :count].copy()
+
+
+@compiled
+def _length2(one: Array, other: Array) -> float:
+    """Return the squared distance of two places."""
+    return float((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
 
 
 def _likelihood(

@@ -53,6 +53,8 @@ def fed(
     alone
         Whether they are of no other source.
     """
+    if not len(tracks):
+        return bank
     states = taken_states(bank.states, tracks)
     if settings.filter == "paper":
         after = _fed_paper(bank, tracks, states, seen, time_s, settings)

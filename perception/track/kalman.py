@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
+
 Array = NDArray[np.float64]
 
 BLIND_M2 = 1e5
@@ -69,7 +71,9 @@ def process_noise(after_s: float, psd_m2_per_s3: float) -> Array:
     t = abs(after_s)
     # Backwards in time position and velocity part the other way.
     cross = 0.5 * t * after_s
-    return psd_m2_per_s3 * np.kron(np.array([[t**3 / 3.0, cross], [cross, t]]), np.eye(3))
+    noise = np.zeros((2, 3, 2, 3))
+    noise[:, range(3), :, range(3)] = np.array([[t**3 / 3.0, cross], [cross, t]])
+    return psd_m2_per_s3 * noise.reshape(6, 6)
 
 
 def predicted(states: States, after_s: float, psd_m2_per_s3: float) -> States:
@@ -96,15 +100,30 @@ def _shaken(arm_m: Array, position_m2: float, rotation_rad2: float) -> Array:
 
 def innovation_covariance(states: States, innovations: Innovations) -> Array:
     """Return the covariance of the residuals, the consider state included, shape (n, 3, 3)."""
-    rows, _, noise, load = innovations
-    crossed = np.einsum("nij,nj->ni", rows, states.common)[:, :, None] * load[:, None, :]
-    return np.asarray(
-        rows @ states.covariance @ rows.transpose(0, 2, 1)
-        + noise
-        + crossed
-        + crossed.transpose(0, 2, 1)
-        + load[:, :, None] * load[:, None, :]
+    rows, _, noise, load = map(np.ascontiguousarray, innovations)
+    return _innovation_covariance(
+        np.ascontiguousarray(states.covariance), np.ascontiguousarray(states.common), rows, noise, load
     )
+
+
+@compiled
+def _innovation_covariance(covariance: Array, common: Array, rows: Array, noise: Array, load: Array) -> Array:
+    found, crossed, turned = noise.copy(), np.empty(3), np.empty((3, 6))
+    for k in range(len(rows)):
+        for a in range(3):
+            crossed[a] = 0.0
+            for x in range(6):
+                crossed[a] += rows[k, a, x] * common[k, x]
+                turned[a, x] = 0.0
+                for y in range(6):
+                    turned[a, x] += rows[k, a, y] * covariance[k, y, x]
+        for a in range(3):
+            for b in range(3):
+                total = crossed[a] * load[k, b] + load[k, a] * crossed[b] + load[k, a] * load[k, b]
+                for x in range(6):
+                    total += turned[a, x] * rows[k, b, x]
+                found[k, a, b] += total
+    return found
 
 
 def updated(states: States, innovations: Innovations) -> States:
@@ -119,31 +138,91 @@ def updated(states: States, innovations: Innovations) -> States:
     would draw the track towards the observer by its noise, a little with each update, and call it certain;
     what parallax a moving observer has is given up for that.
     """
-    rows, residual, noise, load = innovations
-    known = states.covariance - states.common[:, :, None] * states.common[:, None, :]
-    crossed = known @ rows.transpose(0, 2, 1)
-    gain = np.linalg.solve(rows @ crossed + noise, crossed.transpose(0, 2, 1)).transpose(0, 2, 1)
-    blind = noise[:, 2, 2] > BLIND_M2
-    if blind.any():
-        along = rows[blind, 2, :3]
-        aside = np.eye(3) - along[:, :, None] * along[:, None, :]
-        gain[blind] = np.einsum("ab,nij->naibj", np.eye(2), aside).reshape(-1, 6, 6) @ gain[blind]
-    left = np.eye(6) - gain @ rows
-    turned = gain.transpose(0, 2, 1)
-    pushed = np.einsum("nij,nj->ni", gain, load)
-    kept = np.einsum("nij,nj->ni", left, states.common)
-    covariance = (
-        left @ states.covariance @ left.transpose(0, 2, 1)
-        + gain @ noise @ turned
-        - kept[:, :, None] * pushed[:, None, :]
-        - pushed[:, :, None] * kept[:, None, :]
-        + pushed[:, :, None] * pushed[:, None, :]
-    )
-    return States(
-        states.mean + np.einsum("nij,nj->ni", gain, residual),
-        0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        kept - pushed,
-    )
+    columns = (states.mean, states.covariance, states.common, *innovations)
+    return States(*_updated(*map(np.ascontiguousarray, columns)))
+
+
+@compiled
+def _updated(
+    mean: Array, covariance: Array, common: Array, rows: Array, residual: Array, noise: Array, load: Array
+) -> tuple[Array, Array, Array]:
+    after, spread, kept = mean.copy(), np.empty_like(covariance), np.empty_like(common)
+    known, carried, left = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    crossed, gain, weighed = np.empty((6, 3)), np.empty((6, 3)), np.empty((6, 3))
+    inverse, pushed = np.empty((3, 3)), np.empty(6)
+    for k in range(len(rows)):
+        for x in range(6):
+            for y in range(6):
+                known[x, y] = covariance[k, x, y] - common[k, x] * common[k, y]
+        _times_turned_into(crossed, known, rows[k])
+        for a in range(3):
+            for b in range(3):
+                inverse[a, b] = noise[k, a, b]
+                for x in range(6):
+                    inverse[a, b] += rows[k, a, x] * crossed[x, b]
+        _invert(inverse)
+        _times_turned_into(gain, crossed, inverse.T)
+        if noise[k, 2, 2] > BLIND_M2:
+            for half in (0, 3):
+                for b in range(3):
+                    moved = 0.0
+                    for x in range(3):
+                        moved += rows[k, 2, x] * gain[half + x, b]
+                    for x in range(3):
+                        gain[half + x, b] -= rows[k, 2, x] * moved
+        for x in range(6):
+            pushed[x] = 0.0
+            for b in range(3):
+                after[k, x] += gain[x, b] * residual[k, b]
+                pushed[x] += gain[x, b] * load[k, b]
+            for y in range(6):
+                left[x, y] = 1.0 if x == y else 0.0
+                for b in range(3):
+                    left[x, y] -= gain[x, b] * rows[k, b, y]
+        _times_turned_into(weighed, gain, noise[k].T)
+        _times_turned_into(carried, left, covariance[k].T)
+        for x in range(6):
+            kept[k, x] = 0.0
+            for y in range(6):
+                kept[k, x] += left[x, y] * common[k, y]
+        for x in range(6):
+            for y in range(x + 1):
+                total = pushed[x] * pushed[y] - kept[k, x] * pushed[y] - pushed[x] * kept[k, y]
+                for z in range(6):
+                    total += carried[x, z] * left[y, z]
+                for b in range(3):
+                    total += weighed[x, b] * gain[y, b]
+                spread[k, x, y] = spread[k, y, x] = total
+        for x in range(6):
+            kept[k, x] -= pushed[x]
+    return after, spread, kept
+
+
+@compiled
+def _times_turned_into(product: Array, one: Array, other: Array) -> None:
+    """Write one · otherᵀ."""
+    for x in range(one.shape[0]):
+        for y in range(other.shape[0]):
+            product[x, y] = 0.0
+            for z in range(one.shape[1]):
+                product[x, y] += one[x, z] * other[y, z]
+
+
+@compiled
+def _invert(matrix: Array) -> None:
+    """Invert a small positive definite matrix in place, by elimination."""
+    size = len(matrix)
+    for pivot in range(size):
+        scale = 1.0 / matrix[pivot, pivot]
+        matrix[pivot, pivot] = 1.0
+        for column in range(size):
+            matrix[pivot, column] *= scale
+        for row in range(size):
+            if row != pivot:
+                factor = matrix[row, pivot]
+                matrix[row, pivot] = 0.0
+                for column in range(size):
+                    matrix[row, column] -= factor * matrix[pivot, column]
 
 
 def updated_paper(

@@ -99,14 +99,16 @@ def tracks(
     turn = pose.rotation.T
     place = (bank.mean[rows, :3] - pose.position_m) @ turn.T
     velocity = bank.mean[rows, 3:] @ turn.T
-    both = np.kron(np.eye(2), turn)
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = turn
     covariance = both @ bank.covariance[rows] @ both.T
-    across = np.sum(place**2, axis=1)[:, None, None] * np.eye(3) - place[:, :, None] * place[:, None, :]
-    covariance[:, :3, :3] += pose.position_sigma_m**2 * np.eye(3) + pose.rotation_sigma_rad**2 * across
+    if pose.position_sigma_m or pose.rotation_sigma_rad:
+        across = np.sum(place**2, axis=1)[:, None, None] * np.eye(3) - place[:, :, None] * place[:, None, :]
+        covariance[:, :3, :3] += pose.position_sigma_m**2 * np.eye(3) + pose.rotation_sigma_rad**2 * across
+    numbers, seen_s, ghosts = (column[rows].tolist() for column in (bank.number, bank.seen_s, bank.ghost))
     found = []
-    for k, row in enumerate(rows.tolist()):
-        number = int(bank.number[row])
-        unseen_s = 0.0 if number in detections else max(time_s - float(bank.seen_s[row]), 0.0)
+    for k, number in enumerate(numbers):
+        unseen_s = 0.0 if number in detections else max(time_s - seen_s[k], 0.0)
         found.append(
             Track(
                 robot=robot,
@@ -117,7 +119,7 @@ def tracks(
                 covariance=covariance[k],
                 detections=detections.get(number, ()),
                 unseen_s=unseen_s,
-                ghost=ghost_label(float(bank.ghost[row])),
+                ghost=ghost_label(ghosts[k]),
             )
         )
     return tuple(found)

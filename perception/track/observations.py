@@ -1,11 +1,13 @@
 """Measurements of a set as arrays in the observer's odometry frame, and what they say beyond predictions."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
 from perception.odometry import Poses
 from perception.track.kalman import Innovations, States
 from perception.track.settings import TrackerSettings
@@ -20,9 +22,9 @@ NO_RANGE_M = 1e3
 LEAST_RANGE_M = 0.05
 """Nearer than this no source is taken to be, where noise is put by the predicted range."""
 
-_MOST_CORRELATION = 0.95
-_MOST_GROWTH = 4.0
-_KNOWN_RANGE = 0.3
+MOST_CORRELATION = 0.95
+MOST_GROWTH = 4.0
+KNOWN_RANGE = 0.3
 _SLOWER = 1.05
 
 
@@ -50,8 +52,8 @@ def beaten(rhythm: Mapping[str, Beat], names: Iterable[str], time_s: float) -> d
 
 def _period_s(cameras: Sequence[str], rhythm: Mapping[str, Beat]) -> float:
     """Return the period of the fastest of some cameras; 0 where none is known."""
-    fastest_s = min((rhythm[name].period_s for name in cameras if name in rhythm), default=np.inf)
-    return fastest_s if np.isfinite(fastest_s) else 0.0
+    fastest_s = min((rhythm[name].period_s for name in cameras if name in rhythm), default=math.inf)
+    return fastest_s if math.isfinite(fastest_s) else 0.0
 
 
 class Observations(NamedTuple):
@@ -117,7 +119,7 @@ def usable(measurements: Sequence[Measurement]) -> list[int]:
     return [
         k
         for k, one in enumerate(measurements)
-        if np.isfinite([one.time_s, *one.origin_body_m, *one.bearing_body]).all()
+        if all(map(math.isfinite, (one.time_s, *one.origin_body_m, *one.bearing_body)))
     ]
 
 
@@ -173,38 +175,54 @@ def innovations(states: States, seen: Observations, spread_rad: Array | None = N
     The bias of a range by flux, E[r̂] = r (1 + ⅜ (σ_F/F)²), is taken off. A range that is not known gets a σ
     of 1 km, and only the bearing counts; so where `spread_rad`, shape (n,), is no NaN: it adds to the noise.
     """
-    n = len(seen.range_m)
-    rows = np.zeros((n, 3, 6))
-    rows[:, :, :3], rows[:, :, 3:] = seen.axes, seen.after_s[:, None, None] * seen.axes
-    apart_m = (rows @ states.mean[:, :, None])[:, :, 0] - np.einsum("nij,nj->ni", seen.axes, seen.origin_m)
-    far_m = np.maximum(np.linalg.norm(apart_m, axis=1), LEAST_RANGE_M)
-    ranged = np.isfinite(seen.range_m)
-    if spread_rad is not None:
-        ranged &= np.isnan(spread_rad)
-    along_m2 = np.einsum("ni,nij,nj->n", seen.bearing, states.covariance[:, :3, :3], seen.bearing)
-    far_m = np.where(ranged & (along_m2 > (_KNOWN_RANGE * far_m) ** 2), seen.range_m, far_m)
-    range_m = np.where(ranged, seen.range_m, far_m)
-    growth = np.clip(far_m / range_m, 1.0 / _MOST_GROWTH, _MOST_GROWTH)
-    # δr = ½ r δF/F grows as r³ where F ∝ r⁻² has a noise that does not depend on it.
-    sigma_m = np.where(ranged, np.sqrt(seen.noise_m2) * growth**3, NO_RANGE_M)
-    bias_m = np.where(ranged, 1.5 * sigma_m**2 / far_m, 0.0)  # ⅜ (2 σ_w / r)² r
-    residual_m = -apart_m
-    residual_m[:, 2] += np.where(ranged, range_m - np.minimum(bias_m, 0.5 * sigma_m), apart_m[:, 2])
-    noise = np.zeros((n, 3, 3))
-    noise[:, :2, :2] = seen.angle_rad2
-    if spread_rad is not None:
-        noise[:, :2, :2] += (np.nan_to_num(spread_rad) ** 2)[:, None, None] * np.eye(2)
-    noise[:, :2, :2] *= (far_m**2)[:, None, None]
-    noise[:, 2, 2] = sigma_m**2
-    most_m2 = (
-        _MOST_CORRELATION
-        / np.sqrt(2.0)
-        * np.sqrt(noise[:, [0, 1], [0, 1]] * np.where(ranged, seen.noise_m2, 0.0)[:, None])
-    )
-    skew = np.clip(seen.skew_m * far_m[:, None], -most_m2, most_m2)
-    skew *= np.where(ranged, sigma_m / np.sqrt(seen.noise_m2), 0.0)[:, None]
-    noise[:, :2, 2] = noise[:, 2, :2] = skew
-    noise += seen.shaken_m2[:, None, None] * np.eye(3)
-    load = np.zeros((n, 3))
-    load[:, 2] = np.where(ranged, seen.common_m * growth, 0.0)
-    return Innovations(rows, residual_m, noise, load)
+    spread_rad = np.full(len(seen.range_m), np.nan) if spread_rad is None else spread_rad
+    columns = (
+        states.mean, states.covariance, seen.origin_m, seen.axes, seen.range_m, seen.angle_rad2, seen.skew_m,
+        seen.noise_m2, seen.common_m, seen.shaken_m2, seen.after_s, spread_rad,
+    )  # fmt: skip
+    return Innovations(*_innovations(*map(np.ascontiguousarray, columns)))
+
+
+@compiled
+def _innovations(
+    mean: Array, covariance: Array, origin_m: Array, axes: Array, range_m: Array, angle_rad2: Array,
+    skew_m: Array, noise_m2: Array, common_m: Array, shaken_m2: Array, after_s: Array, spread_rad: Array,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    n = len(range_m)
+    rows, noise = np.zeros((n, 3, 6)), np.zeros((n, 3, 3))
+    residual_m, load = np.zeros((n, 3)), np.zeros((n, 3))
+    for k in range(n):
+        far2, along_m2 = 0.0, 0.0
+        for a in range(3):
+            for x in range(3):
+                rows[k, a, x], rows[k, a, 3 + x] = axes[k, a, x], after_s[k] * axes[k, a, x]
+                there_m = mean[k, x] + after_s[k] * mean[k, 3 + x] - origin_m[k, x]
+                residual_m[k, a] -= axes[k, a, x] * there_m
+                along_m2 += axes[k, 2, a] * covariance[k, a, x] * axes[k, 2, x]
+            far2 += residual_m[k, a] ** 2
+        far_m = max(math.sqrt(far2), LEAST_RANGE_M)
+        ranged = math.isfinite(range_m[k]) and math.isnan(spread_rad[k])
+        if ranged and along_m2 > (KNOWN_RANGE * far_m) ** 2:
+            far_m = range_m[k]
+        sigma_m, skewed = NO_RANGE_M, 0.0
+        if ranged:
+            growth = min(max(far_m / range_m[k], 1.0 / MOST_GROWTH), MOST_GROWTH)
+            # δr = ½ r δF/F grows as r³ where F ∝ r⁻² has a noise that does not depend on it.
+            skewed = growth**3
+            sigma_m = math.sqrt(noise_m2[k]) * skewed
+            bias_m = 1.5 * sigma_m**2 / far_m  # ⅜ (2 σ_w / r)² r
+            residual_m[k, 2] += range_m[k] - min(bias_m, 0.5 * sigma_m)
+            load[k, 2] = common_m[k] * growth
+        else:
+            residual_m[k, 2] = 0.0
+        for a in range(2):
+            for b in range(2):
+                noise[k, a, b] = angle_rad2[k, a, b] * far_m**2
+            if not math.isnan(spread_rad[k]):
+                noise[k, a, a] += spread_rad[k] ** 2 * far_m**2
+            most_m2 = MOST_CORRELATION * math.sqrt(0.5 * noise[k, a, a] * noise_m2[k]) if ranged else 0.0
+            noise[k, a, 2] = noise[k, 2, a] = min(max(skew_m[k, a] * far_m, -most_m2), most_m2) * skewed
+        noise[k, 2, 2] = sigma_m**2
+        for a in range(3):
+            noise[k, a, a] += shaken_m2[k]
+    return rows, residual_m, noise, load

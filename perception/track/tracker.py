@@ -173,6 +173,19 @@ class Tracker:
         free = np.setdiff1d(free, taken)
         share = min(after_s / CLUTTER_MEMORY_S, 1.0)
         self._clutter = max(LEAST_CLUTTER, self._clutter + share * (len(free) - self._clutter))
+        if len(young.number) or len(free):
+            old, young = self._feed_young(old, young, seen, taken, free, after_s)
+        self._bank = old.joined(young)
+        numbers = old.number.tolist()
+        return {number: int(k) for number, k in zip(numbers, taken.tolist(), strict=True) if k >= 0}
+
+    def _feed_young(
+        self, old: Bank, young: Bank, seen: Observations, taken: Indices, free: Indices, after_s: float
+    ) -> tuple[Bank, Bank]:
+        """Feed tracks that are not confirmed with what is free, and begin others; one may go on as an old.
+
+        Which measurement that took is written to `taken`.
+        """
         rest = seen.taken(free)
         pairs = self._pairs(young, rest, max(LEAST_CLUTTER, len(free)))
         chosen = assigned(pairs)
@@ -190,9 +203,7 @@ class Tracker:
         left = rest.taken(np.setdiff1d(np.arange(len(free)), measurement))
         born = newborn(left, self._time_s, self.settings)
         born = life.judged_ghosts(born, np.arange(len(left.range_m)), left.ghost)
-        self._bank = old.joined(young).joined(born)
-        numbers = old.number.tolist()
-        return {number: int(k) for number, k in zip(numbers, taken.tolist(), strict=True) if k >= 0}
+        return old, young.joined(born)
 
     def _feed_confirmed(self, old: Bank, seen: Observations, after_s: float) -> tuple[Bank, Indices]:
         """Feed confirmed tracks, and return which measurement each took, −1 for none."""

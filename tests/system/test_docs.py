@@ -14,6 +14,7 @@ import yaml
 import nir_render as nr
 import perception
 from nir_render.scene.load import load_scene
+from nir_render.stress.workers.queue import load_queue
 from tests.paths import ROOT
 from tests.system.command import nir_render
 from tests.unit.test_imports import FLOORS
@@ -127,9 +128,15 @@ def test_the_camera_shown_can_be_read(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "scene.yaml").cameras() == ["r1.front"]
 
 
+def test_the_queue_shown_can_be_read(tmp_path: Path) -> None:
+    _, queue = _blocks("stress.md", "yaml")
+    (tmp_path / "queue.yaml").write_text(queue)
+    assert load_queue(tmp_path / "queue.yaml").walltime_s == 7200.0
+
+
 def test_the_campaign_shown_can_be_planned(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes", ignore=shutil.ignore_patterns("references"))
-    (campaign,) = _blocks("stress.md", "yaml")
+    campaign, _ = _blocks("stress.md", "yaml")
     (tmp_path / "scenes" / "campaigns" / "shown.yaml").write_text(campaign, encoding="utf-8")
     done = nir_render("stress", "scenes/campaigns/shown.yaml", "--plan", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

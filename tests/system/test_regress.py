@@ -215,16 +215,19 @@ def _caught(name: str, seed: int, scene: Scene | None = None, fault: Light1 = la
 
 @pytest.mark.verify
 @pytest.mark.vectorised
-def test_a_hundred_clean_renders_raise_no_alarm() -> None:
-    """At the stated 0.1 % a hundred whole suites give 0.1 alarms: none or one. At 20 % they give 20: 32 at most (3 σ)."""
+def test_thirty_clean_renders_raise_no_alarm() -> None:
+    """At the stated 0.1 % thirty whole suites give 0.03 alarms: none or one. At 20 % they give 6: 12 at most (3 σ).
+
+    `benchmarks/regression.py` does it 200 times.
+    """
     alarms = dict.fromkeys((FALSE_ALARM_RATE, 0.2), 0)
-    for seed in range(1000, 1100):
+    for seed in range(1000, 1030):
         parts = [one for name in _suite()[0] for one in _tests(name, seed)]
         for rate in alarms:
             alarms[rate] += not all(verdict.same for verdict in judge(parts, rate))
-    print(f"false alarms in 100 suites: {alarms}")  # noqa: T201
+    print(f"false alarms in 30 suites: {alarms}")  # noqa: T201
     assert alarms[FALSE_ALARM_RATE] <= 1
-    assert alarms[0.2] <= 32
+    assert alarms[0.2] <= 12
 
 
 @pytest.mark.verify
@@ -252,11 +255,20 @@ def test_one_percent_of_radiance_is_caught() -> None:
 
 @pytest.mark.verify
 @pytest.mark.vectorised
-def test_five_percent_of_a_walls_albedo_are_caught() -> None:
-    scene = _suite()[0]["room"].with_({"materials.paint.reflectance": 0.7 * 1.05})
-    caught = sum(_caught("room", 3000 + trial, scene) for trial in range(40))
-    print(f"a wall's albedo + 5 %: caught in {caught} of 40 trials")  # noqa: T201
-    assert caught >= 38
+@pytest.mark.parametrize(
+    ("name", "change", "trials"),
+    [
+        ("room", {"materials.paint.reflectance": 0.7 * 1.05}, 40),
+        ("glass", {"materials.plaster.reflectance": 0.6 * 0.95}, 4),
+        ("fog", {"materials.earth.reflectance": 0.15 * 0.95}, 4),
+    ],
+)
+def test_five_percent_of_a_walls_albedo_are_caught(name: str, change: dict[str, Any], trials: int) -> None:
+    """Dim ones too: the wall behind the glass, the floor below the fog."""
+    scene = _suite()[0][name].with_(change)
+    caught = sum(_caught(name, 3000 + trial, scene) for trial in range(trials))
+    print(f"{name}: {change}: caught in {caught} of {trials} trials")  # noqa: T201
+    assert caught >= 0.95 * trials
 
 
 @pytest.mark.verify
@@ -273,13 +285,13 @@ def test_five_percent_of_a_walls_albedo_are_caught() -> None:
 def test_faults_of_the_camera_are_caught(key: str, value: str, stage: str) -> None:
     """Gain + 1 %, a shift of 0.1 px and a filter shifted by 1 nm; no Monte Carlo, so each trial says the same."""
     scenes, references = _suite()
-    name = "fog"  # the quickest one
+    name = "fog"
     faulty = scenes[name].with_({f"robots.r1.rig.cameras.front.{key}": value})
     stages: Counter[str] = Counter()
-    for trial in range(40):
+    for trial in range(2):
         result = check_scenes("suite", {name: faulty}, {name: references[name]}, seed=4000 + trial)
         stages.update(
             {one.stage for scene in result.scenes for one in scene.findings if one.verdict == "fail"}
         )
-    print(f"{key} = {value}: caught in {stages[stage]} of 40 trials, by {dict(stages)}")  # noqa: T201
-    assert stages[stage] >= 38
+    print(f"{key} = {value}: caught in {stages[stage]} of 2 trials, by {dict(stages)}")  # noqa: T201
+    assert stages[stage] == 2

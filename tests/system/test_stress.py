@@ -126,6 +126,8 @@ def test_a_campaign_runs_stops_and_goes_on(tmp_path: Path) -> None:
     summary = json.loads(finished(file, output, "--json"))
     assert (summary["jobs"], summary["done_before"], summary["failed"]) == (40, len(parts), 0)
     assert set(summary["estimators"]) == {"paper", "robust"}
+    told = json.loads(finished(file, output, "--status", "--json"))
+    assert told == {"campaign": "tiny", "jobs": 40, "done": 40, "others": 0}
     kept = times_of(output)
     assert len(kept) == 40
     assert kept.items() >= parts.items()

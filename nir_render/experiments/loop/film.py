@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 
 from nir_render.experiments.loop.closed import LoopPlan
 from nir_render.report.pictures import whole_picture
-from nir_render.report.style import FAINT, GROUND, INK, LINE, PANEL
+from nir_render.report.time.canvas import (
+    FAINT_BGR,
+    GROUND_BGR,
+    INK_BGR,
+    LINE_BGR,
+    PANEL_BGR,
+    Colour,
+    Picture,
+    bgr,
+    write,
+)
 from nir_render.report.time.film import places_px
 from nir_render.report.time.plots import COLOURS
 from nir_render.run import folder as run_folder
@@ -32,9 +42,6 @@ from perception import (
 from perception.rig.frame_sets import robot_of
 from perception.types import Calibration, Message, Track
 
-Picture = NDArray[np.uint8]
-Colour = tuple[int, int, int]
-
 FILM = "film.mp4"
 _WIDTH, _HEIGHT = 1120, 640
 _RATE_HZ, _MOST_PICTURES = 30.0, 450
@@ -44,13 +51,6 @@ _VIEWS_AT = ((600, 66), (860, 66), (600, 285), (860, 285))
 _WORDS_AT, _WORDS = (600, 508), 4
 _MARGIN_M, _TRAIL_S = 0.6, 15.0
 _SAME_S = 1e-6
-
-
-def _bgr(colour: str) -> Colour:
-    return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
-
-
-_INK, _FAINT, _GROUND, _PANEL, _LINE = map(_bgr, (INK, FAINT, GROUND, PANEL, LINE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +149,10 @@ def _read(run: Path, plan: LoopPlan) -> _Run:
 
 def _canvas(seen: _Run, title: str, plan: LoopPlan) -> tuple[Picture, _Lens]:
     """Draw what stays: titles, panels, a grid of metres."""
-    canvas = np.full((_HEIGHT, _WIDTH, 3), _GROUND, dtype=np.uint8)
-    _write(canvas, title, (20, 32), 20, _INK)
+    canvas = np.full((_HEIGHT, _WIDTH, 3), GROUND_BGR, dtype=np.uint8)
+    write(canvas, title, (20, 32), 20, INK_BGR)
     left, top, width, height = _ABOVE
-    cv2.rectangle(canvas, (left, top), (left + width, top + height), _PANEL, -1)
+    cv2.rectangle(canvas, (left, top), (left + width, top + height), PANEL_BGR, -1)
     every_m = np.concatenate(list(seen.places_m.values()))
     low_m, high_m = every_m.min(axis=0) - _MARGIN_M, every_m.max(axis=0) + _MARGIN_M
     lens = _Lens(float(min(np.array([width, height]) / (high_m - low_m))), 0.5 * (low_m + high_m))
@@ -160,23 +160,23 @@ def _canvas(seen: _Run, title: str, plan: LoopPlan) -> tuple[Picture, _Lens]:
     begin_m, end_m = lens.centre_m - reach_m, lens.centre_m + reach_m
     for x_m in range(math.ceil(begin_m[0]), math.floor(end_m[0]) + 1):
         column = lens.px(np.array([x_m, 0.0]))[0]
-        cv2.line(canvas, (column, top), (column, top + height), _LINE, 1)
+        cv2.line(canvas, (column, top), (column, top + height), LINE_BGR, 1)
     for y_m in range(math.ceil(begin_m[1]), math.floor(end_m[1]) + 1):
         row = lens.px(np.array([0.0, y_m]))[1]
-        cv2.line(canvas, (left, row), (left + width, row), _LINE, 1)
-    _write(
+        cv2.line(canvas, (left, row), (left + width, row), LINE_BGR, 1)
+    write(
         canvas,
         f"lines every metre; rings: where {seen.observer} takes the others to be",
         (left, _HEIGHT - 6),
         12,
-        _FAINT,
+        FAINT_BGR,
     )
     if not seen.known:
-        _write(canvas, "robots know the truth: there are no cameras", (600, 90), 14, _FAINT)
+        write(canvas, "robots know the truth: there are no cameras", (600, 90), 14, FAINT_BGR)
     for name, (x, y) in zip(seen.known, _VIEWS_AT, strict=False):
-        cv2.rectangle(canvas, (x, y), (x + _VIEW[0], y + _VIEW[1]), _PANEL, -1)
+        cv2.rectangle(canvas, (x, y), (x + _VIEW[0], y + _VIEW[1]), PANEL_BGR, -1)
         without = "" if seen.frames[name] else _WITHOUT[plan.level]
-        _write(canvas, f"{name.rpartition('.')[2]}{without}", (x, y + _VIEW[1] + 17), 12, _FAINT)
+        write(canvas, f"{name.rpartition('.')[2]}{without}", (x, y + _VIEW[1] + 17), 12, FAINT_BGR)
     return canvas, lens
 
 
@@ -187,7 +187,7 @@ def _drawn(
     canvas: Picture, lens: _Lens, seen: _Run, at: int, run: Path, pictures: dict[str, tuple[int, Picture]]
 ) -> Picture:
     time_s = float(seen.times_s[at])
-    _write(canvas, f"{time_s:6.1f} s", (1020, 32), 20, _INK)
+    write(canvas, f"{time_s:6.1f} s", (1020, 32), 20, INK_BGR)
     _above_into(canvas, lens, seen, at)
     tracks = seen.tracks.get(at, [])
     for (name, known), corner in zip(seen.known.items(), _VIEWS_AT, strict=False):
@@ -202,15 +202,15 @@ def _above_into(canvas: Picture, lens: _Lens, seen: _Run, at: int) -> None:
     sends = [packet.robot for packet in seen.sent if packet.start_s <= time_s <= packet.end_s]
     for number, (robot, places_m) in enumerate(seen.places_m.items()):
         way = np.array([lens.px(place_m) for place_m in places_m[begin : at + 1 : 5]], dtype=np.int32)
-        cv2.polylines(canvas, [way.reshape(-1, 1, 2)], isClosed=False, color=_LINE, thickness=2)
+        cv2.polylines(canvas, [way.reshape(-1, 1, 2)], isClosed=False, color=LINE_BGR, thickness=2)
         centre = lens.px(places_m[at])
-        colour = _bgr(COLOURS[4]) if number == 0 else _FAINT
+        colour = bgr(COLOURS[4]) if number == 0 else FAINT_BGR
         cv2.circle(canvas, centre, 8, colour, -1, cv2.LINE_AA)
         if robot in sends:
             cv2.circle(canvas, centre, 13, colour, 2, cv2.LINE_AA)
         if robot == seen.observer:
-            cv2.circle(canvas, centre, 4, _GROUND, -1, cv2.LINE_AA)
-        _write(canvas, robot, (centre[0] + 12, centre[1] - 10), 12, _FAINT)
+            cv2.circle(canvas, centre, 4, GROUND_BGR, -1, cv2.LINE_AA)
+        write(canvas, robot, (centre[0] + 12, centre[1] - 10), 12, FAINT_BGR)
     own_m = seen.places_m[seen.observer][at]
     for track in seen.tracks.get(at, []):
         cv2.circle(canvas, lens.px(own_m + track.position_body_m[:2]), 11, _colour(track), 2, cv2.LINE_AA)
@@ -246,7 +246,7 @@ def _view_into(
         cv2.circle(canvas, centre, 9, _colour(track), 1, cv2.LINE_AA)
         far_m = float(np.linalg.norm(track.position_body_m - known.position_body_m))
         text = f"{track.track}: {far_m:.2f} m" + ("" if track.detections else ", unseen")
-        _write(canvas, text, (min(centre[0] + 12, x + _VIEW[0] - 84), centre[1] - 8), 12, _colour(track))
+        write(canvas, text, (min(centre[0] + 12, x + _VIEW[0] - 84), centre[1] - 8), 12, _colour(track))
 
 
 def _words_into(canvas: Picture, seen: _Run, time_s: float) -> None:
@@ -256,20 +256,13 @@ def _words_into(canvas: Picture, seen: _Run, time_s: float) -> None:
     x, y = _WORDS_AT
     now = [packet for packet in seen.sent if packet.start_s <= time_s <= packet.end_s]
     sending = ", ".join(f"{one.robot} sends {one.command or one.word}" for one in now) or "nobody sends"
-    _write(canvas, sending, (x, y), 15, _bgr(COLOURS[4]) if now else _FAINT)
-    _write(canvas, f"what {seen.observer} has read:", (x, y + 24), 13, _FAINT)
+    write(canvas, sending, (x, y), 15, bgr(COLOURS[4]) if now else FAINT_BGR)
+    write(canvas, f"what {seen.observer} has read:", (x, y + 24), 13, FAINT_BGR)
     told = [word for word in seen.words if word.end_s <= time_s][-_WORDS:][::-1]
     for number, word in enumerate(told):
         text = f"{word.end_s:5.1f} s  track {word.track}: {word.command or word.word}"
-        _write(canvas, text, (x, y + 46 + 22 * number), 15, _INK if number == 0 else _FAINT)
+        write(canvas, text, (x, y + 46 + 22 * number), 15, INK_BGR if number == 0 else FAINT_BGR)
 
 
 def _colour(track: Track) -> Colour:
-    return _bgr(COLOURS[track.track % len(COLOURS)])
-
-
-def _write(canvas: Picture, text: str, at: tuple[int, int], size: int, colour: Colour) -> None:
-    cv2.putText(canvas, text, at, colour, _FACE, size)
-
-
-_FACE = cv2.FontFace("sans")
+    return bgr(COLOURS[track.track % len(COLOURS)])

@@ -20,10 +20,11 @@ Line = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """What there is to tell of a step: lines by the names of their files, frames to be kept."""
+    """What there is to tell of a step: lines by the names of their files, frames to be kept, whole files."""
 
     lines: Mapping[str, Sequence[Line]]
     frames: Sequence[RawFrame] = ()
+    files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 @dataclass
@@ -60,6 +61,8 @@ class Journal:
         lines = dict(told.lines)
         if told.frames:
             lines[FRAMES] = [self._kept(frame) for frame in told.frames]
+        for name, content in told.files.items():
+            write_file(self.folder / name, content)
         for name, records in lines.items():
             text = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records).encode()
             self._add(name, text)

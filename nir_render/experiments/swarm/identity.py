@@ -1,10 +1,17 @@
 """Who says it: a robot's number in a word of the paper's language, in two where there are more than 128."""
 
+from collections import defaultdict
+from collections.abc import Iterable
+
+from perception import Message
+
 WORDS = 128
 _HIGH = 32
 """Of two words the first is one of the first 32, the second one of the other 96: which is which is seen."""
 
 MOST = _HIGH * (WORDS - _HIGH)
+
+_PAIR_S = 9.0  # the second word of a robot begins 6.65 s after the first
 
 
 def words_of(number: int, robots: int) -> tuple[int, ...]:
@@ -39,3 +46,25 @@ def number_of(words: tuple[int, ...], robots: int) -> int | None:
     else:
         number = robots
     return number if number < robots else None
+
+
+def numbers_told(words: Iterable[Message], robots: int) -> list[tuple[int, tuple[Message, ...]]]:
+    """Return the numbers that tracks tell, each with the words by which it is told.
+
+    A track's two words are one robot's where they follow each other as a robot sends them. A word that may be
+    another track's tells nobody's number.
+    """
+    by_track: dict[int, list[Message]] = defaultdict(list)
+    for word in words:
+        if word.ambiguous_with is None:
+            by_track[word.track].append(word)
+    length = len(words_of(0, robots))
+    found = []
+    for said in by_track.values():
+        in_time = sorted(said, key=lambda word: word.start_s)
+        for first in range(len(in_time) - length + 1):
+            some = tuple(in_time[first : first + length])
+            number = number_of(tuple(word.word for word in some), robots)
+            if number is not None and some[-1].start_s - some[0].start_s <= _PAIR_S * (length - 1):
+                found.append((number, some))
+    return found

@@ -7,12 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from nir_render.evaluate.match import MIN_PEAK_SNR, MIN_VISIBLE_FRACTION, match, on_a_lamp
+from nir_render.evaluate.match import (
+    GATE_PX,
+    MIN_PEAK_SNR,
+    MIN_VISIBLE_FRACTION,
+    image_radius_px,
+    match,
+    on_a_lamp,
+)
+from nir_render.evaluate.messages import is_of
 from nir_render.evaluate.metrics import source_limits
 from nir_render.truth.lamps import Outline
 from nir_render.truth.sent import SentTruth
 from nir_render.truth.sources import SourceTruth
-from perception import Calibration, Detection
+from perception import Calibration, Detection, Message
 
 WHYS = ("free", "eclipsed", "merged", "faint", "dark", "hidden", "cut")
 """How a robot can be seen, the best first: of its cameras the best one counts."""
@@ -21,7 +29,7 @@ MERGED_PX, NEAR_PX = 2.0, 4.0
 _BESIDE = 0.1  # a neighbour with less of one's light hardly shifts it
 _EDGE_PX = 3.0
 _WHOLE = 0.99
-_SLACK_S = 0.55  # half a frame of eleven bits
+_HALO_SIGMAS = 20.0  # more than flares are told apart by
 
 
 @dataclass(frozen=True)
@@ -35,7 +43,8 @@ class Sight:
     near
         Whether another source shines within 4 px of it, in the camera that shows it best.
     range_m, limit_m
-        The true distance from that camera, and the Cramér–Rao bound of it, overlapping flares told apart.
+        The true distance from that camera, and the Cramér–Rao bound of it, overlapping flares told apart;
+        NaN where it is not found.
     found
         Whether a detection is its.
     said_m, sigma_m
@@ -58,6 +67,26 @@ class Sight:
             for value in (self.range_m, self.limit_m, self.said_m, self.sigma_m)
         ]
         return [self.robot, self.why, self.near, self.found, *floats]
+
+
+@dataclass(frozen=True)
+class InSet:
+    """A set of frames held against truth.
+
+    Attributes
+    ----------
+    sights
+        Each of the other robots.
+    false_alarms
+        How many detections are of no robot, lamp or mirror image.
+    parts
+        How many are further ones of a robot of which a body hides a part, and which has one already: what is
+        left of it is taken for several.
+    """
+
+    sights: tuple[Sight, ...]
+    false_alarms: int
+    parts: int
 
 
 def whys(rows: Sequence[SourceTruth], known: Calibration) -> list[tuple[str, bool]]:
@@ -92,14 +121,25 @@ def whys(rows: Sequence[SourceTruth], known: Calibration) -> list[tuple[str, boo
     return found
 
 
+def unlike(rows: Sequence[SourceTruth], known: Calibration) -> list[str]:
+    """Return the robots whose flare is not their whole light alone: partly hidden, or one within 4 px."""
+    return [
+        row.robot
+        for row, (_, near) in zip(rows, whys(rows, known), strict=True)
+        if row.direct_e > 0.0 and (near or row.visible_fraction < _WHOLE)
+    ]
+
+
 def sights(
     robots: Iterable[str],
     rows_of: Mapping[str, Sequence[SourceTruth]],
     found: Mapping[str, Sequence[Detection]],
     lamps_px: Mapping[str, Sequence[Outline]],
     known: Mapping[str, Calibration],
-) -> tuple[list[Sight], int]:
-    """Return each robot as a set of frames shows it, and how many detections are of none of them.
+) -> InSet:
+    """Return each robot as a set of frames shows it, and what the detections are that are of none of them.
+
+    Who sends no light to a camera, dark or hidden whole, is not found by it, whatever is found there.
 
     Parameters
     ----------
@@ -109,26 +149,53 @@ def sights(
         By camera: truth, detections, lamps, what is known of it.
     """
     best: dict[str, Sight] = {}
-    alarms = 0
+    alarms = parts = 0
     for camera, rows in rows_of.items():
         real = [row for row in rows if row.ghost_of is None]
-        pairs = match(real, found[camera], known[camera])
-        hits = {number: found[camera][hit] for number, hit in pairs.pairs}
-        alarms += sum(
-            not (found[camera][hit].ghost or on_a_lamp(found[camera][hit], lamps_px[camera]))
-            for hit in pairs.unmatched
-        )
+        shining = [number for number, row in enumerate(real) if row.direct_e > 0.0]
+        pairs = match([real[number] for number in shining], found[camera], known[camera])
+        hits = {shining[number]: found[camera][hit] for number, hit in pairs.pairs}
+        for other in (found[camera][number] for number in pairs.unmatched):
+            if other.ghost or on_a_lamp(other, lamps_px[camera]):
+                continue
+            is_part = any(_is_part(other, real[number], known[camera]) for number in shining)
+            parts += is_part
+            alarms += not is_part
+        reach = _Reach(real, known[camera])
         for number, (row, (why, near)) in enumerate(zip(real, whys(real, known[camera]), strict=True)):
             hit = hits.get(number)
             limit_m = math.nan
-            if why in ("free", "merged") and row.on_fraction >= 1.0:
-                limit_m, _ = source_limits(row, known[camera], real)
+            if hit is not None and why in ("free", "merged") and row.on_fraction >= 1.0:
+                limit_m, _ = source_limits(row, known[camera], reach.of(number))
             one = Sight(
                 row.robot, why, near, row.range_m, limit_m, hit is not None,
                 math.nan if hit is None else hit.range_m, math.nan if hit is None else hit.range_sigma_m,
             )  # fmt: skip
             best[row.robot] = _better(best.get(row.robot), one)
-    return [best.get(robot, _unseen(robot)) for robot in robots], alarms
+    return InSet(tuple(best.get(robot, _unseen(robot)) for robot in robots), alarms, parts)
+
+
+class _Reach:
+    """Which sources of a frame may overlap which: for each a few, where there are hundreds."""
+
+    def __init__(self, rows: Sequence[SourceTruth], known: Calibration) -> None:
+        self._rows = rows
+        self._places_px = np.array([(row.u_px, row.v_px) for row in rows]).reshape(-1, 2)
+        self._radii_px = np.array([image_radius_px(row, known) for row in rows])
+        self._halo_px = _HALO_SIGMAS * known.psf_sigma_px
+
+    def of(self, number: int) -> list[SourceTruth]:
+        """Return the sources whose images may reach that of one, itself among them."""
+        apart_px = np.hypot(*(self._places_px - self._places_px[number]).T)
+        near = apart_px < self._radii_px + self._radii_px[number] + self._halo_px
+        return [self._rows[row] for row in np.flatnonzero(near).tolist()]
+
+
+def _is_part(hit: Detection, row: SourceTruth, known: Calibration) -> bool:
+    """Tell whether a detection lies on a source of which something hides more than a hundredth."""
+    gate_px = max(GATE_PX, image_radius_px(row, known))
+    apart_px = math.hypot(hit.u_px - row.u_px, hit.v_px - row.v_px)
+    return row.visible_fraction < _WHOLE and apart_px <= gate_px
 
 
 def _better(known: Sight | None, other: Sight) -> Sight:
@@ -145,12 +212,13 @@ def _unseen(robot: str) -> Sight:
 
 @dataclass(frozen=True)
 class Word:
-    """A word that was told: of whom it was, by truth, as far as its track was one's, and by which track."""
+    """A word that was told, and of whom it is by truth: whom its track followed meanwhile.
 
-    robot: str | None
-    track: int
-    start_s: float
-    word: int
+    Two where the message says that another track may have said it instead; none where they followed nobody.
+    """
+
+    robots: tuple[str, ...]
+    message: Message
 
 
 @dataclass(frozen=True)
@@ -160,7 +228,7 @@ class Packets:
     Attributes
     ----------
     received
-        For each packet whether it was told, with the sender's track.
+        For each packet whether it was told, of all five frames or of some, with the sender's track.
     misattributed
         How many words were told that another one sent just then: the wrong one is said to speak.
     wrong
@@ -173,18 +241,15 @@ class Packets:
 
 
 def judged_packets(sent: Sequence[SentTruth], told: Sequence[Word]) -> Packets:
-    """Hold words against packets: one is a packet's that begins within half a frame, 0.55 s, of it."""
+    """Hold words against packets (`evaluate.messages.is_of`)."""
     received = [False] * len(sent)
     misattributed = wrong = 0
     for word in told:
-        same = [
-            number
-            for number, packet in enumerate(sent)
-            if packet.word == word.word and abs(packet.start_s - word.start_s) < _SLACK_S
-        ]
-        own = [number for number in same if sent[number].robot == word.robot]
+        same = [number for number, packet in enumerate(sent) if is_of(word.message, packet)]
+        own = [number for number in same if sent[number].robot in word.robots]
         if own:
-            received[own[0]] = True
+            # Two may say one word at once, each perhaps the other: that is one packet of each.
+            received[next((number for number in own if not received[number]), own[0])] = True
         elif same:
             misattributed += 1
         else:

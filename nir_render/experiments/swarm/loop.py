@@ -16,10 +16,12 @@ from nir_render.camera.timing.shutter import mid_exposure_s
 from nir_render.evaluate.match import MIN_VISIBLE_FRACTION
 from nir_render.experiments.loop.journal import Told
 from nir_render.experiments.loop.measurement_sight import MeasurementSight
-from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of
-from nir_render.experiments.swarm.identity import MOST, number_of, words_of
-from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights
-from nir_render.experiments.swarm.views import TRACKS
+from nir_render.experiments.swarm.film import MOST_PICTURES, encoded, picture_file
+from nir_render.experiments.swarm.followed import Followed
+from nir_render.experiments.swarm.hall import OBSERVER, hall_scene, names_of, side_m
+from nir_render.experiments.swarm.identity import MOST, numbers_told
+from nir_render.experiments.swarm.judge import Sight, Word, judged_packets, sights, unlike
+from nir_render.experiments.swarm.picture import Moment, SwarmPicture
 from nir_render.randomness import RandomKey
 from nir_render.run.folder import POSES, SENT
 from nir_render.scene.pose import Pose
@@ -32,6 +34,7 @@ from nir_render.simulation.sent import sent_packets
 from nir_render.simulation.truth import truth_of
 from nir_render.truth.lamps import Outline
 from nir_render.truth.poses import PoseTruth
+from nir_render.truth.sources import SourceTruth
 from perception import (
     Calibration,
     Detection,
@@ -47,15 +50,12 @@ from perception import (
 
 Array = NDArray[np.float64]
 
+TRACKS = "tracks.robust.jsonl"
 SECONDS = "seconds.jsonl"
 """How long each part of each set took, in a run's folder."""
 
 OFF = 0.01
 """Of a block's temporal variance: by so much may light that many share be off in the mean square."""
-
-_GATE_CHI2 = 25.0
-_FLOOR_M = 0.02  # a track is not held to a place better than that
-_PAIR_S = 9.0  # the second word of a robot begins 6.65 s after the first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,11 +118,11 @@ class SwarmLoop:
         self._pipeline = Pipeline.of("robust", self._known)
         self._sight: MeasurementSight | None = None
         self._rates: dict[str, Rates] = {}
-        self._followed: dict[int, str | None] = {}
+        self._followed = Followed(self._others, np.empty((0, 3)), {}, self._known)
         self._done = 0
         self._told: list[Word] = []
         self._sights: list[list[Any]] = []
-        self._alarms = 0
+        self._alarms = self._parts = 0
         self._standing: list[list[Any]] = []
         self._shared: dict[str, SharedLight] = {}
 
@@ -151,7 +151,9 @@ class SwarmLoop:
             self._render()
             clock.lap("render")
         if not self._standing:
-            self._standing = [one.record() for one in self._lit()]
+            rows = self._lit()
+            self._standing = [one.record() for one in self._could_be_seen(rows)]
+            self._followed = self._nobody_yet(rows)
             clock.lap("ceiling")
         if self.plan.level != "frames":
             return self._measured(clock)
@@ -177,10 +179,26 @@ class SwarmLoop:
             self._judge(means, frames, found)
             clock.lap("judge")
         self._done += 1
+        files = self._pictured(frames, heard.tracks, last)
+        clock.lap("draw")
         lines = self._lines(words, clock)
         if last:
             lines[TRACKS] = [track_record(track) for track in heard.tracks]
-        return Told(lines, frames if last else [])
+        return Told(lines, frames if last else [], files)
+
+    def _pictured(self, frames: Sequence[RawFrame], tracks: Sequence[Track], last: bool) -> dict[str, bytes]:
+        """Draw the set that is done, where the film has it, or the run ends."""
+        number = self._done - 1
+        if not last and number % math.ceil(self.steps / MOST_PICTURES):
+            return {}
+        places_m = np.array(
+            [self._world.robots[name].pose.position_m[:2] for name in names_of(self.plan.robots)]
+        )
+        side = side_m(self.plan.robots, self.plan.density_per_m2)
+        picture = SwarmPicture(places_m, self._world.robots[OBSERVER].pose, self._known, side)
+        words = [word.message for word in self._told]
+        drawn = picture.drawn(Moment(number / self.plan.rate_hz, frames, tracks, words))
+        return {picture_file(number, last): encoded(drawn, last)}
 
     def _measured(self, clock: "_Clock") -> Told:
         """Draw the detections of a set, and read them."""
@@ -229,6 +247,7 @@ class SwarmLoop:
             "standing": self._standing,
             "sights": self._sights,
             "false_alarms": self._alarms,
+            "parts": self._parts,
             "packets": [
                 [packet.robot, packet.word, round(packet.start_s, 4), received]
                 for packet, received in zip(sent, packets.received, strict=True)
@@ -236,7 +255,7 @@ class SwarmLoop:
             "misattributed": packets.misattributed,
             "wrong_words": packets.wrong,
             "identities": self._identities(),
-            "tracks": list(self._followed.values()),
+            "tracks": self._followed.now(),
             "shared": {name: asdict(one) for name, one in self._shared.items()},
         }
 
@@ -255,16 +274,12 @@ class SwarmLoop:
             self._rates[name] = electron_rates(light, self._world, self._shared[name].groups)
 
     def _hear(self, words: Sequence[Message], tracks: Sequence[Track]) -> None:
-        """Note of whom each word is, by truth: of the robot that its track follows."""
-        place = self._world.robots[OBSERVER].pose
-        others_m = np.array([self._world.sources[f"{name}.top"].pose.position_m for name in self._others])
-        others_body_m = place.to_local(others_m)
-        for track in tracks:
-            if track.ghost != "yes":
-                self._followed[track.track] = _nearest(track, others_body_m, self._others)
-        self._told += [
-            Word(self._followed.get(word.track), word.track, word.start_s, word.word) for word in words
-        ]
+        """Note of whom each word is, by truth."""
+        self._followed.update(tracks)
+        for word in words:
+            meant = [word.track] if word.ambiguous_with is None else [word.track, word.ambiguous_with]
+            whom = (self._followed.during(track, word.start_s, word.end_s) for track in meant)
+            self._told.append(Word(tuple(one for one in whom if one is not None), word))
 
     def _judge(
         self, means: dict[str, MeanFrame], frames: Sequence[RawFrame], found: Sequence[Sequence[Detection]]
@@ -275,50 +290,50 @@ class SwarmLoop:
             name: [lamp.outline_px for lamp in lamp_truth(self._world, name, self._done)] for name in means
         }
         rows = {name: list(truth_of(mean, by_camera[name])) for name, mean in means.items()}
-        seen, alarms = sights(self._others, rows, hits, lamps_px, self._known)
-        self._sights.append([one.record() for one in seen])
-        self._alarms += alarms
+        seen = sights(self._others, rows, hits, lamps_px, self._known)
+        self._sights.append([one.record() for one in seen.sights])
+        self._alarms += seen.false_alarms
+        self._parts += seen.parts
 
-    def _lit(self) -> list[Sight]:
-        """Return each robot as it could be seen were all lit at once: the ceiling of what is heard."""
+    def _lit(self) -> dict[str, list[SourceTruth]]:
+        """Return by camera the truth of a set in which all are lit at once, mirror images left out."""
         rows = {}
         for name, rates in self._rates.items():
             setting = own_setting(rates.camera, 0)
             lit = fully_lit_frame(rates, setting.exposure_s)
             key = RandomKey(self.seed, "read_out", name, 0)
             frame = frame_of(lit.electrons, rates.camera, setting, 0.0, key)
-            rows[name] = [replace(row, on_fraction=1.0) for row in truth_of(lit, frame)]
+            real = [row for row in truth_of(lit, frame) if row.ghost_of is None]
+            rows[name] = [replace(row, on_fraction=1.0) for row in real]
+        return rows
+
+    def _could_be_seen(self, rows: dict[str, list[SourceTruth]]) -> tuple[Sight, ...]:
+        """Return each robot as it could be seen were all lit at once: the ceiling of what is heard."""
         none: dict[str, list[Detection]] = {name: [] for name in rows}
         lamps_px: dict[str, list[Outline]] = {name: [] for name in rows}
-        return sights(self._others, rows, none, lamps_px, self._known)[0]
+        return sights(self._others, rows, none, lamps_px, self._known).sights
+
+    def _nobody_yet(self, rows: dict[str, list[SourceTruth]]) -> Followed:
+        """Return whom tracks follow before there are any."""
+        others_m = np.array([self._world.sources[f"{name}.top"].pose.position_m for name in self._others])
+        places_m = self._world.robots[OBSERVER].pose.to_local(others_m)
+        return Followed(
+            self._others,
+            places_m,
+            {name: unlike(some, self._known[name]) for name, some in rows.items()},
+            self._known,
+        )
 
     def _identities(self) -> dict[str, Any]:
-        """Return who was told to be who: numbers right, wrong, and robots that told it in full.
-
-        A track's two words are one robot's where they follow each other as a robot sends them.
-        """
-        robots = self.plan.robots
-        right: set[str] = set()
-        wrong = 0
-        by_track: dict[int, list[Word]] = {}
-        for word in self._told:
-            by_track.setdefault(word.track, []).append(word)
-        length = len(words_of(0, robots))
-        for words in by_track.values():
-            in_time = sorted(words, key=lambda word: word.start_s)
-            for first in range(len(in_time) - length + 1):
-                some = in_time[first : first + length]
-                if some[-1].start_s - some[0].start_s > _PAIR_S * (length - 1) + 1e-9:
-                    continue
-                number = number_of(tuple(word.word for word in some), robots)
-                if number is None:
-                    continue
-                told = names_of(robots)[number]
-                if told == some[-1].robot:
-                    right.add(told)
-                else:
-                    wrong += 1
-        return {"right": sorted(right), "wrong": wrong}
+        """Return who was told to be who: numbers right, wrong, and robots that told it in full."""
+        robots, names = self.plan.robots, names_of(self.plan.robots)
+        whom = {word.message: word.robots for word in self._told}
+        told = [
+            (names[number], all(names[number] in whom[word] for word in words))
+            for number, words in numbers_told(whom, robots)
+        ]
+        right = {name for name, is_right in told if is_right}
+        return {"right": sorted(right), "wrong": sum(not is_right for _, is_right in told)}
 
 
 def _standing(robot: str, pose: Pose) -> dict[str, Any]:
@@ -327,15 +342,6 @@ def _standing(robot: str, pose: Pose) -> dict[str, Any]:
     half_rad = 0.5 * math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
     turned = (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
     return PoseTruth(robot, 0.0, (x, y, z), turned, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)).record()
-
-
-def _nearest(track: Track, others_m: Array, names: Sequence[str]) -> str | None:
-    """Return the robot that a track follows: the likeliest, where one is within five σ."""
-    off_m = others_m - track.position_body_m
-    covariance = track.covariance[:3, :3] + _FLOOR_M**2 * np.eye(3)
-    chi2 = np.einsum("ni,ij,nj->n", off_m, np.linalg.inv(covariance), off_m)
-    best = int(np.argmin(chi2))
-    return names[best] if chi2[best] < _GATE_CHI2 else None
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ class Condition:
             "free": len(free),
             "free_found": sum(one[3] for one in free),
             "false_alarms": sum(record["false_alarms"] for record in self.records),
+            "parts": sum(record["parts"] for record in self.records),
             "sets_judged": len(self.plan.judged) * len(self.records),
             "range": _range_figures(free),
             "packets": len(packets),
@@ -65,6 +66,7 @@ class Condition:
             "told_in_full": self._told_in_full(),
             "identities_right": sum(len(record["identities"]["right"]) for record in self.records),
             "identities_wrong": sum(record["identities"]["wrong"] for record in self.records),
+            **self._tracks(),
             "shared_light_worst": max(
                 (one["worst_share"] for record in self.records for one in record["shared"].values()),
                 default=0.0,
@@ -85,6 +87,21 @@ class Condition:
                 found[why_of[robot]][0] += 1
                 found[why_of[robot]][1] += received
         return {why: counts for why, counts in found.items() if counts[0]}
+
+    def _tracks(self) -> dict[str, int]:
+        """Return how many tracks there are as runs end.
+
+        How many of them are off on the bearing of a robot whose flare is not its own, of nobody, of whom
+        another one is already.
+        """
+        each = [record["tracks"] for record in self.records]
+        known = [[robot for robot, _ in tracks if robot is not None] for tracks in each]
+        return {
+            "tracks": sum(map(len, each)),
+            "tracks_off": sum(robot is not None and off for tracks in each for robot, off in tracks),
+            "tracks_of_nobody": sum(map(len, each)) - sum(map(len, known)),
+            "tracks_twice": sum(len(tracks) - len(set(tracks)) for tracks in known),
+        }
 
     def _told_in_full(self) -> int:
         """Return how many robots said all words of who they are."""

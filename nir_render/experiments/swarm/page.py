@@ -13,14 +13,13 @@ from matplotlib.axes import Axes
 from nir_render.experiments.loop.ending import BAG, write_ending
 from nir_render.experiments.loop.runs import run_folder
 from nir_render.experiments.loop.shares import lower_limit
+from nir_render.experiments.swarm.film import show_run
 from nir_render.experiments.swarm.hall import BODIES
 from nir_render.experiments.swarm.judge import WHYS
 from nir_render.experiments.swarm.outcome import Condition, Outcome
-from nir_render.experiments.swarm.views import views_of
 from nir_render.export.mcap_file import export_mcap
 from nir_render.report.drawing import Drawing, legend, sheet, svg_of
 from nir_render.report.parts import Table, render_page
-from nir_render.report.pictures import png_uri
 from nir_render.report.style import FAINT, INK, MATPLOTLIB
 from nir_render.report.wording import counted, metres, share
 from nir_render.run.folder import POSES
@@ -34,7 +33,9 @@ RULES = {
     ),
     "recall": (
         "robots that are lit, of which a detection is within 3 px; of all, those that are hidden, cut, faint "
-        "and merged too, and of those that stand free."
+        "and merged too, and of those that stand free. False alarms are of no robot, lamp or mirror image; "
+        "parts are further detections of a robot of which a column hides a part, and which has one already: "
+        "a disc with a dark edge through it is taken for several, each merged, of hardly known range."
     ),
     "ranges": (
         "of robots that stand free and are lit all through the exposure, held against the Cramér–Rao bound "
@@ -42,8 +43,10 @@ RULES = {
         "median of the errors in place of their mean square. σ is what the detector claims."
     ),
     "packets": (
-        "sent in full while the observer looked; received if the track of that robot says the word. A word "
-        "that another one sent just then is misattributed, one that nobody sent is wrong."
+        "sent in full while the observer looked; received if the track of that robot says the word, read in "
+        "all five frames or in some. A word that another one sent just then is misattributed, one that "
+        "nobody sent is wrong. Tracks: of whom they are by truth, within five σ; off are those on the "
+        "bearing of a robot that is partly hidden, or has another within 4 px: its flux says a wrong range."
     ),
     "identity": (
         "each says its number once a minute: one word up to 128 robots, beyond that two, one after the "
@@ -73,7 +76,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
         else outcome.conditions[0]
     )
     run = run_folder(folder / shown.name, shown.records[0]["seed"])
-    views = views_of(run)
+    film, picture = show_run(run, folder)
     bag = None
     if find_spec("mcap") is not None and (run / POSES).is_file():
         bag = BAG
@@ -94,7 +97,8 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
         took=_took(outcome, figures),
         against=density_plot(figures),
         above=above_plot(shown),
-        views=None if views is None else png_uri(views),
+        film=film,
+        picture=picture,
         bag=bag,
         shown=f"{shown.plan.bodies}, {shown.plan.density_per_m2:g} per m², seed {shown.records[0]['seed']}",
         conditions=_conditions(outcome),
@@ -137,11 +141,13 @@ def _seen(figures: dict[str, Any]) -> Table:
             (*_where(one), _part(one["found"], one["lit"]), _part(one["free"], one["lit"]),
              _of(one["free_found"], one["free"]),
              *(share(could[why], more=1) for why in ("eclipsed", "merged", "hidden", "faint", "cut")),
-             share(one["within_4_px"], more=1), f"{one['false_alarms']} in {one['sets_judged']}")
+             share(one["within_4_px"], more=1), f"{one['false_alarms']} in {one['sets_judged']}",
+             f"{one['parts']} in {one['sets_judged']}")
         )  # fmt: skip
     headings = (
         "bodies", "per m²", "recall", "ceiling: stand free", "found of the free", "eclipsed", "merged",
         "hidden", "faint", "cut", "another within 4 px", "false alarms in sets",
+        "parts in sets",
     )  # fmt: skip
     return Table(headings, rows)
 
@@ -170,11 +176,13 @@ def _heard(figures: dict[str, Any]) -> Table:
             (*_where(one), _of(one["packets_received"], one["packets"]),
              *(f"{received} of {sent}" if sent else "–" for sent, received in by_sight),
              str(one["misattributed"]), str(one["wrong_words"]),
-             f"{one['identities_right']} of {one['told_in_full']}", str(one["identities_wrong"]))
+             f"{one['identities_right']} of {one['told_in_full']}", str(one["identities_wrong"]),
+             *(str(one[name]) for name in ("tracks", "tracks_off", "tracks_of_nobody", "tracks_twice")))
         )  # fmt: skip
     headings = (
         "bodies", "per m²", "packets received", "from the free", "from the merged", "from the hidden",
         "misattributed", "wrong words", "identities right", "identities wrong",
+        "tracks at the end", "off, on its bearing", "of nobody", "of one robot twice",
     )  # fmt: skip
     return Table(headings, rows)
 

@@ -27,7 +27,25 @@ _ANSWERS_WITHIN_S = 10
 _STARTS_WITHIN_S = 120
 _MAY_DIFFER = ("platform",)  # the processor: its bits may differ, its statistics do not
 MARK = ".seen-"  # not one of the names that a cache takes for a killed writer's, and removes in time
+DEATHS = 3  # of workers, that a job is given up after
+SCHEDULER_SETTINGS = {
+    "distributed.scheduler.allowed-failures": DEATHS - 1,
+    "distributed.scheduler.worker-saturation": 1.0,  # none waits at a worker, which may end after its job
+    "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
+}
 _THREADS = "start workers with '--nthreads 1', and '--nworkers' for more"
+
+
+@dataclass(frozen=True)
+class Scheduler:
+    """The scheduler of workers that run elsewhere.
+
+    `address` is as Dask writes it, tcp://host:8786; `threads` how many each worker computes with, None where
+    workers of one host share its cores.
+    """
+
+    address: str
+    threads: int | None = None
 
 
 class RefusedError(InputError):

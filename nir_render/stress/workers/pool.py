@@ -32,19 +32,22 @@ from nir_render.stress.job.execute import execute
 from nir_render.stress.jobs import Job, is_same, made_by_of
 from nir_render.stress.table import read_part, write_part
 from nir_render.stress.workers.cluster import (
+    SCHEDULER_SETTINGS,
     RefusedError,
+    Scheduler,
     Terms,
     check_this_worker,
     connected,
     terms_of,
     workers_beside,
 )
+from nir_render.stress.workers.recycle import JOBS, recycle
 from nir_render.transport.backend.cores import cores, thread_settings
 from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
 from perception import Estimator
 
-_DEATHS = 3
+PART_KIND = ".parquet"
 _STARTS = 4
 _MEMORY_LIMIT_BYTES = 256 * 2**20
 _ENDS_WITHIN_S = 5
@@ -57,8 +60,9 @@ class Work:
     """What all jobs of a campaign share.
 
     `scene` is what the jobs' settings change; `threads` how many each worker computes with, None where
-    workers of one host share its cores; `processor` that of the machine that asks. All paths are absolute,
-    those of the scene and of estimators too: workers have folders of their own.
+    workers of one host share its cores; `processor` that of the machine that asks; `jobs_per_process` how
+    many a worker does before it begins anew. All paths are absolute, those of the scene and of estimators
+    too: workers have folders of their own.
     """
 
     scene: Scene
@@ -68,6 +72,7 @@ class Work:
     light_limit_bytes: int
     threads: int | None
     processor: str
+    jobs_per_process: int = JOBS
 
 
 @dataclass(frozen=True)
@@ -80,13 +85,13 @@ class Done:
 
 def part_file(parts: Path, job: Job) -> Path:
     """Return where a job leaves its rows."""
-    return parts / f"{job.key}.parquet"
+    return parts / f"{job.key}{PART_KIND}"
 
 
 def run_jobs(
-    work: Work, jobs: Sequence[Job], workers: int, scratch: Path, scheduler: str | None = None
+    work: Work, jobs: Sequence[Job], workers: int, scratch: Path, scheduler: Scheduler | None = None
 ) -> Generator[Done]:
-    """Do jobs in `workers` processes, or by those of a `scheduler` at an address; yield each as it ends.
+    """Do jobs in `workers` processes, or by those of a `scheduler`; yield each as it ends.
 
     The first job of those that share light renders it; the others begin when it has ended, and find it in the
     cache. When the generator is closed, or an exception goes through it, the workers end.
@@ -100,11 +105,12 @@ def run_jobs(
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     settings = {
-        "distributed.scheduler.allowed-failures": _DEATHS - 1,
-        "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
+        **SCHEDULER_SETTINGS,
         "distributed.nanny.pre-spawn-environ": thread_settings(work.threads or 1),
         "temporary-directory": str(scratch),
     }
+    if scheduler is None:  # one that takes long to begin anew is not lost
+        settings["distributed.deploy.lost-worker-timeout"] = "1 hour"
     try:
         terms: Terms | None = None
         with contextlib.ExitStack() as stack:
@@ -113,7 +119,7 @@ def run_jobs(
                 client = stack.enter_context(_client(workers))
             else:
                 terms = stack.enter_context(terms_of((work.parts, work.light)))
-                client = stack.enter_context(connected(scheduler, terms))
+                client = stack.enter_context(connected(scheduler.address, terms))
             plugin = _plugin_name(work)
             _tell_workers(client, _Context(work, terms), plugin)
             if scheduler is not None:  # it outlives this campaign
@@ -144,7 +150,9 @@ def run_jobs(
                 # However it has ended: one that takes its workers along must not take the others along.
                 for follower in followers.pop(job.light, ()):
                     ending.add(submitted(follower))
-                yield Done(job, _fault(future))
+                problem = _fault(future)
+                del future  # what it told is then dropped, and a worker that has done enough may end
+                yield Done(job, problem)
     except (ClosedClientError, CommClosedError, CancelledError):
         raise InputError(_GONE) from None
     finally:
@@ -243,6 +251,7 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
         self._made_by: tuple[str, ...] = ()
         self._cache: LightCache | None = None
         self._threads = 0
+        self._jobs = 0
 
     def do(self, job: Job) -> None:
         """Do a job, and leave its file.
@@ -271,9 +280,16 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
                 "scene or of an estimator, the code or a version has changed or is another one there; "
                 "the same command goes on"
             )
+        self._jobs += 1
         scene = self.work.scene.with_(job.settings)
         rows, frames_sha256 = execute(scene, self._estimators, self._cache)
         write_part(part_file(self.work.parts, job), rows, frames_sha256)
+
+    def begin_anew_in_time(self) -> None:
+        """Have another process take the place of this one, where the job that ends is its last."""
+        worker = get_worker()
+        if self._jobs >= self.work.jobs_per_process and recycle(worker, worker.get_current_task()):
+            self._jobs = 0
 
     def _share_cores(self) -> None:
         """Take this worker's share of the cores; others may have come or gone since the last job."""
@@ -295,6 +311,8 @@ def _do(job: Job, plugin: str) -> str | None:
         raise
     except Exception as error:  # one job that fails must not take the others along
         return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    finally:
+        context.begin_anew_in_time()
     return None
 
 

@@ -10,11 +10,13 @@ seldom at each of several vertices hardly ever gets the paths that it needs. Gro
 are therefore dealt out to *tiers*: each path serves one tier, as if the others were off (`kernel.begin`).
 """
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.camera.by_spectrum import spectrum_key
 from nir_render.camera.optics.response import response
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.emission import emission_units
@@ -196,7 +198,12 @@ def group_power(snapshot: Snapshot, camera: Camera) -> NDArray[np.float64]:
     or the filter change, which otherwise matter only afterwards. It moves nothing but noise.
     """
     known = snapshot.emitters.values()
-    brought = np.array([emission_units(one) * float(response(camera, one)(0.0)) for one in known])
+    answers: dict[Hashable, float] = {}
+    for one in known:
+        key = spectrum_key(one)
+        if key not in answers:
+            answers[key] = float(response(camera, one)(0.0))
+    brought = np.array([emission_units(one) * answers[spectrum_key(one)] for one in known])
     strongest = brought.max() if brought.size else 1.0
     steps = np.round(np.log(np.maximum(brought, 1e-30) / max(strongest, 1e-30)) / np.log(_STEP))
     return np.asarray(float(_STEP) ** np.maximum(steps, -_STEPS))

@@ -23,14 +23,8 @@ SEED_LOG_RANGE, SEED_RAD = 0.3, 0.1
 SEED_COSINE2 = 1.0 - 2.0 * SEED_RAD**2
 FIT_STEPS, HOPELESS_CHI2, MOST_MATCHES = 8, 25.0, 4
 STEP, SETTLED2 = 1e-4, 1e-4
-
-
-@compiled
-def log_root_reflectance(kind: int, parameter: float, cosine: float) -> float:
-    """Return ½ ln R at an angle of incidence; the parameter is −½ ln R of a constant one, else the index."""
-    if kind == CONSTANT:
-        return -parameter
-    return 0.5 * math.log(of_dielectric(kind, parameter, cosine))
+MOST_STEP = (0.2, 0.2, 1.0, 0.3)
+ROUNDED = 1.0 - 1e-9
 
 
 @compiled
@@ -51,26 +45,46 @@ def of_dielectric(kind: int, index: float, cosine: float) -> float:
 
 
 @compiled
-def residual(
-    flares: Flares, image: int, plane: Array, kind: int, x: float, y: float, z: float
-) -> tuple[float, float, float]:
-    """Return how far an image lies from where a plane shows a place: left, up, and in ln range.
-
-    `plane` holds n (3), c and the parameter of the reflectance.
-    """
+def shown_at(
+    flares: Flares, image: int, plane: Array, x: float, y: float, z: float
+) -> tuple[float, float, float, float, float]:
+    """Return where a plane shows a place: left, up and along an image's axes, how far, and ray · normal."""
     n_x, n_y, n_z = plane[0], plane[1], plane[2]
     twice_m = 2.0 * (((plane[3] - n_x * x) - n_y * y) - n_z * z)
     off_x = x + twice_m * n_x - flares.origin_m[image, 0]
     off_y = y + twice_m * n_y - flares.origin_m[image, 1]
     off_z = z + twice_m * n_z - flares.origin_m[image, 2]
     axes = flares.axes[image]
-    path_m = math.sqrt(off_x**2 + off_y**2 + off_z**2)
-    cosine = off_x * n_x + off_y * n_y + off_z * n_z
     left = axes[0, 0] * off_x + axes[0, 1] * off_y + axes[0, 2] * off_z
     up = axes[1, 0] * off_x + axes[1, 1] * off_y + axes[1, 2] * off_z
     along = axes[2, 0] * off_x + axes[2, 1] * off_y + axes[2, 2] * off_z
-    by_reflectance = log_root_reflectance(kind, plane[4], abs(cosine) / path_m)
-    off = math.log(flares.seems_m[image] / path_m) + by_reflectance
+    across_m = off_x * n_x + off_y * n_y + off_z * n_z
+    return left, up, along, math.sqrt(off_x**2 + off_y**2 + off_z**2), across_m
+
+
+@compiled
+def off_in_range(
+    flares: Flares, image: int, plane: Array, kind: int, path_m: float, across_m: float
+) -> float:
+    """Return ln of how much farther an image seems than its path, but for the light that the mirror takes."""
+    off = math.log(flares.seems_m[image] / path_m)
+    if kind == CONSTANT:
+        return float(off - plane[4])
+    return off + 0.5 * math.log(of_dielectric(kind, plane[4], abs(across_m) / path_m))
+
+
+@compiled
+def residual(
+    flares: Flares, image: int, plane: Array, kind: int, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """Return how far an image lies from where a plane shows a place: left, up, and in ln range.
+
+    `plane` holds n (3), c and the parameter of the reflectance: −½ ln R of a constant one, else the index.
+    """
+    left, up, along, path_m, across_m = shown_at(flares, image, plane, x, y, z)
+    off = off_in_range(flares, image, plane, kind, path_m, across_m)
+    if along > 0.0:  # which is quicker
+        return -math.atan(left / along), -math.atan(up / along), off
     return -math.atan2(left, along), -math.atan2(up, along), off
 
 
@@ -90,20 +104,16 @@ def pair_covariance(
         for m in range(3):
             slope[m, k] = (moved[m] - off[m]) / STEP
     for a in range(3):
-        shared_a = flares.common[image] if a == 2 else 0.0  # the parent's flux is also the image's
-        for k in range(3):
-            shared_a += slope[a, k] * flares.moved_m[parent, k]
         for b in range(a + 1):
+            total = flares.angular_rad2[image, a, b] if a < 2 else 0.0
+            shared_a = flares.common[image] if a == 2 else 0.0  # the parent's flux is also the image's
             shared_b = flares.common[image] if b == 2 else 0.0
             for k in range(3):
+                shared_a += slope[a, k] * flares.moved_m[parent, k]
                 shared_b += slope[b, k] * flares.moved_m[parent, k]
-            total = shared_a * shared_b
-            for k in range(3):
                 for m in range(3):
                     total += slope[a, k] * flares.noise_m2[parent, k, m] * slope[b, m]
-            if a < 2:
-                total += flares.angular_rad2[image, a, b]
-            covariance[a, b] = covariance[b, a] = total
+            covariance[a, b] = covariance[b, a] = total + shared_a * shared_b
     covariance[2, 2] += flares.noise[image] ** 2
     return off
 
@@ -128,6 +138,18 @@ def invert(matrix: Array) -> float:
 
 
 @compiled
+def add_form_into(total: Array, slope: Array, matrix: Array) -> None:
+    """Add slopeᵀ · matrix · slope."""
+    for a in range(slope.shape[0]):
+        for m in range(slope.shape[1]):
+            weighed = 0.0
+            for b in range(slope.shape[0]):
+                weighed += matrix[a, b] * slope[b, m]
+            for k in range(slope.shape[1]):
+                total[k, m] += slope[a, k] * weighed
+
+
+@compiled
 def fit_plane(
     flares: Flares, parents: Indices, images: Indices, plane: Array, kind: int, prior: Array, precision: Array
 ) -> tuple[float, float, Array]:
@@ -148,77 +170,57 @@ def fit_plane(
     χ², prior included; ln of the density of the residuals of all pairs at 0; the covariance of the unknowns,
     shape (4, 4), which is NaN where the fit fails.
     """
-    information, score = np.empty((4, 4)), np.empty(4)
-    covariance, slope, turned = np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 3))
-    chi2, log_peak, settled = 0.0, 0.0, False
-    trial, axes = np.empty(5), np.empty((2, 3))
+    # Unknowns, and behind them the residual as one more column: [H | r], and [H | r]ᵀ C⁻¹ [H | r].
+    slope, of_prior, normal = np.empty((3, 5)), np.eye(4, 5), np.empty((5, 5))
+    covariance, turned, information = np.empty((3, 3)), np.empty((3, 3)), np.empty((4, 4))
+    log_peak, settled = 0.0, False
+    # How a step of each unknown moves the plane: its angles to the left and upwards, c, the parameter.
+    trial, moves = np.empty(5), np.eye(4, 5, 1)
     for step in range(FIT_STEPS):
         across_m = math.hypot(plane[0], plane[1])
-        axes[0, 0], axes[0, 1], axes[0, 2] = 0.0, 1.0, 0.0
+        moves[0, 0], moves[0, 1] = 0.0, 1.0
         if across_m > 1e-9:
-            axes[0, 0], axes[0, 1] = -plane[1] / across_m, plane[0] / across_m
-        axes[1, 0] = plane[1] * axes[0, 2] - plane[2] * axes[0, 1]
-        axes[1, 1] = plane[2] * axes[0, 0] - plane[0] * axes[0, 2]
-        axes[1, 2] = plane[0] * axes[0, 1] - plane[1] * axes[0, 0]
-        from_prior = np.zeros(4)
-        for k in range(3):
-            from_prior[0] += axes[0, k] * (plane[k] - prior[k])
-            from_prior[1] += axes[1, k] * (plane[k] - prior[k])
-        from_prior[2], from_prior[3] = plane[3] - prior[3], plane[4] - prior[4]
-        information[:] = precision
-        chi2, log_peak = 0.0, 0.0
-        for a in range(4):
-            score[a] = 0.0
-            for b in range(4):
-                score[a] -= precision[a, b] * from_prior[b]
-                chi2 += from_prior[a] * precision[a, b] * from_prior[b]
+            moves[0, 0], moves[0, 1] = -plane[1] / across_m, plane[0] / across_m
+        moves[1, 0], moves[1, 1] = -plane[2] * moves[0, 1], plane[2] * moves[0, 0]
+        moves[1, 2] = plane[0] * moves[0, 1] - plane[1] * moves[0, 0]
+        for unknown in range(4):
+            of_prior[unknown, 4] = 0.0
+            for k in range(5):
+                of_prior[unknown, 4] += moves[unknown, k] * (plane[k] - prior[k])
+        normal[:] = 0.0
+        add_form_into(normal, of_prior, precision)
+        log_peak = 0.0
         for pair in range(len(parents)):
             i, j = parents[pair], images[pair]
             x, y, z = flares.place_m[i, 0], flares.place_m[i, 1], flares.place_m[i, 2]
             off = pair_covariance(flares, i, j, plane, kind, turned, covariance)
             for unknown in range(4):
-                trial[:] = plane
-                if unknown < 2:
-                    for k in range(3):
-                        trial[k] += STEP * axes[unknown, k]
-                else:
-                    trial[unknown + 1] += STEP
+                for k in range(5):
+                    trial[k] = plane[k] + STEP * moves[unknown, k]
                 moved = residual(flares, j, trial, kind, x, y, z)
                 for m in range(3):
                     slope[m, unknown] = (moved[m] - off[m]) / STEP
+            slope[0, 4], slope[1, 4], slope[2, 4] = off
             log_peak -= 0.5 * (invert(covariance) + 3.0 * math.log(2.0 * math.pi))
-            for a in range(3):
-                for b in range(3):
-                    chi2 += off[a] * covariance[a, b] * off[b]
-                    for k in range(4):
-                        score[k] -= slope[a, k] * covariance[a, b] * off[b]
-                        for m in range(4):
-                            information[k, m] += slope[a, k] * covariance[a, b] * slope[b, m]
+            add_form_into(normal, slope, covariance)
         for k in range(4):
-            if not information[k, k] > 0.0:
-                return chi2, log_peak, np.full((4, 4), np.nan)
+            if not normal[k, k] > 0.0:
+                return normal[4, 4], log_peak, np.full((4, 4), np.nan)
+        information[:] = normal[:4, :4]
         invert(information)
         # What its own pairs contradict after three steps is not worth polishing.
-        if settled or step == FIT_STEPS - 1 or (step > 2 and chi2 > HOPELESS_CHI2 * len(parents)):
+        if settled or step == FIT_STEPS - 1 or (step > 2 and normal[4, 4] > HOPELESS_CHI2 * len(parents)):
             break
-        length, settled = 0.0, True
+        settled = True
         for k in range(4):
             change = 0.0
             for m in range(4):
-                change += information[k, m] * score[m]
+                change -= information[k, m] * normal[m, 4]
             settled &= change**2 < SETTLED2 * information[k, k]
-            if k < 2:
-                for m in range(3):
-                    plane[m] += min(max(change, -0.2), 0.2) * axes[k, m]
-            elif k == 2:
-                plane[3] += min(max(change, -1.0), 1.0)
-            else:
-                plane[4] += min(max(change, -0.3), 0.3)
-        for k in range(3):
-            length += plane[k] ** 2
-        for k in range(3):
-            plane[k] /= math.sqrt(length)
-    return chi2, log_peak, information
+            for m in range(5):
+                plane[m] += min(max(change, -MOST_STEP[k]), MOST_STEP[k]) * moves[k, m]
+        plane[:3] /= math.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+    return normal[4, 4], log_peak, information
 
 
 @compiled
@@ -226,34 +228,38 @@ def seeds_of_kind(
     flares: Flares, parents: Indices, images: Indices, kind: int, parameters: tuple[float, ...]
 ) -> Array:
     """Return the plane of each pair for each reflectance of some, shape (seeds, 5)."""
-    found = np.empty((len(parents) * len(parameters), 5))
-    count = 0
-    normal = np.empty(3)
+    total, count = len(parents), 0
+    found = np.empty((total * len(parameters), 5))
+    # The normal is s h + e, h the image as seen, e from the parent to the camera: h², e h, e².
+    seen_m, apart_m, known = np.empty((total, 3)), np.empty((total, 3)), np.zeros((3, total))
+    root, cosine, normal = np.empty(total), np.empty(total), np.empty(3)
+    for pair in range(total):
+        i, j = parents[pair], images[pair]
+        known[0, pair] = flares.seems_m[j] ** 2
+        for k in range(3):
+            seen_m[pair, k] = flares.seems_m[j] * flares.axes[j, 2, k]
+            apart_m[pair, k] = flares.origin_m[j, k] - flares.place_m[i, k]
+            known[1, pair] += seen_m[pair, k] * apart_m[pair, k]
+            known[2, pair] += apart_m[pair, k] ** 2
     for parameter in parameters:
-        for pair in range(len(parents)):
+        cosine[:] = 0.8
+        for _ in range(5):
+            for pair in range(total):
+                s = math.sqrt(of_dielectric(kind, parameter, cosine[pair]))
+                length2 = s**2 * known[0, pair] + 2.0 * s * known[1, pair] + known[2, pair]
+                root[pair] = s
+                cosine[pair] = (s * known[0, pair] + known[1, pair]) / math.sqrt(length2 * known[0, pair])
+        for pair in range(total):
             i, j = parents[pair], images[pair]
-            # The normal is s h + e, h the image as seen, e from the parent to the camera: h², e h, e².
-            seems2, mixed, apart2 = flares.seems_m[j] ** 2, 0.0, 0.0
-            for k in range(3):
-                apart_m = flares.origin_m[j, k] - flares.place_m[i, k]
-                mixed += flares.seems_m[j] * flares.axes[j, 2, k] * apart_m
-                apart2 += apart_m**2
-            cosine, s = 0.8, 0.0
-            for _ in range(5):
-                s = math.sqrt(of_dielectric(kind, parameter, cosine))
-                length2 = s**2 * seems2 + 2.0 * s * mixed + apart2
-                cosine = (s * seems2 + mixed) / math.sqrt(length2 * seems2)
             length, c, near, far = 0.0, 0.0, 0.0, 0.0
             for k in range(3):
-                seen = s * flares.seems_m[j] * flares.axes[j, 2, k]
-                normal[k] = seen + flares.origin_m[j, k] - flares.place_m[i, k]
+                normal[k] = root[pair] * seen_m[pair, k] + apart_m[pair, k]
                 length += normal[k] ** 2
                 c += normal[k] * (flares.place_m[i, k] + 0.5 * normal[k])
                 near += normal[k] * flares.origin_m[j, k]
                 far += normal[k] * flares.place_m[i, k]
-            length = math.sqrt(length)
-            c = c / length
-            if c - near / length > NEAREST_MIRROR_M and far / length < c and cosine > 0.0:
+            length, c = math.sqrt(length), c / math.sqrt(length)
+            if c - near / length > NEAREST_MIRROR_M and far / length < c and cosine[pair] > 0.0:
                 for k in range(3):
                     found[count, k] = normal[k] / length
                 found[count, 3], found[count, 4] = c, parameter
@@ -262,81 +268,93 @@ def seeds_of_kind(
 
 
 @compiled
-def matched(
-    flares: Flares, parents: Indices, images: Indices, plane: Array, kind: int, gate_chi2: float
-) -> tuple[Indices, Indices, float]:
-    """Tell which of some images show which of some parents in a plane, one to one, best first.
+def match_all(
+    flares: Flares, parents: Indices, images: Indices, planes: Array, kind: int, gate_chi2: float
+) -> tuple[Indices, Indices, Array]:
+    """Tell which of some images show which of some parents in each of some planes, one to one, best first.
 
     Where `gate_chi2` is 0 the gate is a coarse one, for planes that are but guessed.
 
     Returns
     -------
-    Pairs of parents and images, same shape, and how well they agree in all, the less the better.
+    Pairs of parents and images, shape (planes, 2, most); how many, and how well they agree in all, the less
+    the better, shape (planes,).
     """
-    columns = len(images)
-    most = min(len(parents), columns)
-    who, whom = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
+    rows, columns = len(parents), len(images)
+    pairs = np.empty((len(planes), 2, min(rows, columns)), dtype=np.int64)
+    count, total = np.zeros(len(planes), dtype=np.int64), np.zeros(len(planes))
     # Those that lie within the gate are few: each with its row and column, and how badly it agrees.
-    found, misfit = 0, np.empty(len(parents) * columns)
+    misfit = np.empty(rows * columns)
     at_row, at_column = np.empty(len(misfit), dtype=np.int64), np.empty(len(misfit), dtype=np.int64)
-    seen, near = np.empty((6, columns)), np.empty(columns, dtype=np.bool_)
+    seen, near = np.empty((7, columns)), np.empty(columns, dtype=np.bool_)
     for column in range(columns):
         for k in range(3):
             seen[k, column] = flares.axes[images[column], 2, k]
             seen[3 + k, column] = flares.origin_m[images[column], k]
-    slope, covariance = np.empty((3, 3)), np.empty((3, 3))
-    for row in range(len(parents)):
-        i = parents[row]
-        x, y, z = flares.place_m[i, 0], flares.place_m[i, 1], flares.place_m[i, 2]
-        before_m = plane[3] - plane[0] * x - plane[1] * y - plane[2] * z
-        if before_m <= 0.0:
-            continue
-        # Most images are far from where they would have to be: that is seen without a root or an angle.
-        shown_x = x + 2.0 * before_m * plane[0]
-        shown_y = y + 2.0 * before_m * plane[1]
-        shown_z = z + 2.0 * before_m * plane[2]
-        for column in range(columns):
-            out_x = shown_x - seen[3, column]
-            out_y = shown_y - seen[4, column]
-            out_z = shown_z - seen[5, column]
-            along = seen[0, column] * out_x + seen[1, column] * out_y + seen[2, column] * out_z
-            length2 = out_x**2 + out_y**2 + out_z**2
-            near[column] = (along > 0.0) & (along**2 >= SEED_COSINE2 * length2)
-        for column in range(columns):
-            if not near[column] or images[column] == i:
+        seen[6, column] = flares.seems_m[images[column]] ** 2
+    slope, covariance, apart, form = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 1)), np.empty((1, 1))
+    for n in range(len(planes)):
+        plane, found = planes[n], 0
+        # A mirror takes light and gives none: nearer than its path no image seems, but for the gate.
+        least2, most2 = ROUNDED * math.exp(-2.0 * SEED_LOG_RANGE), np.inf
+        if kind == CONSTANT:
+            least2 *= math.exp(2.0 * plane[4])
+            most2 = math.exp(2.0 * (plane[4] + SEED_LOG_RANGE)) / ROUNDED
+        for row in range(rows):
+            i = parents[row]
+            x, y, z = flares.place_m[i, 0], flares.place_m[i, 1], flares.place_m[i, 2]
+            before_m = plane[3] - plane[0] * x - plane[1] * y - plane[2] * z
+            if before_m <= 0.0:
                 continue
-            j = images[column]
-            off = residual(flares, j, plane, kind, x, y, z)
-            if abs(off[0]) > SEED_RAD or abs(off[1]) > SEED_RAD or abs(off[2]) > SEED_LOG_RANGE:
-                continue
-            if gate_chi2 == 0.0:
-                chi2 = (off[0] ** 2 + off[1] ** 2) / SEED_RAD**2 + (off[2] / SEED_LOG_RANGE) ** 2
-            else:
-                pair_covariance(flares, i, j, plane, kind, slope, covariance)
-                invert(covariance)
-                chi2 = 0.0
-                for a in range(3):
-                    for b in range(3):
-                        chi2 += off[a] * covariance[a, b] * off[b]
-            if gate_chi2 == 0.0 or chi2 < gate_chi2:
-                misfit[found], at_row[found], at_column[found] = chi2, row, column
-                found += 1
-    count, total = 0, 0.0
-    while count < most:
-        best, at = np.inf, -1
-        for one in range(found):
-            if misfit[one] < best:
-                best, at = misfit[one], one
-        if at < 0:
-            break
-        row, column = at_row[at], at_column[at]
-        who[count], whom[count] = parents[row], images[column]
-        for one in range(found):
-            if at_row[one] == row or at_column[one] == column:
-                misfit[one] = np.inf
-        total += best
-        count += 1
-    return who[:count], whom[:count], total
+            # Most images are far from where they would have to be: that is seen without a root or an angle.
+            shown_x = x + 2.0 * before_m * plane[0]
+            shown_y = y + 2.0 * before_m * plane[1]
+            shown_z = z + 2.0 * before_m * plane[2]
+            for column in range(columns):
+                out_x = shown_x - seen[3, column]
+                out_y = shown_y - seen[4, column]
+                out_z = shown_z - seen[5, column]
+                along = seen[0, column] * out_x + seen[1, column] * out_y + seen[2, column] * out_z
+                length2 = out_x**2 + out_y**2 + out_z**2
+                aside = (along > 0.0) & (along**2 >= SEED_COSINE2 * length2)
+                beyond = (seen[6, column] >= least2 * length2) & (seen[6, column] <= most2 * length2)
+                near[column] = aside & beyond
+            for column in range(columns):
+                j = images[column]
+                if not near[column] or j == i:
+                    continue
+                left, up, along, path_m, across_m = shown_at(flares, j, plane, x, y, z)
+                off = off_in_range(flares, j, plane, kind, path_m, across_m)
+                if abs(off) > SEED_LOG_RANGE:
+                    continue
+                left, up = -math.atan2(left, along), -math.atan2(up, along)
+                if abs(left) > SEED_RAD or abs(up) > SEED_RAD:
+                    continue
+                chi2 = (left**2 + up**2) / SEED_RAD**2 + (off / SEED_LOG_RANGE) ** 2
+                if gate_chi2 > 0.0:
+                    pair_covariance(flares, i, j, plane, kind, slope, covariance)
+                    invert(covariance)
+                    apart[0, 0], apart[1, 0], apart[2, 0], form[:] = left, up, off, 0.0
+                    add_form_into(form, apart, covariance)
+                    chi2 = form[0, 0]
+                if gate_chi2 == 0.0 or chi2 < gate_chi2:
+                    misfit[found], at_row[found], at_column[found] = chi2, row, column
+                    found += 1
+        while count[n] < pairs.shape[2]:
+            best, at = np.inf, -1
+            for one in range(found):
+                if misfit[one] < best:
+                    best, at = misfit[one], one
+            if at < 0:
+                break
+            row, column = at_row[at], at_column[at]
+            pairs[n, 0, count[n]], pairs[n, 1, count[n]] = parents[row], images[column]
+            for one in range(found):
+                if at_row[one] == row or at_column[one] == column:
+                    misfit[one] = np.inf
+            total[n] += best
+            count[n] += 1
+    return pairs, count, total
 
 
 @compiled
@@ -357,44 +375,25 @@ def fit_all(
     for n in range(len(planes)):
         plane, kind, prior, precision = planes[n], kinds[n], priors[n], precisions[n]
         least = 1 if precision[0, 0] > 0.0 else 2
-        parents, shown, _ = matched(flares, robots, images, plane, kind, 0.0)
+        shown, many, _ = match_all(flares, robots, images, planes[n : n + 1], kind, 0.0)
         for _ in range(MOST_MATCHES):
-            if len(parents) < least:
+            if many[0] < least:
                 break
-            fitted = fit_plane(flares, parents, shown, plane, kind, prior, precision)
-            found[n, 0], found[n, 1], covariance = fitted
+            who, whom = shown[0, 0, : many[0]], shown[0, 1, : many[0]]
+            found[n, 0], found[n, 1], covariance = fit_plane(flares, who, whom, plane, kind, prior, precision)
             holds = np.diag(covariance).min() > 0.0
-            for j in shown:
+            for j in whom:
                 o = flares.origin_m[j]
                 holds &= plane[3] - plane[0] * o[0] - plane[1] * o[1] - plane[2] * o[2] > NEAREST_MIRROR_M
             if not holds:
                 break
-            again, whom, _ = matched(flares, robots, images, plane, kind, GATE_CHI2)
-            same = len(again) == len(parents)
-            for one in range(len(again)):
-                same &= ((parents == again[one]) & (shown == whom[one])).any()
+            shown, many, _ = match_all(flares, robots, images, planes[n : n + 1], kind, GATE_CHI2)
+            same = many[0] == len(who)
+            for one in range(many[0]):
+                same &= ((who == shown[0, 0, one]) & (whom == shown[0, 1, one])).any()
             if same:
-                count[n] = len(parents)
-                pairs[n, 0, : count[n]], pairs[n, 1, : count[n]] = parents, shown
+                count[n] = many[0]
+                pairs[n, 0, : count[n]], pairs[n, 1, : count[n]] = who, whom
                 covariances[n] = covariance
                 break
-            parents, shown = again, whom
     return pairs, count, found, covariances
-
-
-@compiled
-def explained_by(
-    flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int
-) -> tuple[Indices, Array, Indices]:
-    """Return how many images each plane explains, how badly, and a mark of which pairs; shapes (seeds,).
-
-    A seed has the noise of one or two pairs, and that of a dielectric a guessed index, so gates are wide.
-    """
-    count, misfit = np.empty(len(seeds), dtype=np.int64), np.empty(len(seeds))
-    mark = np.empty(len(seeds), dtype=np.int64)
-    for seed in range(len(seeds)):
-        gate_chi2 = SEED_GATE_CHI2 if kind == CONSTANT else 0.0
-        who, whom, misfit[seed] = matched(flares, parents, images, seeds[seed], kind, gate_chi2)
-        count[seed] = len(who)
-        mark[seed] = ((who + 1) * (whom + 31) ** 4).sum()  # of which pairs, in whatever order
-    return count, misfit, mark

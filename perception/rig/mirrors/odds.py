@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
 from perception.rig.mirrors.flares import Flares
 from perception.rig.mirrors.model import CONSTANT, fit_plane
 
@@ -22,29 +23,34 @@ LOSS_PRIOR, LOSS_SIGMA = math.log(0.15), 1.2
 
 INDEX_PRIOR, INDEX_SIGMA = 1.5, 0.08
 
-_HEIGHT_SIGMA_M = 0.02
-_SAME_HEIGHT = 0.8
-_LOG_RANGE_SPAN = math.log(100.0)
+ONE_ROBOT_M = 0.25
+
+HEIGHT_SIGMA_M = 0.02
+SAME_HEIGHT = 0.8
+LOG_RANGE_SPAN = math.log(100.0)
 
 
+@compiled
 def log_chances(flares: Flares, count: int) -> Array:
     """Return ln of the density of robots where each flare is, per rad² and unit of ln range, shape (count,).
 
     As many as there are flares, in any direction about the vertical and at any range alike; four of five as
     high as the others, as on a floor.
     """
-    range_m = flares.seems_m[:count]
-    apart_m = range_m[:, None] * flares.axes[:count, 2]
-    height_m = flares.origin_m[:count, 2] + apart_m[:, 2]
-    of_all_m = np.concatenate([height_m, flares.place_m[count:, 2]])
-    middle_m = float(np.median(of_all_m))
-    spread_m = max(_HEIGHT_SIGMA_M, 1.5 * float(np.median(abs(of_all_m - middle_m))))
-    sigma_rad = np.hypot(spread_m / range_m, np.sqrt(flares.angular_rad2[:count, 1, 1]))
-    off = (height_m - middle_m) / range_m / sigma_rad
-    level = np.exp(-0.5 * off**2) / (math.sqrt(2.0 * math.pi) * sigma_rad)
-    cosine = np.sqrt(np.maximum(1.0 - (apart_m[:, 2] / range_m) ** 2, 1e-6))
-    elevation = _SAME_HEIGHT * level + (1.0 - _SAME_HEIGHT) * 0.5 * cosine
-    return np.asarray(np.log(count * elevation / (2.0 * math.pi * cosine) / _LOG_RANGE_SPAN))
+    found, height_m = np.empty(count), flares.place_m[:, 2].copy()
+    for k in range(count):
+        height_m[k] = flares.origin_m[k, 2] + flares.seems_m[k] * flares.axes[k, 2, 2]
+    middle_m = np.median(height_m)
+    spread_m = max(HEIGHT_SIGMA_M, 1.5 * np.median(np.abs(height_m - middle_m)))
+    for k in range(count):
+        range_m, up = flares.seems_m[k], flares.axes[k, 2, 2]
+        sigma_rad = math.hypot(spread_m / range_m, math.sqrt(flares.angular_rad2[k, 1, 1]))
+        off = (height_m[k] - middle_m) / range_m / sigma_rad
+        level = math.exp(-0.5 * off**2) / (math.sqrt(2.0 * math.pi) * sigma_rad)
+        cosine = math.sqrt(max(1.0 - up**2, 1e-6))
+        elevation = SAME_HEIGHT * level + (1.0 - SAME_HEIGHT) * 0.5 * cosine
+        found[k] = math.log(count * elevation / (2.0 * math.pi * cosine) / LOG_RANGE_SPAN)
+    return found
 
 
 def log_parameter_prior(parameter: float, sigma: float, kind: int) -> float:
@@ -89,17 +95,61 @@ def log_seen(flares: Flares, robots: Indices, parents: Indices, plane: Array, ki
 
     What share of robots a mirror shows depends on how large it is: any share is as probable beforehand.
     """
-    farthest_m = float(flares.seems_m[:count].max())
-    # Whoever has an image lies before the plane.
-    beyond_m = plane[3] - flares.place_m[robots] @ plane[:3]
-    image_m = flares.place_m[robots] + 2.0 * beyond_m[:, None] * plane[:3]
-    seems_m = np.sqrt((image_m**2).sum(axis=1)) * math.exp(plane[4] if kind == CONSTANT else 1.3)
-    shown = (beyond_m > 0.0) & (seems_m < farthest_m)
-    seen = set(parents.tolist())
-    unseen = sum(robot not in seen for robot in robots[shown].tolist())
-    return log_share(len(parents), unseen)
+    return log_share(len(parents), _unseen(flares, robots, parents, plane, kind, count))
+
+
+@compiled
+def _unseen(flares: Flares, robots: Indices, parents: Indices, plane: Array, kind: int, count: int) -> int:
+    """Return how many robots have no image, though it would be brighter than the dimmest flare."""
+    longer = math.exp(plane[4] if kind == CONSTANT else 1.3)
+    farthest_m, unseen = flares.seems_m[:count].max(), 0
+    for robot in robots:
+        place_m = flares.place_m[robot]
+        # Whoever has an image lies before the plane.
+        beyond_m = plane[3] - (place_m[0] * plane[0] + place_m[1] * plane[1] + place_m[2] * plane[2])
+        image2 = 0.0
+        for k in range(3):
+            image2 += (place_m[k] + 2.0 * beyond_m * plane[k]) ** 2
+        if beyond_m > 0.0 and math.sqrt(image2) * longer < farthest_m and not (parents == robot).any():
+            unseen += 1
+    return unseen
 
 
 def log_share(seen: int, unseen: int) -> float:
     """Return ln of the probability of just these, of a share between 0 and 1: ∫ s^k (1 − s)^(n−k) ds."""
     return math.lgamma(seen + 1.0) + math.lgamma(unseen + 1.0) - math.lgamma(seen + unseen + 2.0)
+
+
+@compiled
+def one_of_each(flares: Flares, parents: Indices, images: Indices) -> Indices:
+    """Return which pairs to weigh: one for each robot, as LEDs of one body stand in step with each other.
+
+    That two robots mirror each other is one coincidence, however many LEDs they carry; that a robot's LEDs
+    mirror each other is none.
+    """
+    kept = np.empty(len(parents), dtype=np.int64)
+    count = 0
+    for k in range(len(parents)):
+        known = _of_one_robot(flares, parents[k], images[k])
+        for one in kept[:count]:
+            known |= _of_one_robot(flares, parents[k], parents[one])
+        if not known:
+            kept[count] = k
+            count += 1
+    return kept[:count]
+
+
+@compiled
+def _of_one_robot(flares: Flares, i: int, j: int) -> bool:
+    """Tell whether two flares may be LEDs of one robot: they stand within 25 cm.
+
+    How far apart they are along the line of sight is known no better than by their fluxes.
+    """
+    apart2, along_m, moved2 = 0.0, 0.0, 0.0
+    for k in range(3):
+        apart_m = flares.place_m[i, k] - flares.place_m[j, k]
+        apart2 += apart_m**2
+        along_m += apart_m * flares.axes[i, 2, k]
+        moved2 += flares.moved_m[i, k] ** 2 + flares.moved_m[j, k] ** 2
+    across_m = math.sqrt(max(apart2 - along_m**2, 0.0))
+    return across_m < ONE_ROBOT_M and abs(along_m) < ONE_ROBOT_M + 2.0 * math.sqrt(moved2)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.rig.mirrors.flares import Flares
-from perception.rig.mirrors.model import NEAREST_MIRROR_M, explained_by
+from perception.rig.mirrors.model import CONSTANT, NEAREST_MIRROR_M, ROUNDED, SEED_GATE_CHI2, match_all
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -15,8 +15,42 @@ Indices = NDArray[np.int64]
 LEAST_ROOT, MOST_ROOT = 0.1, 1.03
 """√R of a mirror worth looking for, and a margin for noise."""
 
+DIM_RATIO = 1.5
 PARALLEL_RAD = 0.08
+PARALLEL_COSINE = 1.0 - 0.5 * PARALLEL_RAD**2
 SAME_PLANE = 0.02
+
+
+@compiled
+def plausible_pairs(flares: Flares, robots: Indices, images: Indices) -> tuple[Indices, Indices]:
+    """Return whom each flare may show: an image is farther than what it shows, from anywhere before it."""
+    most, count = len(robots) * len(images), 0
+    parents, shown = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64)
+    for i in robots:
+        for j in images:
+            if i != j and flares.seems_m[j] > parted_m(flares, i, j):
+                parents[count], shown[count] = i, j
+                count += 1
+    return parents[:count], shown[:count]
+
+
+@compiled
+def parted_m(flares: Flares, i: int, j: int) -> float:
+    """Return how far a flare is from where the bearing of another counts from."""
+    apart2 = 0.0
+    for k in range(3):
+        apart2 += (flares.place_m[i, k] - flares.origin_m[j, k]) ** 2
+    return math.sqrt(apart2)
+
+
+@compiled
+def dim_pairs(flares: Flares, parents: Indices, images: Indices) -> tuple[Indices, Indices]:
+    """Return the pairs with a dim image: a dielectric takes more than half of the light but when grazed."""
+    dim = np.empty(len(parents), dtype=np.bool_)
+    for pair in range(len(parents)):
+        near_m = parted_m(flares, parents[pair], images[pair])
+        dim[pair] = flares.seems_m[images[pair]] > DIM_RATIO * near_m
+    return parents[dim], images[dim]
 
 
 @compiled
@@ -52,20 +86,25 @@ def seeds_of_constant(flares: Flares, parents: Indices, images: Indices, stride:
                 s = roots[way, a]
                 if not LEAST_ROOT < s < MOST_ROOT:
                     continue
-                length1, length2, dot, c1, c2, near1, far1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                length1, length2, dot = 0.0, 0.0, 0.0
                 for y in range(3):
                     one[y] = s * seems_m[y, a] + flares.origin_m[j, y] - flares.place_m[i, y]
                     other[y] = s * seems_m[y, b] + flares.origin_m[m, y] - flares.place_m[k, y]
                     length1 += one[y] ** 2
                     length2 += other[y] ** 2
                     dot += one[y] * other[y]
+                # Most are far from parallel: that is seen without a root.
+                if dot <= 0.0 or dot**2 < ROUNDED * PARALLEL_COSINE**2 * length1 * length2:
+                    continue
+                c1, c2, near1, far1 = 0.0, 0.0, 0.0, 0.0
+                for y in range(3):
                     c1 += one[y] * (flares.place_m[i, y] + 0.5 * one[y])
                     c2 += other[y] * (flares.place_m[k, y] + 0.5 * other[y])
                     near1 += one[y] * flares.origin_m[j, y]
                     far1 += one[y] * flares.place_m[i, y]
                 length1, length2 = math.sqrt(length1), math.sqrt(length2)
                 c1, c2 = c1 / length1, c2 / length2
-                aligned = dot / (length1 * length2) > 1.0 - 0.5 * PARALLEL_RAD**2
+                aligned = dot / (length1 * length2) > PARALLEL_COSINE
                 agree = abs(c1 - c2) < 0.05 + 0.05 * c1
                 before = c1 - near1 / length1 > NEAREST_MIRROR_M and far1 / length1 < c1
                 if aligned and agree and before and count < most:
@@ -112,14 +151,20 @@ def best_seeds(
     flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int, most: int
 ) -> tuple[Array, Indices]:
     """Return the planes that explain most images, shape (most, 5) or less, and how many each does."""
-    count, misfit, mark = explained_by(flares, parents, images, seeds, kind)
-    chosen = _chosen(seeds, count, misfit, mark, most)
+    # A seed has the noise of one or two pairs, and that of a dielectric a guessed index, so gates are wide.
+    gate_chi2 = SEED_GATE_CHI2 if kind == CONSTANT else 0.0
+    pairs, count, misfit = match_all(flares, parents, images, seeds, kind, gate_chi2)
+    chosen = _chosen(seeds, pairs, count, misfit, most)
     return seeds[chosen], count[chosen]
 
 
 @compiled
-def _chosen(seeds: Array, count: Indices, misfit: Array, mark: Indices, most: int) -> Indices:
+def _chosen(seeds: Array, pairs: Indices, count: Indices, misfit: Array, most: int) -> Indices:
     """Return which planes to try, the best first."""
+    mark = np.zeros(len(seeds), dtype=np.int64)  # of which pairs, in whatever order
+    for seed in range(len(seeds)):
+        for k in range(count[seed]):
+            mark[seed] += (pairs[seed, 0, k] + 1) * (pairs[seed, 1, k] + 31) ** 4
     taken = np.zeros(len(seeds), dtype=np.bool_)
     chosen = np.empty(min(most, len(seeds)), dtype=np.int64)
     ranks = 0

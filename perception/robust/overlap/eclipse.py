@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import pixel_turn
+from perception.model.bearing import direction_camera, pixel_turn
 from perception.model.flare import image_radius_px
 from perception.model.layout import View
 from perception.model.pixels import (
@@ -27,8 +27,9 @@ from perception.model.pixels import (
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.overlap.deblend import asks_for_more
+from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
 from perception.robust.overlap.hidden import expectation_of_two
+from perception.robust.overlap.oval import gain_over_oval
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
@@ -90,10 +91,10 @@ def eclipses(
         good: list[Solution] = []
         for fit in fits:
             pair = fit.solution() if len(good) < _TRIED else None
-            if pair is not None and _is_pair(pair):
+            if pair is not None and _is_pair(pair) and _are_apart(pair, camera):
                 good.append(pair)
-        if good:
-            likeliest = min(good, key=lambda pair: pair.cost)
+        likeliest = min(good, key=lambda pair: pair.cost, default=None)
+        if likeliest is not None and gain_over_oval(likeliest, camera) >= LEAST_GAIN:
             pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
     return pairs
 
@@ -134,15 +135,22 @@ def _is_near(several: Solution) -> bool:
     return near_px > LEAST_RADIUS_PX and far_px > _SMALLEST_PX and apart_px < 2.0 * near_px + far_px
 
 
+def _are_apart(pair: Solution, camera: Camera) -> bool:
+    """Tell whether two spheres may stand where they are said to: middles two radii apart, or more."""
+    place = direction_camera(np.column_stack([pair.u_px, pair.v_px]), camera.calibration)
+    place *= np.exp(pair.log_range)[:, None]
+    between = place[0] - place[1]
+    apart_m = float(np.linalg.norm(between))
+    sigma_m = float(np.hypot(*(place @ between / max(apart_m, 1e-12) * pair.log_range_sigma)))
+    return bool(apart_m + _OTHER_SIGMAS * sigma_m >= 2.0 * camera.radius_m)
+
+
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     """Return first guesses of two discs: at both ends of what is lit, the wider one at either."""
-    window = cluster.window
-    excess_e = np.where(window.usable, window.image_e - cluster.background_e, 0.0)
-    if not excess_e.max() > 0.0:
+    lit = lit_pixels(cluster)
+    if lit is None:
         return []
-    level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
-    rows, columns = np.nonzero(excess_e > 0.5 * level_e)
-    places = np.column_stack([columns, rows]).astype(np.float64)
+    window, (level_e, places) = cluster.window, lit
     middle = places.mean(axis=0)
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
@@ -153,7 +161,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     u_px, v_px = (corner + middle).tolist()
     at_1_m_px = float(image_radius_px(u_px, v_px, math.asin(min(camera.radius_m, 1.0)), camera.calibration))
     most_e = math.inf if cluster.is_clipped else level_e
-    if not at_1_m_px > 0.0 or not _is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
+    if not at_1_m_px > 0.0 or not is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
         return []
     guesses = []
     for sign in (1.0, -1.0):
@@ -170,7 +178,21 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     return guesses
 
 
-def _is_as_bright(
+def lit_pixels(cluster: Cluster) -> tuple[float, Array] | None:
+    """Return how bright the brighter half of a cluster's light is, and which pixels have half of that.
+
+    The pixels by column and row in the window, shape (pixels, 2); None where nothing is lit.
+    """
+    window = cluster.window
+    excess_e = np.where(window.usable, window.image_e - cluster.background_e, 0.0)
+    if not excess_e.max() > 0.0:
+        return None
+    level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
+    rows, columns = np.nonzero(excess_e > 0.5 * level_e)
+    return level_e, np.column_stack([columns, rows]).astype(np.float64)
+
+
+def is_as_bright(
     least_e: float, most_e: float, place: tuple[float, float], at_1_m_px: float, camera: Camera
 ) -> bool:
     """Tell whether pixels of so much light may be of sources, which are as bright at any range."""
@@ -190,8 +212,7 @@ class _Eclipse:
         known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
         self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
         self._prior = fit.layout.prior(fit.structure, 0.0)
-        # No finer than what a pixel alone smooths asks for.
-        self._finer = min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))
+        self._finer = finer(camera)
         self._expected, self._jacobian = self._expectation(fit.values)
         self.objective = self._objective(fit.values, self._expected)
 
@@ -268,17 +289,29 @@ class _Eclipse:
         near = int(np.argmin(by_size))
         hidden_px = hidden_px_at_1_m(own, camera)
         hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
-        finer = np.where(np.arange(2) == near, 1.0, self._finer)
-        laid, imaged = lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=finer)
+        fineness = np.where(np.arange(2) == near, 1.0, self._finer)
+        laid, imaged = lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=fineness)
         fit.log_flux_at_1_m, fit.image_radius_px = laid.log_flux_at_1_m, laid.reach_px
         flux = np.exp(laid.log_flux_at_1_m - 2.0 * own[:, 2])
         flux[~imaged] = math.nan  # nowhere to go on to
-        turn = pixel_turn(own[near : near + 1, :2], camera.calibration)[0]
+        middle_px, first, end = own[near : near + 1, :2], *laid.first_node[1 - near : 3 - near]
+        offset = np.column_stack([laid.node_u_px[first:end], laid.node_v_px[first:end]])
+        away = direction_camera(own[1 - near, :2] + offset, camera.calibration)
+        away -= direction_camera(middle_px, camera.calibration)
+        turn = pixel_turn(middle_px, camera.calibration)[0]
         radius_rad = math.asin(min(camera.radius_m * math.exp(-float(by_size[near])), 1.0))
         expected = np.empty(self._view.image_e.size)
         jacobian = np.zeros((layout.size, len(expected)))
         expectation_of_two(
-            values, near, flux, turn, radius_rad, self._view, laid, fit.structure, fit.known,
+            values, near, flux, away, turn, radius_rad, self._view, laid, fit.structure, fit.known,
             expected, jacobian,
         )  # fmt: skip
         return expected, jacobian
+
+
+def finer(camera: Camera) -> float:
+    """Return by how much finer sources are laid out: an edge is sharper than a limb.
+
+    No finer than what a pixel alone smooths asks for.
+    """
+    return min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))

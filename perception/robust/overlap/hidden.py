@@ -21,8 +21,8 @@ RAMP_PX = 0.4
 
 @compiled
 def expectation_of_two(
-    values: Array, near: int, flux: Array, turn: Array, radius_rad: float, view: View, sources: Sources,
-    structure: Structure, known: Known, expected: Array, jacobian: Array,
+    values: Array, near: int, flux: Array, away: Array, turn: Array, radius_rad: float, view: View,
+    sources: Sources, structure: Structure, known: Known, expected: Array, jacobian: Array,
 ) -> None:  # fmt: skip
     """Compute λ and its derivatives, as `pixels.expectation`, of two spheres, one before the other.
 
@@ -32,8 +32,9 @@ def expectation_of_two(
         As there; nothing moves.
     near, flux
         Which of both is the nearer; the flux of each, were it whole, shape (2,).
-    turn, radius_rad
-        How directions turn with pixels about the nearer (`bearing.pixel_turn`), and the nearer's radius.
+    away, turn, radius_rad
+        Of the farther's nodes, the unit directions less that of the nearer, shape (nodes, 3); how directions
+        turn with pixels about the nearer (`bearing.pixel_turn`); and the nearer's radius.
     expected, jacobian
         Shape (pixels,), written, and (unknowns, pixels), zeros that are added to.
     """
@@ -47,7 +48,7 @@ def expectation_of_two(
     sigma_px = known.psf_sigma_px
     if has_width:
         sigma_px *= math.exp(known.width_spread * values[width])
-    seen, hidden = _behind(values, near, step, turn, radius_rad, view, sources, sigma_px)
+    seen, hidden = _behind(values, near, step, away, turn, radius_rad, view, sources, sigma_px)
     image = np.empty((5, *view.image_e.shape))
     flat, changes = image.reshape(5, -1), hidden.reshape(4, -1)
     for source in range(2):
@@ -78,8 +79,8 @@ def expectation_of_two(
 
 @compiled
 def _behind(
-    values: Array, near: int, step: int, turn: Array, radius_rad: float, view: View, sources: Sources,
-    sigma_px: float,
+    values: Array, near: int, step: int, away: Array, turn: Array, radius_rad: float, view: View,
+    sources: Sources, sigma_px: float,
 ) -> tuple[Sources, Array]:  # fmt: skip
     """Return of the farther source what stands out, and how that changes.
 
@@ -92,18 +93,14 @@ def _behind(
     changes, weight = np.zeros((4, rows, columns)), sources.weight.copy()
     across, down, by = np.empty((3, columns)), np.empty((3, rows)), np.empty(4)
     place = (values[far * step] - view.left, values[far * step + 1] - view.top)
-    from_u, from_v = (
-        values[far * step] - values[near * step],
-        values[far * step + 1] - values[near * step + 1],
-    )
     # Squares of angles over pixels, and the greatest that a step of one may turn by.
     uu, uv, vv = (turn[0] ** 2).sum(), (turn[0] * turn[1]).sum(), (turn[1] ** 2).sum()
     ramp_rad = RAMP_PX * math.sqrt(0.5 * (uu + vv) + math.hypot(0.5 * (uu - vv), uv))
-    for node in range(sources.first_node[far], sources.first_node[far + 1]):
-        out_u, out_v = sources.node_u_px[node], sources.node_v_px[node]
-        away_u, away_v = from_u + out_u, from_v + out_v
-        turn_u, turn_v = away_u * uu + away_v * uv, away_u * uv + away_v * vv
-        apart_rad = math.sqrt(max(away_u * turn_u + away_v * turn_v, 0.0))
+    first = sources.first_node[far]
+    for node in range(first, sources.first_node[far + 1]):
+        out_u, out_v, turned = sources.node_u_px[node], sources.node_v_px[node], away[node - first]
+        turn_u, turn_v = (turned * turn[0]).sum(), (turned * turn[1]).sum()
+        apart_rad = 2.0 * math.asin(0.5 * math.sqrt((turned**2).sum()))
         stands_out = 0.5 + (apart_rad - radius_rad) / ramp_rad
         if stands_out <= 0.0:
             weight[node] = 0.0

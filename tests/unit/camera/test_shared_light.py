@@ -104,3 +104,13 @@ def test_one_alone_and_glare_share_nothing(scene: Scene) -> None:
     )
     with_glare = _light(glare, [1e-3] * 6)
     assert shared_light(with_glare, glare.at(0.0), 1e-3, 0.1).groups == ()
+
+
+@pytest.mark.parametrize(
+    "place",
+    [(slice(0, 5), slice(0, 7)), (slice(20, 21), slice(30, 34)), (slice(40, ROWS), slice(50, COLUMNS))],
+)
+def test_a_part_of_a_group_s_image_is_that_part(scene: Scene, place: tuple[slice, slice]) -> None:
+    """To the same bits: at corners, too, and in a single pixel's height, where the blur reaches far beyond."""
+    rates = electron_rates(_light(scene, [1.0] * 6), scene.at(0.0))
+    assert np.array_equal(rates.group_image(3, place), rates.group_image(3)[place])

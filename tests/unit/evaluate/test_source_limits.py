@@ -6,7 +6,7 @@ import math
 import pytest
 
 from nir_render.evaluate.metrics import evaluate, source_limits
-from perception.model.fisher import flare_limit
+from perception.model.fisher import flare_limit, flare_limits
 from tests.unit.report.cases import calibration, truth
 
 CAMERA = calibration()
@@ -84,3 +84,20 @@ def test_without_light_there_is_no_limit_and_the_summary_leaves_it_out() -> None
     lit, unlit = truth(), truth(u_px=200.0, direct_e=0.0)
     summary = evaluate([("r1.front", 0)], [lit, unlit], {"r1.front": CAMERA}, {}).summary
     assert summary["bearing_limit_rms_deg"] == pytest.approx(source_limits(lit, CAMERA)[1])
+
+
+def test_a_flare_that_moves_while_it_is_exposed_has_the_limit_of_one_drawn_out() -> None:
+    """By 2.5 px, which is not known: its light lies on more pixels, and its motion is one more unknown."""
+    row = truth(background_e=30.0, moved_u_px=2.0, moved_v_px=-1.5)
+    at_rest = source_limits(truth(background_e=30.0), CAMERA)
+    flare = (row.u_px, row.v_px, row.range_m, row.direct_e)
+    (limit,) = flare_limits(CAMERA, [flare], 30.0, motions_px=[(2.0, -1.5)])
+    found = source_limits(row, CAMERA)
+    assert found[0] == limit.range_sigma_m > 1.05 * at_rest[0]
+    assert found[1] > 1.05 * at_rest[1]
+
+
+def test_motion_that_is_too_little_to_tell_costs_nothing() -> None:
+    """The image answers to the square of it: 0.02 px that are not known are as good as none."""
+    slow = source_limits(truth(background_e=30.0, moved_u_px=0.02), CAMERA)
+    assert slow == pytest.approx(source_limits(truth(background_e=30.0), CAMERA), rel=2e-3)

@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 from nir_render import load_scene
+from nir_render.evaluate.metrics import source_limits
+from nir_render.experiments.swarm.followed import Followed
 from nir_render.experiments.swarm.hall import HALL, OBSERVER, hall_scene, places_m, side_m
 from nir_render.experiments.swarm.identity import number_of, words_of
-from nir_render.experiments.swarm.judge import Word, judged_packets, whys
+from nir_render.experiments.swarm.judge import Word, judged_packets, sights, whys
 from nir_render.experiments.swarm.loop import Swarm, SwarmLoop
 from nir_render.experiments.swarm.outcome import Condition, Outcome
 from nir_render.experiments.swarm.page import write_outcome
@@ -19,6 +22,8 @@ from nir_render.simulation.calibration import calibration
 from nir_render.simulation.sent import sent_packets
 from nir_render.truth.sent import SentTruth
 from nir_render.truth.sources import SourceTruth
+from perception import Detection, Message, Track
+from perception.types import Ghost
 
 CAMERA = f"{OBSERVER}.front"
 
@@ -69,18 +74,111 @@ def test_how_robots_can_be_seen() -> None:
     assert [near for _, near in whys(rows, known)][:4] == [True] * 4
 
 
+def test_a_track_off_on_the_bearing_of_who_is_partly_hidden_is_its() -> None:
+    """As the camera sees it, 6 cm before the middle of the robot; within 3 px, and only of those given."""
+    known = {CAMERA: calibration(load_scene(HALL), CAMERA)}
+    lens_m, px_rad = known[CAMERA].position_body_m, 1.0 / known[CAMERA].fx_px
+    place_m = lens_m + 2.0 * np.array([math.cos(0.4), math.sin(0.4), 0.0])
+    for off_px, unlike, whom in (
+        (2.9, {CAMERA: ["a"]}, ("a", True)), (3.1, {CAMERA: ["a"]}, (None, True)), (0.0, {CAMERA: []}, (None, True)),
+    ):  # fmt: skip
+        followed = Followed(["b", "a"], np.stack([-place_m, place_m]), unlike, known)
+        turn_rad = 0.4 + off_px * px_rad
+        track = replace(
+            _track(0.0, 0.0),
+            position_body_m=lens_m + 3.5 * np.array([math.cos(turn_rad), math.sin(turn_rad), 0.0]),
+        )
+        followed.update([track])
+        assert followed.now() == [whom]
+
+
+def _hit(u_px: float, v_px: float = 400.0, **changes: Any) -> Detection:
+    given: dict[str, Any] = {
+        "camera": CAMERA, "index": 0, "time_s": 0.0, "u_px": u_px, "v_px": v_px, "u_sigma_px": 0.1, "v_sigma_px": 0.1,
+        "flux_dn": 100.0, "mean_dn": 64.0, "background_dn": 64.0, "area_px": 9, "saturated": False, "merged": False,
+        "ghost": False, "range_m": 3.0, "range_sigma_m": 0.1, "bearing_body": (1.0, 0.0, 0.0),
+    }  # fmt: skip
+    return Detection(**(given | changes))
+
+
+def test_detections_of_nobody_and_parts_of_who_is_partly_hidden() -> None:
+    """Each robot has one detection; a second one on it is a part only where something hides some of it."""
+    rows = [
+        _row(100.0, robot="whole"), _row(200.0, visible_fraction=0.9, robot="part"),
+        _row(300.0, direct_e=0.0, on_fraction=0.0, robot="dark"), _row(400.0, direct_e=0.0, visible_fraction=0.0, robot="gone"),
+    ]  # fmt: skip
+    hits = [
+        _hit(100.1), _hit(101.5),  # the second one is of nobody
+        _hit(200.2), _hit(201.0), _hit(198.0), _hit(203.1),  # one, two parts, and one beyond 3 px
+        _hit(300.0), _hit(400.0),  # where no light comes from
+        _hit(500.0, ghost=True),
+    ]  # fmt: skip
+    known = {CAMERA: calibration(load_scene(HALL), CAMERA)}
+    in_set = sights(
+        ["whole", "part", "dark", "gone", "away"], {CAMERA: rows}, {CAMERA: hits}, {CAMERA: []}, known
+    )
+    assert [(one.robot, one.why, one.found) for one in in_set.sights] == [
+        ("whole", "free", True), ("part", "eclipsed", True), ("dark", "dark", False), ("gone", "hidden", False),
+        ("away", "cut", False),
+    ]  # fmt: skip
+    assert (in_set.parts, in_set.false_alarms) == (2, 4)
+
+
+def test_limits_are_those_beside_all_others() -> None:
+    """Of two that overlap by a little, of a large near one, and of one alone: as if all rows were asked."""
+    known = calibration(load_scene(HALL), CAMERA)
+    rows = [
+        _row(200.0, robot="a"), _row(203.5, robot="b"), _row(300.0, 1e5, range_m=0.4, robot="near"),
+        _row(330.0, robot="beside"), _row(900.0, robot="alone"),
+    ]  # fmt: skip
+    hits = [_hit(row.u_px) for row in rows]
+    in_set = sights(
+        [row.robot for row in rows], {CAMERA: rows}, {CAMERA: hits}, {CAMERA: []}, {CAMERA: known}
+    )
+    for row, one in zip(rows, in_set.sights, strict=True):
+        assert one.limit_m == source_limits(row, known, rows)[0]
+    lone_m = source_limits(rows[0], known)[0]
+    assert in_set.sights[0].limit_m > 1.05 * lone_m
+
+
+def _message(start_s: float, end_s: float, word: int, track: int = 1) -> Message:
+    return Message("o", track, start_s, end_s, word, "x", confidence=1.0, frames=5)
+
+
 def test_words_are_held_against_packets() -> None:
+    """A packet of which one frame of five was read is received; who says two robots' word is none of them."""
     sent = [SentTruth("a", "top", 3.0, 8.5, 7, "x"), SentTruth("b", "top", 3.2, 8.7, 7, "x"),
-            SentTruth("c", "top", 9.0, 14.5, 8, "x")]  # fmt: skip
+            SentTruth("c", "top", 9.0, 14.5, 8, "x"), SentTruth("d", "top", 9.1, 14.6, 8, "x")]  # fmt: skip
     told = [
-        Word("a", 1, 3.1, 7),  # its own
-        Word("c", 2, 3.3, 7),  # of a or b, but its track is c's
-        Word("c", 2, 9.6, 8),  # begins too late
-        Word(None, 3, 9.0, 8),  # of nobody's track
+        Word(("a",), _message(7.4, 8.5, 7)),  # its own, the last frame alone
+        Word(("c",), _message(3.3, 8.8, 7)),  # of a or b, but its track is c's
+        Word(("c",), _message(9.7, 15.2, 8)),  # ends too late
+        Word((), _message(8.4, 13.9, 8)),  # begins too early, of nobody's track
+        Word(("c", "d"), _message(9.0, 14.5, 8)),  # c's or d's: one of them
+        Word(("d", "c"), _message(9.1, 14.6, 8)),  # and the other
     ]
     packets = judged_packets(sent, told)
-    assert packets.received == (True, False, False)
-    assert (packets.misattributed, packets.wrong) == (2, 1)
+    assert packets.received == (True, False, True, True)
+    assert (packets.misattributed, packets.wrong) == (1, 2)
+
+
+def _track(time_s: float, x_m: float, number: int = 1, ghost: Ghost = "no") -> Track:
+    place, still = np.array([x_m, 0.0, 0.0]), np.zeros(3)
+    return Track("o", time_s, number, place, still, 1e-4 * np.eye(6), ghost=ghost)
+
+
+def test_a_word_is_of_whom_its_track_followed_for_most_of_it() -> None:
+    """σ and floor are 1 and 2 cm, so 5 σ are 11.2 cm."""
+    known = {CAMERA: calibration(load_scene(HALL), CAMERA)}
+    followed = Followed(["a", "b"], np.array([[2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), {}, known)
+    for time_s, x_m in ((0.0, 2.11), (1.0, 2.0), (4.0, 2.12), (9.0, 2.98), (10.0, 3.0)):
+        followed.update([_track(time_s, x_m), _track(time_s, 3.0, 2, "yes")])
+    assert followed.now() == [("b", False)]
+    assert followed.during(1, 0.0, 10.0) == "a"  # for four seconds; b for one, nobody for five
+    assert followed.during(1, 3.5, 9.4) == "a"
+    assert followed.during(1, 3.5, 9.6) == "b"
+    assert followed.during(1, 5.0, 8.0) is None
+    assert followed.during(2, 0.0, 10.0) is None
 
 
 @pytest.mark.parametrize("density_per_m2", [0.5, 2.0])
@@ -175,10 +273,10 @@ def _record(seed: int) -> dict[str, Any]:
     return {
         "format": 1, "seed": seed, "places_m": [[0.0, 0.0], [2.0, 0.0], [0.0, 3.0], [4.0, 0.0], [1.0, 0.0]],
         "standing": [[*sights[0]], [*sights[1]], [*sights[2]], ["r0004", "free", *sights[3][2:]]],
-        "sights": [sights, sights], "false_alarms": 3,
+        "sights": [sights, sights], "false_alarms": 3, "parts": 5,
         "packets": [["r0001", 1, 5.0, True], ["r0003", 3, 7.0, False], ["r0004", 4, 7.0, True]],
         "misattributed": 1, "wrong_words": 0, "identities": {"right": ["r0001", "r0004"], "wrong": 1},
-        "tracks": ["r0001", None], "shared": {"front": {"groups": [1, 2], "mean_share": 1e-5, "worst_share": 0.004}},
+        "tracks": [["r0001", False], [None, True], ["r0001", True]], "shared": {"front": {"groups": [1, 2], "mean_share": 1e-5, "worst_share": 0.004}},
     }  # fmt: skip
 
 
@@ -198,6 +296,9 @@ def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
     assert figures["range"]["rmse_m"] == pytest.approx(0.02)
     assert figures["packets_by_sight"] == {"free": [4, 4], "merged": [2, 0]}
     assert (figures["told_in_full"], figures["identities_right"], figures["identities_wrong"]) == (6, 4, 2)
+    names = ("tracks", "tracks_off", "tracks_of_nobody", "tracks_twice")
+    assert [figures[name] for name in names] == [6, 2, 2, 2]
+    assert (figures["false_alarms"], figures["parts"]) == (6, 10)
     assert figures["seconds"]["light_of_a_set"] == 9.0
     page = write_outcome(Outcome(5, "hall", [0, 1], [condition]), tmp_path)
     text = page.read_text()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import nir_render as nr
+from nir_render.scene.motion import Velocity
 from tests.paths import SCENES
 
 pytestmark = pytest.mark.mitsuba
@@ -41,6 +42,33 @@ def test_truth_follows_the_robot_that_is_moved(scene: nr.Scene) -> None:
         assert row.range_m == pytest.approx(
             float(np.linalg.norm(moved.sources["r2.top"].pose.position_m - eye_m)), rel=1e-9
         )
+
+
+def test_truth_says_how_far_a_flare_moves_within_an_exposure(scene: nr.Scene) -> None:
+    """Across at 0.6 m/s, ahead on the axis of u: f v t / depth. Beside it the observer turns: f ω t / cos² θ.
+
+    Both for 10 ms and 480 px; a turn to the left moves flares to the right. At rest it is 0.
+    """
+    slow = scene.with_({"robots.r1.rig.cameras.front.exposure": "10 ms"}).at(0.0)
+    across = Velocity(np.array([0.0, -0.6, 0.0]), np.zeros(3))
+    turning = Velocity(np.zeros(3), np.array([0.0, 0.0, 0.5]))
+    cases: tuple[tuple[float, float, dict[str, Velocity]], ...] = (
+        (3.0, 0.0, {"r2": across}),
+        (3.0, 0.6, {"r1": turning}),
+        (3.0, 0.0, {}),
+    )
+    for x_m, y_m, velocities in cases:
+        poses = {"r2": nr.Pose.of((x_m, y_m, 0.0)), "r1": slow.robots["r1"].pose}
+        world = slow.moved(poses, velocities=velocities)
+        (row,) = (row for row in nr.take_frame(world, "r1.front", 0).truth if row.robot == "r2")
+        assert row.depth_z_m is not None
+        expected_px = 0.0
+        if "r2" in velocities:
+            expected_px = 480.0 * 0.6 * 0.01 / row.depth_z_m
+        if "r1" in velocities:
+            # The lens is carried around the robot's middle, 6 cm behind it, and so moves to the left.
+            expected_px = 480.0 * 0.5 * 0.01 * (1.0 + (y_m / row.depth_z_m) ** 2 + 0.06 / row.depth_z_m)
+        assert row.moved_u_px == pytest.approx(expected_px, rel=1e-3)
 
 
 def test_a_light_of_another_place_is_refused(scene: nr.Scene) -> None:

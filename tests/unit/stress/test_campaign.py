@@ -12,7 +12,8 @@ from jsonschema import Draft202012Validator
 from nir_render import InputError
 from nir_render.stress.campaign import Campaign, campaign_schema, load_campaign
 from nir_render.stress.jobs import Job, plan
-from nir_render.stress.sweep import plan_record
+from nir_render.stress.sweep import PLANNED, plan_record, status_record
+from nir_render.stress.workers.pool import part_file
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.mitsuba
@@ -199,6 +200,23 @@ def test_limits_are_refined_where_there_are_bounds_and_a_plan_says_so(tmp_path: 
     campaign, jobs = planned(tmp_path, axes=axes)
     assert plan_record(campaign, jobs, tmp_path / "out")["refined"] == ["range"]
     assert plan_record(*planned(tmp_path), tmp_path / "out")["refined"] == []
+
+
+def test_what_is_done_is_told_without_planning_anew(tmp_path: Path) -> None:
+    """Twelve jobs, five done, one file of a job that is none of them, one half-written."""
+    campaign, jobs = planned(tmp_path)
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="no sweep has begun there"):
+        status_record(campaign, out)
+    (out / "jobs").mkdir(parents=True)
+    (out / "campaign.json").write_text(json.dumps({"format": 1, "name": "small"}))
+    (out / PLANNED).write_text(json.dumps({"format": 1, "jobs": [job.key for job in jobs]}))
+    for job in (*jobs[:5], replace(jobs[0], key="0" * 32)):
+        part_file(out / "jobs", job).touch()
+    (out / "jobs" / f".{jobs[7].key}.parquet.partial-1").touch()
+    assert status_record(campaign, out) == {"campaign": "small", "jobs": 12, "done": 5, "others": 1}
+    with pytest.raises(InputError, match="holds the campaign 'small', not 'other'"):
+        status_record(replace(campaign, name="other"), out)
 
 
 def test_a_scene_is_no_campaign() -> None:
