@@ -14,6 +14,7 @@ import typer
 
 from nir_render.command import recordings, regress, runs, scenes, stress
 from nir_render.command.compare import compare
+from nir_render.command.experiment import experiment
 from nir_render.command.explain import explain
 from nir_render.errors import InputError
 
@@ -47,7 +48,7 @@ for command in (
     explain,
     compare,
     recordings.export,
-    *(stress.stress, stress.experiment),
+    *(stress.stress, experiment),
     *(scenes.new, scenes.validate, scenes.schema, scenes.look, scenes.goniometer, scenes.doctor),
 ):
     app.command()(command)
