@@ -251,36 +251,33 @@ def inverted(matrix: Array, inverse: Array) -> float:
 
 
 @compiled
-def _add_bends(
-    view: View, expected: Array, jacobian: Array, variance: Array, of: tuple[int, int, int], into: Array
+def _add_bend(
+    view: View, expected: Array, jacobian: Array, variance: Array, motion: int, into: Array
 ) -> None:
-    """Add to an information how ln L bends with motions beside it, where that is downwards.
+    """Add to a lone flare's information how ln L bends with its motion beside it, where that is downwards.
 
     A motion m adds ∂ᵢ∂ⱼ(F S) mᵢ mⱼ / 24 to a flare's light: of that first order in m's square Fisher's
     information knows nothing across a short m, and steps by it alone go to and fro. For the steps alone:
-    second derivatives are differences of first ones. `of` is how many sources there are, how many unknowns
-    each has, and in how many columns the pixels lie.
+    second derivatives are differences of first ones. `motion` is the index of the first of both unknowns.
     """
-    count, step, columns = of
+    columns, uu, uv, vv = view.image_e.shape[1], 0.0, 0.0, 0.0
     image, state = view.image_e.ravel(), view.state.ravel()
-    for at in range(0, count * step, step):
-        uu, uv, vv = 0.0, 0.0, 0.0
-        for pixel in range(columns + 1, len(expected) - columns - 1):
-            if state[pixel] != SEEN:
-                continue
-            pull = (image[pixel] - expected[pixel]) / (24.0 * variance[pixel])
-            uu += pull * (jacobian[at, pixel + 1] - jacobian[at, pixel - 1])
-            vv += pull * (jacobian[at + 1, pixel + columns] - jacobian[at + 1, pixel - columns])
-            uv += pull * (jacobian[at, pixel + columns] - jacobian[at, pixel - columns])
-        # Of the two bends along the axes of a symmetric matrix those that are positive.
-        mean, half = 0.5 * (uu + vv), math.hypot(0.5 * (uu - vv), uv)
-        larger, smaller = max(mean + half, 0.0), max(mean - half, 0.0)
-        cosine, sine = (0.5 * (uu - vv) / half, uv / half) if half > 0.0 else (1.0, 0.0)
-        even, odd, motion = 0.5 * (larger + smaller), 0.5 * (larger - smaller), at + step - 2
-        into[motion, motion] += even + odd * cosine
-        into[motion + 1, motion + 1] += even - odd * cosine
-        into[motion, motion + 1] += odd * sine
-        into[motion + 1, motion] += odd * sine
+    for pixel in range(columns + 1, len(expected) - columns - 1):
+        if state[pixel] != SEEN:
+            continue
+        pull = (image[pixel] - expected[pixel]) / (24.0 * variance[pixel])
+        uu += pull * (jacobian[0, pixel + 1] - jacobian[0, pixel - 1])
+        vv += pull * (jacobian[1, pixel + columns] - jacobian[1, pixel - columns])
+        uv += pull * (jacobian[0, pixel + columns] - jacobian[0, pixel - columns])
+    # Of the two bends along the axes of a symmetric matrix those that are positive.
+    mean, half = 0.5 * (uu + vv), math.hypot(0.5 * (uu - vv), uv)
+    larger, smaller = max(mean + half, 0.0), max(mean - half, 0.0)
+    cosine, sine = (0.5 * (uu - vv) / half, uv / half) if half > 0.0 else (1.0, 0.0)
+    even, odd = 0.5 * (larger + smaller), 0.5 * (larger - smaller)
+    into[motion, motion] += even + odd * cosine
+    into[motion + 1, motion + 1] += even - odd * cosine
+    into[motion, motion + 1] += odd * sine
+    into[motion + 1, motion] += odd * sine
 
 
 @compiled
@@ -345,8 +342,8 @@ def maximise(
         for one in range(size):
             damped[one] = fisher[one]
             damped[one, one] *= 1.0 + damping
-        if known.motion_px > 0.0:
-            _add_bends(view, expected, jacobian, variance, (count, step, view.image_e.shape[1]), damped)
+        if known.motion_px > 0.0 and count == 1:
+            _add_bend(view, expected, jacobian, variance, step - 2, damped)
         if math.isnan(inverted(damped, damped)):
             return math.inf, math.inf
         for one in range(size):
