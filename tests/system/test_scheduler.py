@@ -125,7 +125,10 @@ def test_what_is_no_scheduler_is_told(tmp_path: Path) -> None:
     cases = [
         (by("here", file, tmp_path / "out"), "no Dask scheduler answers"),
         (by("tcp://127.0.0.1:1", file, tmp_path / "other"), "no Dask scheduler answers"),
-        (start(file, tmp_path / "third", "--scheduler", "tcp://127.0.0.1:1"), "leave out all but one of them"),
+        (
+            start(file, tmp_path / "third", "--scheduler", "tcp://127.0.0.1:1"),
+            "leave out all but one of them",
+        ),
     ]
     for running, said in cases:
         _, err = running.communicate(timeout=120)
