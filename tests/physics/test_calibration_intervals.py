@@ -135,6 +135,7 @@ def _check(seeds: int) -> None:
         told.check(what)
 
 
+@pytest.mark.verify
 def test_of_three_cameras_all_that_is_learned_is_true() -> None:
     _check(3)
 
