@@ -27,7 +27,7 @@ from perception.model.pixels import (
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.overlap.deblend import asks_for_more
+from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, gain
 from perception.robust.overlap.eclipse import LEAST_RADIUS_PX, finer, is_as_bright, lit_pixels
 from perception.robust.overlap.hidden import RAMP_PX
 from perception.robust.problem import Problem
@@ -80,7 +80,7 @@ def cut_discs(
         good: list[Solution] = []
         for fit in fits[:_TRIED]:
             cut = fit.solution() if len(good) < _GOOD else None
-            if cut is not None and cut.left_over.is_good:
+            if cut is not None and cut.left_over.is_good and (one is None or gain(one, cut) >= LEAST_GAIN):
                 good.append(cut)
         if good:
             cuts[index] = min(good, key=lambda cut: cut.cost)

@@ -58,12 +58,12 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
         for (index, _), fit in zip(trials, fits, strict=True):
             if fit is not None and (index not in best or fit.deviance < best[index].deviance):
                 best[index] = fit
-        gaining = [index for index, fit in best.items() if _gain(null[index], fit) >= LEAST_GAIN]
+        gaining = [index for index, fit in best.items() if gain(null[index], fit) >= LEAST_GAIN]
         null |= _eased({index: found[index] for index in gaining if found[index].count == 1}, camera)
         asking = []
         for index in gaining:
             fit = best[index]
-            if _gain(null[index], fit) >= LEAST_GAIN:
+            if gain(null[index], fit) >= LEAST_GAIN:
                 found[index] = null[index] = fit
                 if asks_for_more(fit):
                     (asking if fit.count < MOST_FLARES else late).append(index)
@@ -118,10 +118,10 @@ def _with_spread(camera: Camera, name: str, spread: float) -> Camera:
     return replace(camera, calibration=replace(calibration, sigma=sigma))
 
 
-def _gain(fewer: Solution, more: Solution) -> float:
-    """Return by how much more flares explain a window better, as 2 Δ ln L with an imperfect model."""
-    variance = more.variance_e2(MODEL_ERROR)
-    return float(np.sum((fewer.residual_e**2 - more.residual_e**2) / variance))
+def gain(one: Solution, other: Solution) -> float:
+    """Return by how much another fit explains a window better, as 2 Δ ln L with an imperfect model."""
+    variance = other.variance_e2(MODEL_ERROR)
+    return float(np.sum((one.residual_e**2 - other.residual_e**2) / variance))
 
 
 def _of_more(current: Solution, starts: Sequence[Start]) -> Problem:
