@@ -107,8 +107,10 @@ class SwarmLoop:
     """A run in the making; a step is a set of frames of all cameras of the observer."""
 
     def __init__(self, scene: Scene, plan: Swarm, seed: int) -> None:
-        if plan.robots > MOST:
-            raise ValueError(f"{plan.robots} robots: two words tell {MOST} apart")
+        if not 2 <= plan.robots <= MOST:
+            raise ValueError(
+                f"{plan.robots} robots: wanted 2 to {MOST}, one of whom looks; two words tell so many apart"
+            )
         self.plan, self.seed = plan, seed
         self._scene = hall_scene(scene, plan.robots, plan.density_per_m2, plan.bodies, plan.lasts_s, seed)
         self._world = self._scene.at(0.0)
