@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -269,8 +269,9 @@ class SwarmLoop:
             lights = direct_lights(self._world, list(self._known), self.seed)
             self._rates = {name: electron_rates(light, self._world) for name, light in lights.items()}
             return
+        kept: dict[Hashable, Any] = {}
         for name in self._known:
-            light = render(self._world, name, self.seed)
+            light = render(self._world, name, self.seed, kept=kept)
             exposure_s = own_setting(self._world.camera(name).camera, 0).exposure_s
             self._shared[name] = shared_light(light, self._world, exposure_s, OFF)
             self._rates[name] = electron_rates(light, self._world, self._shared[name].groups)

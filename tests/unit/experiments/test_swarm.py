@@ -315,8 +315,8 @@ def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
     assert figures["range"]["unranged"] == 0.0
     assert figures["packets_by_sight"] == {"free": [4, 4], "merged": [2, 0]}
     assert (figures["told_in_full"], figures["identities_right"], figures["identities_wrong"]) == (6, 4, 2)
-    names = ("tracks", "tracks_off", "tracks_of_nobody", "tracks_twice")
-    assert [figures[name] for name in names] == [6, 2, 2, 2]
+    counted = ("tracks", "tracks_off", "tracks_of_nobody", "tracks_twice")
+    assert [figures[name] for name in counted] == [6, 2, 2, 2]
     assert (figures["false_alarms"], figures["parts"]) == (6, 10)
     assert figures["seconds"]["light_of_a_set"] == 9.0
     page = write_outcome(Outcome(5, "hall", [0, 1], [condition]), tmp_path)
