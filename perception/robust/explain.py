@@ -16,6 +16,7 @@ from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, deblend, of_free_width
 from perception.robust.overlap.eclipse import LEAST_RADIUS_PX, eclipses
 from perception.robust.overlap.oval import gain_over_oval
+from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.search.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
@@ -62,6 +63,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     # flares would explain better.
     parted: dict[int, Solution] = {}
     cut_short: set[int] = set()
+    plain: list[Solution | None] = [None] * len(found)
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
         parted = _parted(plain, prepared.shape, camera, cut_short)
@@ -94,6 +96,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, more in parted.items():
         if _is_better(more, chosen[index]):
             chosen[index] = more
+    if prepared.frame.line_time_s == 0.0:
+        for index, one_or_two in doubted(chosen, plain, camera).items():
+            chosen[index] = one_or_two
     for index in cut_short:
         one = chosen[index]
         if one is not None and asks_for_more(one):

@@ -30,7 +30,9 @@ _LAYOUT_KEPT_PX = 0.05
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
 _PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
-_NEIGHBOURS = 20.0 * 50.0 / (1280.0 * 960.0)  # of twenty flares in a frame, how many lie in those 50 px²
+NEIGHBOUR_PX2 = 50.0
+NEIGHBOURS = 20.0 * NEIGHBOUR_PX2 / (1280.0 * 960.0)
+"""Of twenty flares in a frame, how many lie in the 50 px² of a blob."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,8 @@ class Solution:
     motion_px, motion_cost
         How far each moves along u and v during the exposure, shape (flares, 2), None where none may; and what
         that costs a priori (`model.window`).
+    log_range_of_two
+        How far the range of a lone flare may be off because it may be two (`unparted`), beside its σ.
     is_doubtful
         Whether another number of flares explains the window nearly as well (`motion.weighed`).
     may_be_more
@@ -98,6 +102,7 @@ class Solution:
     log_information: float
     motion_px: Array | None = None
     motion_cost: float = 0.0
+    log_range_of_two: float = 0.0
     is_doubtful: bool = False
     may_be_more: bool = False
     is_eclipse: bool = False
@@ -108,10 +113,10 @@ class Solution:
 
         Laplace's approximation (MacKay, Neural Comput. 4, 415, 1992): an unknown costs the logarithm of how
         much narrower the data leave it than its prior, which for a flare is any of `_PLACES` places and
-        brightnesses. That others lie in the same blob is as rare as `_NEIGHBOURS`, each.
+        brightnesses. That others lie in the same blob is as rare as `NEIGHBOURS`, each.
         """
         by_flares = self.count * (2.0 * math.log(_PLACES) - 3.0 * math.log(2.0 * math.pi))
-        by_chance = -2.0 * (self.count - 1) * math.log(_NEIGHBOURS)
+        by_chance = -2.0 * (self.count - 1) * math.log(NEIGHBOURS)
         return self.deviance + self.log_information + by_flares + by_chance + self.motion_cost
 
     @property
