@@ -177,6 +177,8 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     -------
     A solution for each, None where the fit did not converge.
     """
+    if not problems:
+        return []
     moving = replace(camera, motion_px=MOTION_PX)
     fits = [Fit(problem, camera if problem.motions is None else moving) for problem in problems]
     solved: dict[int, Solution] = {}
@@ -203,10 +205,8 @@ def start_costs(problems: Sequence[Problem], camera: Camera) -> list[float]:
     fits = [Fit(problem, camera) for problem in problems]
     laid, imaged, _ = _laid_out(fits, camera, None, finer=_OF_STARTS)
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
-    return [
-        fit.unlikeliness(laid.part(first, end)) if imaged[first:end].all() else math.inf
-        for fit, first, end in zip(fits, [0, *ends], ends, strict=False)
-    ]
+    parts = zip(fits, [0, *ends], ends, strict=False)
+    return [f.unlikeliness(laid.part(a, b)) if imaged[a:b].all() else math.inf for f, a, b in parts]
 
 
 class Fit:
