@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 _SEEN_OF_GAIN = 0.9
 """Part of another shape's gain that the harmonics gain at least: what they miss noise makes up for.
 
-Noise alone gives as much as there are harmonics, about twenty, ± 6.
+Noise alone gives as much as there are harmonics, up to 18 ± 6.
 """
 
 _MOST_HARMONICS, _PER_RADIUS_PX = 10, 2.6  # the point spread lets no finer ones through
@@ -34,9 +34,9 @@ _STEP_PX, _FEWEST_STEPS = 0.5, 16
 
 
 def may_be_other_shape(one: Solution, camera: Camera) -> bool:
-    """Tell whether a lone flare may gain `LEAST_GAIN` by not being a whole disc.
+    """Tell whether a flare may gain `LEAST_GAIN` by not being a whole disc: of several in a window always.
 
-    Always where its fit is bad.
+    One that glare surrounds fits badly, too; but what is left is round.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def may_be_other_shape(one: Solution, camera: Camera) -> bool:
     """
     if not asks_for_more(one):
         return False
-    if one.count > 1 or one.motion_px is not None or not one.left_over.is_good:
+    if one.count > 1 or one.motion_px is not None:
         return True
     return not gain_by_limb(one, camera) < _SEEN_OF_GAIN * LEAST_GAIN
 
@@ -55,7 +55,7 @@ def may_be_other_shape(one: Solution, camera: Camera) -> bool:
 def gain_by_limb(one: Solution, camera: Camera) -> float:
     """Return what displacing a lone disc's limb would gain, as 2 Δ ln L with an imperfect model.
 
-    By one step from the fit, in which brightness and background may change, too; NaN where it is unknown.
+    By one step from the fit, beside what size, brightness and background would gain; NaN where it is unknown.
     """
     u_px, v_px, radius_px = float(one.u_px[0]), float(one.v_px[0]), float(one.image_radius_px[0])
     turn = pixel_turn([[u_px, v_px]], camera.calibration)[0]
@@ -80,10 +80,10 @@ def gain_by_limb(one: Solution, camera: Camera) -> float:
 def _gain(
     left_e: Array, weight: Array, flares_e: Array, outline: Array, waves: Array, sigma_px: float
 ) -> float:
-    """Return what a residual loses, in χ², by light along an outline, modulated by waves, and by two scales.
+    """Return what a residual loses, in χ², by light along an outline, modulated by waves.
 
-    These are of the flares' light and of the ground. `outline` has the shape (2, points), `waves` (waves,
-    points). NaN where some of it cannot be told from the rest.
+    Beside what the first wave, which is even, the flares' light and the ground would take of it. `outline`
+    has the shape (2, points), `waves` (waves, points). NaN where some of it cannot be told from the rest.
     """
     rows, columns = left_e.shape
     count = len(waves) + 2
@@ -107,8 +107,19 @@ def _gain(
     for one in range(count):
         for pixel in range(len(left)):
             pull[one] += by[one, pixel] * flat_weight[pixel] * left[pixel]
+    # What is round, as size, brightness and ground are, is no other shape.
+    is_round = np.array([0, count - 2, count - 1])
+    by_round, round_inverse = np.empty((3, 3)), np.empty((3, 3))
+    for one in range(3):
+        for other in range(3):
+            by_round[one, other] = information[is_round[one], is_round[other]]
+    if math.isnan(inverted(by_round, round_inverse)):
+        return math.nan
     gain = 0.0
     for one in range(count):
         for other in range(count):
             gain += pull[one] * inverse[one, other] * pull[other]
+    for one in range(3):
+        for other in range(3):
+            gain -= pull[is_round[one]] * round_inverse[one, other] * pull[is_round[other]]
     return gain

@@ -12,7 +12,6 @@ from perception.types import Signal
 from tests.unit.perception.messages.wire import signal
 from tests.unit.perception.simulation import random
 
-
 SAMPLES = ("time_s", "exposure_s", "level", "sigma_dark", "sigma_lit")
 
 
