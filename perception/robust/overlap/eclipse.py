@@ -14,20 +14,10 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera, pixel_turn
 from perception.model.flare import image_radius_px
-from perception.model.layout import View
-from perception.model.pixels import (
-    FIRST_DAMPING,
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    inverted,
-    is_inside,
-    objective,
-    slopes,
-)
-from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
+from perception.robust.overlap.climb import Climb
+from perception.robust.overlap.deblend import LEAST_GAIN
 from perception.robust.overlap.hidden import expectation_of_two
 from perception.robust.overlap.oval import gain_over_oval
 from perception.robust.problem import Problem, Start
@@ -42,7 +32,6 @@ _SMALLEST_PX = 0.5  # of the one behind
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
-_MOST_STEPS = 25  # what is no eclipse goes on without an end
 _DIMMEST, _BRIGHTEST = (
     0.5,
     1.5,
@@ -52,14 +41,13 @@ _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
 
 _OTHER_SIGMAS = 3.0
-# In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
-_SETTLED = 0.02
 
 
 def eclipses(
     found: Sequence[Cluster],
     plain: Sequence[Solution | None],
     parted: Mapping[int, Solution],
+    may_be: Sequence[bool],
     camera: Camera,
 ) -> dict[int, Solution]:
     """Explain windows by two resolved spheres, one partly behind the other.
@@ -70,6 +58,8 @@ def eclipses(
         The clusters.
     plain, parted
         What explains each so far: a flare for each blob, None where nothing does; and, by index, more.
+    may_be
+        Which may be of another shape (`limb.may_be_other_shape`): of the others only pairs are tried.
     camera
         The camera.
 
@@ -82,7 +72,7 @@ def eclipses(
         if cluster.is_in_crowd:
             continue
         guesses: list[list[Start]] = []
-        if one is None or (one.count == 1 and asks_for_more(one)):
+        if may_be[index] and (one is None or one.count == 1):
             guesses = _guesses(cluster, camera)
         of_two = [each.starts for each in (one, parted.get(index)) if each is not None and _is_near(each)]
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
@@ -112,10 +102,14 @@ def _may_be_other(pair: Solution, camera: Camera) -> bool:
         inwards = float(pair.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
         starts: list[Start] = [(near_u, near_v, near_log), (*place, log_range)]
-        other = _Eclipse(Problem(pair.window, starts, pair.background_e), camera).solution()
-        if other is None or other.cost > pair.cost + _RIVAL:
+        climb = _Eclipse(Problem(pair.window, starts, pair.background_e), camera)
+        other = climb.solution()
+        # One that goes on without an end is not excluded where it has come as far as the pair.
+        above = climb.so_far - pair.deviance if other is None else other.cost - pair.cost
+        if above > _RIVAL:
             continue
-        farthest = abs(other.log_range.max() - pair.log_range.max())
+        log_ranges = climb.log_ranges if other is None else other.log_range
+        farthest = abs(log_ranges.max() - pair.log_range.max())
         if farthest > _OTHER_SIGMAS * float(pair.log_range_sigma[far]):
             return True
     return False
@@ -202,84 +196,18 @@ def is_as_bright(
     return _DIMMEST / spread * source_e < most_e and least_e < _BRIGHTEST * spread * source_e
 
 
-class _Eclipse:
+class _Eclipse(Climb):
     """The fit of two spheres to a window, on its way from first guesses."""
 
     def __init__(self, problem: Problem, camera: Camera) -> None:
-        self._fit = fit = Fit(problem, camera)
-        self._camera = camera
-        box, window = fit.window.box, fit.window
-        known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
-        self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
-        self._prior = fit.layout.prior(fit.structure, 0.0)
-        self._finer = finer(camera)
-        self._expected, self._jacobian = self._expectation(fit.values)
-        self.objective = self._objective(fit.values, self._expected)
+        fit, self._finer = Fit(problem, camera), finer(camera)
+        super().__init__(fit, camera, fit.values.copy(), fit.layout.most_step, fit.prior)
 
     def solution(self) -> Solution | None:
         """Return what is likeliest; None where no maximum is reached."""
-        if not self._climb():
+        if not self._reach():
             return None
         return solutions_of([self._fit], self._camera)[0]
-
-    def _climb(self) -> bool:
-        """Go on to the greatest likelihood, as `pixels.maximise` does; tell whether it is reached."""
-        fit, clip_e = self._fit, self._fit.known.clip_e
-        size = fit.layout.size
-        gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
-        damped = np.empty((size, size))
-        damping, is_new = FIRST_DAMPING, True
-        for _ in range(_MOST_STEPS):
-            if is_new:
-                variance = self._variance(self._expected)
-                slopes(
-                    self._view, fit.values, self._expected, self._jacobian, variance, self._prior, clip_e,
-                    False, gradient, fisher,
-                )  # fmt: skip
-                log_det = inverted(fisher, inverse)
-                if math.isnan(log_det):
-                    return False
-                if gradient @ inverse @ gradient < _SETTLED:
-                    break
-                before = self._objective(fit.values, self._expected, variance)
-            np.copyto(damped, fisher)
-            np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))
-            if math.isnan(inverted(damped, damped)):
-                return False
-            trial = fit.values + np.clip(damped @ gradient, -fit.layout.most_step, fit.layout.most_step)
-            is_new = False
-            if is_inside(trial, self._view, fit.layout.sources, fit.layout.per_source):
-                expected, jacobian = self._expectation(trial)
-                after = self._objective(trial, expected, variance)
-                is_new = after <= before * (1.0 + 1e-9) + 1e-9
-            if is_new:
-                fit.values[:], self._expected, self._jacobian = trial, expected, jacobian
-                damping = max(0.1 * damping, LEAST_DAMPING)
-            else:
-                damping *= 10.0
-                if not damping < MOST_DAMPING:
-                    return False
-        else:
-            return False
-        variance = self._variance(self._expected)
-        slopes(
-            self._view, fit.values, self._expected, self._jacobian, variance, self._prior, clip_e,
-            True, gradient, fisher,
-        )  # fmt: skip
-        fit.log_information = inverted(fisher, fit.covariance)
-        fit.expected_e = self._expected.reshape(fit.window.image_e.shape)
-        fit.deviance = self._objective(fit.values, self._expected)
-        return math.isfinite(fit.log_information)
-
-    def _variance(self, expected: Array) -> Array:
-        window = self._fit.window
-        return np.asarray(pixel_variance_e2(expected, window.floor_e2, window.prnu))
-
-    def _objective(self, values: Array, expected: Array, variance: Array | None = None) -> float:
-        """Return −2 ln L but for a constant of the window; with given variances without their logarithms."""
-        own = self._variance(expected) if variance is None else variance
-        total, logs = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
-        return float(total + logs) if variance is None else float(total)
 
     def _expectation(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
