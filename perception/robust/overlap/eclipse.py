@@ -8,6 +8,7 @@ nearer, so that the expected image and its derivatives, by places and sizes of b
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from perception.model.pixels import (
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
+from perception.robust.goodness import drawn_out
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
 from perception.robust.overlap.hidden import expectation_of_two
 from perception.robust.overlap.oval import gain_over_oval
@@ -38,6 +40,12 @@ Array = NDArray[np.float64]
 LEAST_RADIUS_PX = 1.5
 """Smaller images tell hardly anything of which of two hides the other."""
 
+LEAST_OF_A_LAYOUT_PX = 0.8
+"""But where a robot's sources are known to stand so close that one may hide the other, what they add up to is
+not what is seen of them however small they are; here they are blurred to points."""
+
+_LEAST_OF_A_LAYOUT = -6.0  # of 2 Δ ln L: an oval is believed where it is twenty times as likely as they are
+_DRAWN_OUT_CHI2 = 14.0  # of two degrees of freedom: by chance once in a thousand
 _SMALLEST_PX = 0.5  # of the one behind
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
@@ -77,24 +85,30 @@ def eclipses(
     -------
     By index what explains a window well; nothing where nothing does.
     """
-    pairs = {}
+    pairs, least_px, of_layouts = {}, _least_radius_px(camera), _knows_layouts(camera)
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd:
             continue
         guesses: list[list[Start]] = []
-        if one is None or (one.count == 1 and asks_for_more(one)):
+        if one is None or (one.count == 1 and (asks_for_more(one) or (of_layouts and _is_long(one)))):
             guesses = _guesses(cluster, camera)
-        of_two = [each.starts for each in (one, parted.get(index)) if each is not None and _is_near(each)]
+        of_two = [
+            each.starts for each in (one, parted.get(index)) if each is not None and _is_near(each, least_px)
+        ]
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
         fits.sort(key=lambda fit: fit.objective)
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
         good: list[Solution] = []
         for fit in fits:
             pair = fit.solution() if len(good) < _TRIED else None
-            if pair is not None and _is_pair(pair) and _are_apart(pair, camera):
+            if pair is not None and _is_pair(pair, least_px) and _are_apart(pair, camera):
                 good.append(pair)
         likeliest = min(good, key=lambda pair: pair.cost, default=None)
-        if likeliest is not None and gain_over_oval(likeliest, camera) >= LEAST_GAIN:
+        if likeliest is None:
+            continue
+        # Where robots are known to carry sources so far apart, globes that are not round are the odder guess.
+        least_gain = _LEAST_OF_A_LAYOUT if _is_of_a_layout(likeliest, camera) else LEAST_GAIN
+        if gain_over_oval(likeliest, camera) >= least_gain:
             pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
     return pairs
 
@@ -121,28 +135,63 @@ def _may_be_other(pair: Solution, camera: Camera) -> bool:
     return False
 
 
-def _is_pair(several: Solution) -> bool:
+def _knows_layouts(camera: Camera) -> bool:
+    """Tell whether robots are known to carry several sources."""
+    return any(len(layout.places_body_m) > 1 for layout in camera.calibration.layouts)
+
+
+def _least_radius_px(camera: Camera) -> float:
+    """Return of how small images eclipses are looked for."""
+    return LEAST_OF_A_LAYOUT_PX if _knows_layouts(camera) else LEAST_RADIUS_PX
+
+
+def _is_long(one: Solution) -> bool:
+    """Tell whether an image is longer than wide, however well one flare explains it but for that."""
+    window = one.window
+    chi2, _, _ = drawn_out(
+        window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu
+    )
+    return chi2 > _DRAWN_OUT_CHI2
+
+
+def _is_pair(several: Solution, least_px: float) -> bool:
     """Tell whether flares are two, well fitted, resolved, and one within two radii of the other."""
-    return several.left_over.is_good and _is_near(several)
+    return several.left_over.is_good and _is_near(several, least_px)
 
 
-def _is_near(several: Solution) -> bool:
+def _is_near(several: Solution, least_px: float) -> bool:
     """Tell whether flares are two, resolved, and one within two radii of the other."""
     if several.count != 2:
         return False
     apart_px = math.hypot(several.u_px[0] - several.u_px[1], several.v_px[0] - several.v_px[1])
     near_px, far_px = float(several.image_radius_px.max()), float(several.image_radius_px.min())
-    return near_px > LEAST_RADIUS_PX and far_px > _SMALLEST_PX and apart_px < 2.0 * near_px + far_px
+    return near_px > least_px and far_px > _SMALLEST_PX and apart_px < 2.0 * near_px + far_px
 
 
 def _are_apart(pair: Solution, camera: Camera) -> bool:
     """Tell whether two spheres may stand where they are said to: middles two radii apart, or more."""
+    apart_m, sigma_m = _apart_m(pair, camera)
+    return apart_m + _OTHER_SIGMAS * sigma_m >= 2.0 * camera.radius_m
+
+
+def _is_of_a_layout(pair: Solution, camera: Camera) -> bool:
+    """Tell whether two spheres may be sources of one robot, as far apart as a layout has them."""
+    apart_m, sigma_m = _apart_m(pair, camera)
+    arms_m = (
+        math.dist(one, other)
+        for layout in camera.calibration.layouts
+        for one, other in combinations(layout.places_body_m, 2)
+    )
+    return any(abs(apart_m - arm_m) <= _OTHER_SIGMAS * sigma_m + camera.radius_m for arm_m in arms_m)
+
+
+def _apart_m(pair: Solution, camera: Camera) -> tuple[float, float]:
+    """Return how far apart two spheres stand, and its standard deviation by their ranges."""
     place = direction_camera(np.column_stack([pair.u_px, pair.v_px]), camera.calibration)
     place *= np.exp(pair.log_range)[:, None]
     between = place[0] - place[1]
     apart_m = float(np.linalg.norm(between))
-    sigma_m = float(np.hypot(*(place @ between / max(apart_m, 1e-12) * pair.log_range_sigma)))
-    return bool(apart_m + _OTHER_SIGMAS * sigma_m >= 2.0 * camera.radius_m)
+    return apart_m, float(np.hypot(*(place @ between / max(apart_m, 1e-12) * pair.log_range_sigma)))
 
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
@@ -155,7 +204,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
     near_px = 0.5 * (float(np.ptp(across)) + 1.0)
-    if near_px < LEAST_RADIUS_PX:
+    if near_px < _least_radius_px(camera):
         return []
     corner = np.array([window.box.left, window.box.top], dtype=np.float64)
     u_px, v_px = (corner + middle).tolist()

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from nir_render.errors import InputError
-from nir_render.run.perceive import chosen_estimators, frame_estimators, perceive_run
+from nir_render.run.folder import read_period_s
+from nir_render.run.perceive import chosen_estimators, estimators_in_process, perceive_run
 from perception import (
     Odometry,
     calibration_document,
@@ -179,14 +180,45 @@ def test_two_commands_of_one_name_are_refused() -> None:
         chosen_estimators([f"a=cmd: {sys.executable} x", f"a=cmd: {sys.executable} y"])
 
 
-def test_what_cannot_read_a_frame_by_itself_is_no_estimator_of_a_campaign(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text("def sets(frames, calibrations, odometry): ...\n")
-    for reference, kind in (
-        (f"a=cmd: {sys.executable}", "is a command"),
-        (f"{tmp_path / 'own.py'}:sets", "sets of frames"),
-    ):
-        with pytest.raises(InputError, match=kind):
-            frame_estimators([reference])
+def test_a_command_is_no_estimator_of_a_campaign() -> None:
+    with pytest.raises(InputError, match="is a command"):
+        estimators_in_process([f"a=cmd: {sys.executable}"])
+
+
+def test_exposures_of_a_bracket_are_one_set_where_the_period_is_given(recording: Path) -> None:
+    """Three exposures 10 ms apart, every second: by the median interval nine sets, in fact three of two cameras."""
+    lines = [json.loads(line) for line in (recording / "frames.jsonl").read_text().splitlines()]
+    taken = [
+        {
+            **line,
+            "index": 3 * line["index"] + k,
+            "time_s": 10.0 * line["time_s"] + 0.01 * k,
+            "exposure_s": exposure_s,
+        }
+        for line in lines
+        for k, exposure_s in enumerate((1.2e-4, 2.4e-4, 4.8e-4))
+    ]
+    (recording / "frames.jsonl").write_text("\n".join(map(json.dumps, taken)))
+    chosen = chosen_estimators(["robust"])
+
+    def sets() -> list[int]:
+        said = (recording / "measurements.robust.jsonl").read_text().splitlines()
+        return sorted(len(json.loads(line)["detections"]) for line in said)
+
+    perceive_run(recording, estimators=chosen, progress=lambda *_: None)
+    assert len(sets()) > 3
+    assert read_period_s(recording) is None
+    perceive_run(recording, estimators=chosen, progress=lambda *_: None, period_s=1.0)
+    assert sum(sets()) == 18
+    assert len(sets()) == 6  # of either camera, as both show it in the same pixels
+    assert max(sets()) == 3
+    assert read_period_s(recording) == 1.0
+    (recording / "sets.json").write_text('{"format": 1, "period_s": -1}')
+    with pytest.raises(InputError, match="write a time above 0"):
+        read_period_s(recording)
+    for wrong in ("0", "nan"):
+        done = nir_render("perceive", str(recording), "--period", wrong, cwd=recording)
+        assert (done.returncode, "wanted seconds above 0, such as 0.1" in done.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("limit", ["0", "-1", "nan", "inf"])
