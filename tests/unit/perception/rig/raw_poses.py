@@ -96,7 +96,7 @@ def mean_e(camera: Calibration, places: Sequence[Array], relative_flux: Sequence
         light = lit * radiance * EXPOSURE_S * cosine**4 / (camera.fx_px * SAMPLES) ** 2
         spread = gaussian_filter(light, camera.psf_sigma_px * SAMPLES, truncate=6.0, mode="constant")
         pixels = spread.reshape(size, SAMPLES, size, SAMPLES).sum(axis=(1, 3))
-        rows, columns = slice(max(top, 0), top + size), slice(max(left, 0), left + size)
+        rows, columns = slice(max(top, 0), max(top + size, 0)), slice(max(left, 0), max(left + size, 0))
         part = image[rows, columns]
         part += pixels[rows.start - top :, columns.start - left :][: part.shape[0], : part.shape[1]]
     return image
@@ -109,7 +109,7 @@ def _disc(camera: Calibration, x: Array, y: Array, cosine: Array, at: tuple[floa
     # Twice the sine of half the angle between directions, without cancellation; edges soft over a sample.
     away = np.sqrt((x * cosine - middle[0]) ** 2 + (y * cosine - middle[1]) ** 2 + (cosine - middle[2]) ** 2)
     radius = 2.0 * math.sin(0.5 * math.asin(camera.source_radius_m / at[2]))
-    return np.clip(0.5 + (radius - away) * camera.fx_px * SAMPLES, 0.0, 1.0)
+    return np.asarray(np.clip(0.5 + (radius - away) * camera.fx_px * SAMPLES, 0.0, 1.0))
 
 
 def bound_of_frames_rad(cameras: dict[str, Calibration], layout: Layout, pose: Array) -> float:
@@ -149,9 +149,9 @@ def bound_of_frames_rad(cameras: dict[str, Calibration], layout: Layout, pose: A
 
     if not sigmas or not np.isfinite(list(sigmas.values())).all():
         return math.inf
-    at, step = np.append(pose, 0.0), 1e-5
+    here, step = np.append(pose, 0.0), 1e-5
     slopes = np.column_stack(
-        [(seen(at + step * axis) - seen(at - step * axis)) / (2.0 * step) for axis in np.eye(5)]
+        [(seen(here + step * axis) - seen(here - step * axis)) / (2.0 * step) for axis in np.eye(5)]
     )
     information = slopes.T @ slopes
     information[4, 4] += 1.0
