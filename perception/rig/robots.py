@@ -11,8 +11,8 @@ from perception.rig.frame_sets import Exposed
 from perception.rig.moving import OneTime
 from perception.rig.pose.gates import GATE_CHI2, HEADINGS, Places, fitting
 from perception.rig.pose.partings import Candidate, told_apart
-from perception.rig.pose.posterior import LEAST_ODDS, evidence_alone, posterior
-from perception.rig.pose.sights import Sights, carried, sights_of
+from perception.rig.pose.posterior import LEAST_ODDS, Posterior, evidence_alone, posterior
+from perception.rig.pose.sights import Sights, carried, sights_of, symmetries
 from perception.types import Calibration, Detection, Layout, Measurement, PoseHypothesis, RobotPose
 
 Array = NDArray[np.float64]
@@ -157,9 +157,18 @@ def _candidate(members: tuple[int, ...], seen: _Seen, layout: Layout, fits: Pair
         return None
     counts = [len(seen.rows[k]) for k in members]
     body, ways = carried(layout), []
+    turns = symmetries(layout)
+    known: dict[tuple[int, ...], Posterior | None] = {}
     for way, headings in _ways(members, sources, fits):
-        shown = np.repeat(np.array(way), counts)
-        found = posterior(seen.sights, rows, body, shown, headings, GATE_CHI2 + 3 * len(rows))
+        if way not in known:
+            shown = np.repeat(np.array(way), counts)
+            known[way] = posterior(seen.sights, rows, body, shown, headings, GATE_CHI2 + 3 * len(rows))
+            for turn_rad, onto in turns:  # the same said otherwise
+                again = known[way]
+                known[tuple(onto[source] for source in way)] = (
+                    None if again is None else again.turned(turn_rad)
+                )
+        found = known[way]
         if found is not None:
             log_prior = len(members) * math.log(SEEN) + hidden * math.log(1.0 - SEEN)
             ways.append((way, found, found.log_evidence + log_prior + math.log(PER_M3)))

@@ -1,6 +1,8 @@
 """What is seen of sources, as the search for poses reckons with it."""
 
+import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +24,8 @@ SIZE_TELLS = 0.1
 
 UNTOLD_RAD = 1.0
 """σ of angles where nothing is told of them."""
+
+_SAME_M = 1e-6
 
 
 class Sights(NamedTuple):
@@ -78,6 +82,31 @@ def carried(layout: Layout) -> Carried:
         layout.flux_sigma_common,
         layout.flux_sigma_own,
     )
+
+
+@lru_cache(maxsize=64)
+def symmetries(layout: Layout) -> tuple[tuple[float, tuple[int, ...]], ...]:
+    """Return the turns (rad) about z under which a layout is the same, and what takes whose place in each.
+
+    A robot that heads by such a turn farther, each of its sources taken for the one whose place it takes,
+    looks just alike. No turn at all is left out.
+    """
+    places_m, flux = np.array(layout.places_body_m), layout.relative_flux
+    from_axis_m = np.hypot(places_m[:, 0], places_m[:, 1])
+    first = int(np.argmax(from_axis_m))
+    found = []
+    for to in range(len(flux)):
+        turn_rad = math.atan2(places_m[first, 1], places_m[first, 0])
+        turn_rad -= math.atan2(places_m[to, 1], places_m[to, 0])
+        cosine, sine = math.cos(turn_rad), math.sin(turn_rad)
+        turned_m = places_m @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        apart_m = np.linalg.norm(turned_m[:, None] - places_m, axis=2)
+        onto = tuple(np.argmin(apart_m, axis=1).tolist())
+        same = to != first and len(set(onto)) == len(flux) and float(apart_m.min(axis=1).max()) < _SAME_M
+        if same and all(flux[k] == flux[n] for k, n in enumerate(onto)):
+            # What stood at k now stands at onto[k]: taken for it, the robot heads by as much less.
+            found.append((-turn_rad, onto))
+    return tuple(found)
 
 
 def sights_of(
