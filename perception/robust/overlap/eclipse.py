@@ -8,14 +8,13 @@ nearer, so that the expected image and its derivatives, by places and sizes of b
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera, pixel_turn
 from perception.model.flare import image_radius_px
-from perception.model.layout import View
+from perception.model.layout import UNUSABLE, View
 from perception.model.pixels import (
     FIRST_DAMPING,
     LEAST_DAMPING,
@@ -28,25 +27,27 @@ from perception.model.pixels import (
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.goodness import drawn_out
+from perception.robust.goodness import MODEL_ERROR, drawn_out
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
 from perception.robust.overlap.hidden import expectation_of_two
 from perception.robust.overlap.oval import gain_over_oval
+from perception.robust.overlap.pairs import (
+    OTHER_SIGMAS,
+    are_apart,
+    is_near,
+    is_of_a_layout,
+    knows_layouts,
+    least_radius_px,
+    nearest_two,
+    pair_of,
+)
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
 Array = NDArray[np.float64]
 
-LEAST_RADIUS_PX = 1.5
-"""Smaller images tell hardly anything of which of two hides the other."""
-
-LEAST_OF_A_LAYOUT_PX = 0.8
-"""But where a robot's sources are known to stand so close that one may hide the other, what they add up to is
-not what is seen of them however small they are; here they are blurred to points."""
-
 _LEAST_OF_A_LAYOUT = -6.0  # of 2 Δ ln L: an oval is believed where it is twenty times as likely as they are
 _DRAWN_OUT_CHI2 = 14.0  # of two degrees of freedom: by chance once in a thousand
-_SMALLEST_PX = 0.5  # of the one behind
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
@@ -59,7 +60,6 @@ _DIMMEST, _BRIGHTEST = (
 _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
 
-_OTHER_SIGMAS = 3.0
 # In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
 _SETTLED = 0.02
 
@@ -71,6 +71,9 @@ def eclipses(
     camera: Camera,
 ) -> dict[int, Solution]:
     """Explain windows by two resolved spheres, one partly behind the other.
+
+    Where robots are known to carry several sources, smaller ones too, others may be beside them, and two that
+    stand as far apart as a robot's are believed where one that is not quite round would explain as much.
 
     Parameters
     ----------
@@ -85,15 +88,19 @@ def eclipses(
     -------
     By index what explains a window well; nothing where nothing does.
     """
-    pairs, least_px, of_layouts = {}, _least_radius_px(camera), _knows_layouts(camera)
+    pairs, least_px, of_layouts = {}, least_radius_px(camera), knows_layouts(camera)
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd:
             continue
         guesses: list[list[Start]] = []
+        if of_layouts and one is not None and one.count > 1 and asks_for_more(one):
+            guesses = _guesses_beside(cluster, one, camera)
         if one is None or (one.count == 1 and (asks_for_more(one) or (of_layouts and _is_long(one)))):
             guesses = _guesses(cluster, camera)
         of_two = [
-            each.starts for each in (one, parted.get(index)) if each is not None and _is_near(each, least_px)
+            each.starts
+            for each in (one, parted.get(index))
+            if each is not None and (of_layouts or each.count == 2) and is_near(each, least_px)
         ]
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
         fits.sort(key=lambda fit: fit.objective)
@@ -101,14 +108,15 @@ def eclipses(
         good: list[Solution] = []
         for fit in fits:
             pair = fit.solution() if len(good) < _TRIED else None
-            if pair is not None and _is_pair(pair, least_px) and _are_apart(pair, camera):
+            if pair is not None and _is_pair(pair, least_px) and are_apart(pair, camera):
                 good.append(pair)
         likeliest = min(good, key=lambda pair: pair.cost, default=None)
         if likeliest is None:
             continue
         # Where robots are known to carry sources so far apart, globes that are not round are the odder guess.
-        least_gain = _LEAST_OF_A_LAYOUT if _is_of_a_layout(likeliest, camera) else LEAST_GAIN
-        if gain_over_oval(likeliest, camera) >= least_gain:
+        of_one_robot = is_of_a_layout(likeliest, camera)
+        least_gain = _LEAST_OF_A_LAYOUT if of_one_robot else LEAST_GAIN
+        if of_one_robot if likeliest.count > 2 else gain_over_oval(likeliest, camera) >= least_gain:
             pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
     return pairs
 
@@ -118,31 +126,22 @@ def _may_be_other(pair: Solution, camera: Camera) -> bool:
 
     Tried with its outer edge held where it is seen, at the range of the nearer, and half way there.
     """
-    near, far = int(np.argmax(pair.image_radius_px)), int(np.argmin(pair.image_radius_px))
-    (near_u, near_v, near_log), (far_u, far_v, far_log) = pair.starts[near], pair.starts[far]
+    near, far = sorted(pair_of(pair), key=lambda k: -float(pair.image_radius_px[k]))
+    starts = pair.starts
+    (near_u, near_v, near_log), (far_u, far_v, far_log) = starts[near], starts[far]
     apart_px = max(math.hypot(far_u - near_u, far_v - near_v), 1e-9)
     for share in (0.5, 1.0):
         log_range = far_log + share * (near_log - far_log)
         inwards = float(pair.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
-        starts: list[Start] = [(near_u, near_v, near_log), (*place, log_range)]
+        starts[far] = (*place, log_range)
         other = _Eclipse(Problem(pair.window, starts, pair.background_e), camera).solution()
         if other is None or other.cost > pair.cost + _RIVAL:
             continue
-        farthest = abs(other.log_range.max() - pair.log_range.max())
-        if farthest > _OTHER_SIGMAS * float(pair.log_range_sigma[far]):
+        farthest = abs(other.log_range[[near, far]].max() - pair.log_range[far])
+        if farthest > OTHER_SIGMAS * float(pair.log_range_sigma[far]):
             return True
     return False
-
-
-def _knows_layouts(camera: Camera) -> bool:
-    """Tell whether robots are known to carry several sources."""
-    return any(len(layout.places_body_m) > 1 for layout in camera.calibration.layouts)
-
-
-def _least_radius_px(camera: Camera) -> float:
-    """Return of how small images eclipses are looked for."""
-    return LEAST_OF_A_LAYOUT_PX if _knows_layouts(camera) else LEAST_RADIUS_PX
 
 
 def _is_long(one: Solution) -> bool:
@@ -156,42 +155,7 @@ def _is_long(one: Solution) -> bool:
 
 def _is_pair(several: Solution, least_px: float) -> bool:
     """Tell whether flares are two, well fitted, resolved, and one within two radii of the other."""
-    return several.left_over.is_good and _is_near(several, least_px)
-
-
-def _is_near(several: Solution, least_px: float) -> bool:
-    """Tell whether flares are two, resolved, and one within two radii of the other."""
-    if several.count != 2:
-        return False
-    apart_px = math.hypot(several.u_px[0] - several.u_px[1], several.v_px[0] - several.v_px[1])
-    near_px, far_px = float(several.image_radius_px.max()), float(several.image_radius_px.min())
-    return near_px > least_px and far_px > _SMALLEST_PX and apart_px < 2.0 * near_px + far_px
-
-
-def _are_apart(pair: Solution, camera: Camera) -> bool:
-    """Tell whether two spheres may stand where they are said to: middles two radii apart, or more."""
-    apart_m, sigma_m = _apart_m(pair, camera)
-    return apart_m + _OTHER_SIGMAS * sigma_m >= 2.0 * camera.radius_m
-
-
-def _is_of_a_layout(pair: Solution, camera: Camera) -> bool:
-    """Tell whether two spheres may be sources of one robot, as far apart as a layout has them."""
-    apart_m, sigma_m = _apart_m(pair, camera)
-    arms_m = (
-        math.dist(one, other)
-        for layout in camera.calibration.layouts
-        for one, other in combinations(layout.places_body_m, 2)
-    )
-    return any(abs(apart_m - arm_m) <= _OTHER_SIGMAS * sigma_m + camera.radius_m for arm_m in arms_m)
-
-
-def _apart_m(pair: Solution, camera: Camera) -> tuple[float, float]:
-    """Return how far apart two spheres stand, and its standard deviation by their ranges."""
-    place = direction_camera(np.column_stack([pair.u_px, pair.v_px]), camera.calibration)
-    place *= np.exp(pair.log_range)[:, None]
-    between = place[0] - place[1]
-    apart_m = float(np.linalg.norm(between))
-    return apart_m, float(np.hypot(*(place @ between / max(apart_m, 1e-12) * pair.log_range_sigma)))
+    return several.left_over.is_good and is_near(several, least_px)
 
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
@@ -204,7 +168,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
     near_px = 0.5 * (float(np.ptp(across)) + 1.0)
-    if near_px < _least_radius_px(camera):
+    if near_px < least_radius_px(camera):
         return []
     corner = np.array([window.box.left, window.box.top], dtype=np.float64)
     u_px, v_px = (corner + middle).tolist()
@@ -225,6 +189,23 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
                 starts.append((u, v, math.log(at_1_m_px / radius_px)))
             guesses.append(starts)
     return guesses
+
+
+def _guesses_beside(cluster: Cluster, several: Solution, camera: Camera) -> list[list[Start]]:
+    """Return first guesses of two discs in the place of that flare which explains what is around it worst."""
+    window, rest = cluster.window, list(several.starts)
+    rows, columns = np.indices(window.image_e.shape)
+    away_px = [
+        np.hypot(columns + window.box.left - u, rows + window.box.top - v)
+        for u, v in zip(several.u_px, several.v_px, strict=True)
+    ]
+    nearest = np.argmin(away_px, axis=0)
+    left2 = several.residual_e**2 / several.variance_e2(MODEL_ERROR)
+    worst = int(np.argmax([left2[nearest == k].sum() for k in range(several.count)]))
+    del rest[worst]
+    around = np.where(nearest == worst, window.state, UNUSABLE).astype(np.uint8)
+    alone = replace(cluster, window=replace(window, state=around))
+    return [[*two, *rest] for two in _guesses(alone, camera)]
 
 
 def lit_pixels(cluster: Cluster) -> tuple[float, Array] | None:
@@ -257,6 +238,7 @@ class _Eclipse:
     def __init__(self, problem: Problem, camera: Camera) -> None:
         self._fit = fit = Fit(problem, camera)
         self._camera = camera
+        self._pair = nearest_two(np.array(problem.starts)[:, :2])
         box, window = fit.window.box, fit.window
         known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
         self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
@@ -335,24 +317,24 @@ class _Eclipse:
         fit, camera, layout = self._fit, self._camera, self._fit.layout
         own = layout.of_sources(values)
         by_size = log_range_by_size(own, fit)
-        near = int(np.argmin(by_size))
+        near, far = sorted(self._pair, key=lambda k: float(by_size[k]))
         hidden_px = hidden_px_at_1_m(own, camera)
         hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
-        fineness = np.where(np.arange(2) == near, 1.0, self._finer)
+        fineness = np.where(np.arange(layout.sources) == far, self._finer, 1.0)
         laid, imaged = lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=fineness)
         fit.log_flux_at_1_m, fit.image_radius_px = laid.log_flux_at_1_m, laid.reach_px
         flux = np.exp(laid.log_flux_at_1_m - 2.0 * own[:, 2])
         flux[~imaged] = math.nan  # nowhere to go on to
-        middle_px, first, end = own[near : near + 1, :2], *laid.first_node[1 - near : 3 - near]
+        middle_px, first, end = own[near : near + 1, :2], *laid.first_node[far : far + 2]
         offset = np.column_stack([laid.node_u_px[first:end], laid.node_v_px[first:end]])
-        away = direction_camera(own[1 - near, :2] + offset, camera.calibration)
+        away = direction_camera(own[far, :2] + offset, camera.calibration)
         away -= direction_camera(middle_px, camera.calibration)
         turn = pixel_turn(middle_px, camera.calibration)[0]
         radius_rad = math.asin(min(camera.radius_m * math.exp(-float(by_size[near])), 1.0))
         expected = np.empty(self._view.image_e.size)
         jacobian = np.zeros((layout.size, len(expected)))
         expectation_of_two(
-            values, near, flux, away, turn, radius_rad, self._view, laid, fit.structure, fit.known,
+            values, near, far, flux, away, turn, radius_rad, self._view, laid, fit.structure, fit.known,
             expected, jacobian,
         )  # fmt: skip
         return expected, jacobian
