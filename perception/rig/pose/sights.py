@@ -25,6 +25,10 @@ SIZE_TELLS = 0.1
 UNTOLD_RAD = 1.0
 """σ of angles where nothing is told of them."""
 
+MERGED_PX, MERGED_RANGE = 0.7, 0.15
+"""What a flare that does not look like one source may be off by at least, and its range relatively: two that
+overlap are a pixel or two apart, and seem up to a seventh too near, or one of them too far."""
+
 _SAME_M = 1e-6
 
 
@@ -143,8 +147,11 @@ def sights_of(
     noise2[sized] = np.maximum(by_size.flux_noise[sized] ** 2, LEAST_NOISE**2)
     of_camera2 = np.minimum(CAMERAS_SHARE * common**2, CAMERAS_MOST**2)
     noise2 += found.together.noise**2 - rays.noise**2  # where the observer moved between its cameras
+    noise2[found.merged] += MERGED_RANGE**2
+    per_px = np.array([1.0 / calibrations[name].fx_px for name in names])[camera]
+    own_rad2 = (MERGED_PX * per_px * found.merged) ** 2 - found.mounting_rad2
     own = np.zeros((n + len(sized), 3, 3))
-    own[:n, :2, :2] = found.together.angular_rad2 - found.mounting_rad2[:, None, None] * np.eye(2)
+    own[:n, :2, :2] = found.together.angular_rad2 + own_rad2[:, None, None] * np.eye(2)
     own[:n, 2, 2] = np.where(claimed, noise2, np.where(ranged, UNCLAIMED_RANGE**2, UNKNOWN_RANGE**2))
     own[n:, 0, 0] = own[n:, 1, 1] = UNTOLD_RAD**2
     own[n:, 2, 2] = by_size.size_noise[sized] ** 2
