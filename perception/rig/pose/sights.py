@@ -29,6 +29,9 @@ MERGED_PX, MERGED_RANGE = 0.7, 0.15
 """What a flare that does not look like one source may be off by at least, and its range relatively: two that
 overlap are a pixel or two apart, and seem up to a seventh too near, or one of them too far."""
 
+MOST_SIGMAS, MOST_FACTOR = 4.0, 0.7
+"""How far ranges by flux may be from those that are stated, in σ of the range constant and beyond: ln 2."""
+
 _SAME_M = 1e-6
 
 
@@ -208,11 +211,13 @@ def _by_size(
         range_m, sigma_m, flux_dn, flux_sigma_dn, saturated = np.array(told, dtype=np.float64).T
         by_flux_m = clear_air_ranges_m(found, frame, calibration)
         usable = np.isfinite(by_flux_m + sigma_m) & (sigma_m > 0.0) & (range_m > 0.0) & (saturated == 0.0)
+        # Who has fluxes of a scale of their own says nothing by them.
+        constant = _relative_sigma_of_k(calibration)
+        ratio = np.where(usable, by_flux_m, 1.0) / np.where(usable, range_m, 1.0)
+        usable &= abs(np.log(ratio)) < MOST_SIGMAS * 0.5 * constant + MOST_FACTOR
         share = np.where(usable, flux_sigma_dn, 1.0) / np.where(usable, flux_dn, 1.0)
         range_m, sigma_m, by_flux_m = (np.where(usable, each, 1.0) for each in (range_m, sigma_m, by_flux_m))
-        size_m, size_sigma_m = size_alone(
-            range_m, sigma_m, by_flux_m, share, _relative_sigma_of_k(calibration), SIZE_TELLS
-        )
+        size_m, size_sigma_m = size_alone(range_m, sigma_m, by_flux_m, share, constant, SIZE_TELLS)
         size_m = np.where(usable, size_m, np.nan)
         parts.append(np.array([np.log(by_flux_m), 0.5 * share, np.log(size_m), size_sigma_m / size_m]))
     log_flux, flux_noise, log_size, size_noise = np.concatenate([np.empty((4, 0)), *parts], axis=1)

@@ -88,6 +88,9 @@ def test_a_range_by_flux_and_size_is_parted_again() -> None:
     assert math.hypot(sights.constant[0], float(sights.shared[0, 2, 6])) == pytest.approx(0.15, rel=1e-9)
     assert sights.constant[1] == 0.0
     assert not sights.shared[1].any()
+    # Fluxes of a scale of one's own, as another program may give them, are not listened to.
+    other = [[replace(hit, flux_dn=50.0 * flux_dn, flux_sigma_dn=50.0 * share * flux_dn)]]
+    assert sights_of(known, [frame], other, calibrations).size.tolist() == [-1]
 
 
 @pytest.mark.verify
