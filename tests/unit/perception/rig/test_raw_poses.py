@@ -100,11 +100,16 @@ def test_a_range_by_flux_and_size_is_parted_again() -> None:
     ids=["alike", "unlike", "three"],
 )
 def test_headings_from_raw_frames(layout: Layout, turn: float, changes: dict[str, dict[str, float]]) -> None:
-    """60 poses each; `benchmarks/headings.py --raw` takes more."""
-    found = figures(layout, 60, turn, seed=1541, look=photographed, **changes)
-    right = replace(found, **{
-        name: getattr(found, name)[~found.astray] for name in ("error", "sigma", "bound", "pulls2")
-    })  # fmt: skip
-    assert found.lost <= 4  # end-on: one flare
-    assert against_bound(right)[0] < 1.25
-    assert found.astray.sum() <= 2
+    """40 poses each; `benchmarks/headings.py --raw` takes more.
+
+    One in twenty is within a degree or two of end-on: one flare, no heading. Bounds know nothing of what sources
+    hide of each other, so that only of two alike, which hide each other seldom, they are held against.
+    """
+    found = figures(layout, 40, turn, seed=1541, look=photographed, **changes)
+    assert found.lost <= 5
+    assert found.astray.sum() <= 1
+    if layout is ALIKE:
+        right = replace(found, **{
+            name: getattr(found, name)[~found.astray] for name in ("error", "sigma", "bound", "pulls2")
+        })  # fmt: skip
+        assert against_bound(right)[0] < 1.25
