@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from tests.unit.perception.rig.raw_poses import cropped, frames_of_robot, photog
 from tests.unit.perception.rig.world import detection, frame_without_pixels, rig
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M
 
-BROAD = {"sigma": {"range_constant_dn_m2_per_s": 0.3 * 0.74 * FLUX_PER_S_AT_1_M}}
+BROAD: dict[str, Any] = {"sigma": {"range_constant_dn_m2_per_s": 0.3 * 0.74 * FLUX_PER_S_AT_1_M}}
 KNOWN = replace(UNLIKE, flux_sigma_common=2.0 * COMMON)
 
 
@@ -99,7 +100,7 @@ def test_a_range_by_flux_and_size_is_parted_again() -> None:
     [(ALIKE, math.pi, {}), (KNOWN, 2.0 * math.pi, BROAD), (THREE, 2.0 * math.pi, {})],
     ids=["alike", "unlike", "three"],
 )
-def test_headings_from_raw_frames(layout: Layout, turn: float, changes: dict[str, dict[str, float]]) -> None:
+def test_headings_from_raw_frames(layout: Layout, turn: float, changes: dict[str, Any]) -> None:
     """40 poses each; `benchmarks/headings.py --raw` takes more.
 
     One in twenty is within a degree or two of end-on: one flare, no heading. Bounds know nothing of what sources
