@@ -12,7 +12,7 @@ from typing import Any
 
 from nir_render.errors import InputError
 from nir_render.run.manifest import versions as run_versions
-from nir_render.run.perceive import frame_estimators
+from nir_render.run.perceive import estimators_in_process
 from nir_render.scene.documents.camera import Rig
 from nir_render.scene.documents.document import SceneDocument
 from nir_render.scene.scene import Scene
@@ -21,7 +21,7 @@ from nir_render.stress.design.points import Point, number_of_points, points_of
 from nir_render.transport.backend.cores import usual_workers
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.fingerprint import code_hash
-from perception.estimators import OwnEstimator
+from perception.estimators import OwnEstimator, OwnSetEstimator
 from perception.own_code import files_of
 
 # What shows results, and what is asked for, do not change them.
@@ -219,8 +219,8 @@ def made_by_of(names: Sequence[str], processor: str = "") -> tuple[str, ...]:
     from nir_render.transport.backend.variant import backend
     from nir_render.transport.cache_key import versions
 
-    estimators = frame_estimators(names)
-    own = (one.path for one in estimators.values() if isinstance(one, OwnEstimator))
+    estimators = estimators_in_process(names)
+    own = (one.path for one in estimators.values() if isinstance(one, OwnEstimator | OwnSetEstimator))
     files = sorted({file for path in own for file in files_of(path)})
     contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
     packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")

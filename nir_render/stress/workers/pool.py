@@ -26,7 +26,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.scheduler import KilledWorker
 
 from nir_render.errors import InputError
-from nir_render.run.perceive import frame_estimators
+from nir_render.run.perceive import estimators_in_process
 from nir_render.scene.scene import Scene
 from nir_render.stress.job.execute import execute
 from nir_render.stress.jobs import Job, is_same, made_by_of
@@ -45,7 +45,7 @@ from nir_render.stress.workers.recycle import JOBS, recycle
 from nir_render.transport.backend.cores import cores, thread_settings
 from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
-from perception import Estimator
+from perception import Estimator, OwnSetEstimator
 
 PART_KIND = ".parquet"
 _STARTS = 4
@@ -247,7 +247,7 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
 
     def __init__(self, work: Work, terms: Terms | None) -> None:
         self.work, self.terms = work, terms
-        self._estimators: dict[str, Estimator] | None = None
+        self._estimators: dict[str, Estimator | OwnSetEstimator] | None = None
         self._made_by: tuple[str, ...] = ()
         self._cache: LightCache | None = None
         self._threads = 0
@@ -264,7 +264,7 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
         if self._estimators is None:  # here, not at the start: Mitsuba's variant belongs to this thread
             if self.terms is not None:
                 check_this_worker(self.terms)
-            self._estimators = frame_estimators(self.work.estimators)
+            self._estimators = estimators_in_process(self.work.estimators)
             self._cache = LightCache(
                 self.work.light,
                 limit_bytes=self.work.light_limit_bytes,

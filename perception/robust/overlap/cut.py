@@ -19,8 +19,9 @@ from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
-from perception.robust.overlap.eclipse import LEAST_RADIUS_PX, finer, is_as_bright, lit_pixels
+from perception.robust.overlap.eclipse import finer, is_as_bright, lit_pixels
 from perception.robust.overlap.hidden import RAMP_PX
+from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.problem import Problem
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
