@@ -15,8 +15,10 @@ import multiprocessing
 import resource
 import sys
 import time
+from collections.abc import Hashable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -46,8 +48,9 @@ def frames_of(robots: int, names: list[str]) -> tuple[float, float, int]:
 
     scene = hall(robots)
     world, frames = scene.at(0.0), 0
+    kept: dict[Hashable, Any] = {}
     for name in (camera for robot in names for camera in scene.document.cameras_of(robot)):
-        light = render(world, name, SEED)
+        light = render(world, name, SEED, kept=kept)
         setting = own_setting(world.camera(name).camera, 0)
         levels = {
             source: float(mean_level(drive_of(placed.source), TIME_S, setting.exposure_s))

@@ -201,11 +201,19 @@ def pip_environment(environ: "dict[str, str]") -> "dict[str, str]":
 
 
 def compile_loops() -> None:
-    """Compile the loops of perception, so that no first frame waits for it."""
-    import perception
+    """Compile the loops of perception, so that no first frame waits for it: in two processes at once."""
+    from perception.warm_up import warm_up_frames
 
-    say("compiling the loops of perception")
-    perception.warm_up()
+    say("compiling the loops of perception (a minute or two)")
+    other = subprocess.Popen(
+        [sys.executable, "-c", "from perception.warm_up import warm_up_sets; warm_up_sets()"], cwd=ROOT
+    )
+    try:
+        warm_up_frames()
+    finally:
+        status = other.wait()
+    if status:
+        say(f"a loop did not compile (status {status}): the first frames will wait for it")
 
 
 # LLVM

@@ -35,9 +35,8 @@ class SharedLight:
     groups
         Their numbers in the light.
     mean_share, worst_share
-        The mean square that the frame is off by, at most, over its temporal variance: of all pixels, and of
-        the worst block of the film. At most: as if each blinked by itself and were dark half of the time,
-        and all that a block is off by fell on it alone.
+        The mean square that the film is off by over its temporal variance: of all blocks, and of the worst
+        one; as if each blinked by itself and were dark half of the time. The lens's blur makes it less.
     """
 
     groups: tuple[int, ...]
@@ -48,8 +47,10 @@ class SharedLight:
 def shared_light(light: Light, snapshot: Snapshot, exposure_s: float, most_share: float) -> SharedLight:
     """Return the groups that may share an image so that no block is off by more than a share of its noise.
 
-    The faintest first, as many as that allows. The square of what a group brings to a block counts a quarter:
-    no drive between 0 and 1 varies more. What the render's own noise adds to it makes the bound larger.
+    The faintest first, as many as that allows. With drives d of groups that bring f to a block, and w the
+    share of each in all that they send, the block is off by Σ d (f − w Σ f): in the mean square a quarter of
+    Σ (f − w Σ f)², as no drive between 0 and 1 varies more than by a quarter about its mean. What the
+    render's own noise adds to f makes that larger.
     Under a point spread with glare or ghosts none share: there drives act on what flares spread, too.
 
     Parameters
@@ -61,14 +62,15 @@ def shared_light(light: Light, snapshot: Snapshot, exposure_s: float, most_share
     """
     camera, indirect = snapshot.camera(light.camera).camera, light.indirect
     emitters = group_emitters(light, snapshot)
-    drives = [drive_of(one) for one in emitters]
+    drives, fluxes = [drive_of(one) for one in emitters], group_fluxes(light, snapshot)
     known = Counter(drives)
     blinking = [
-        group for group, one in enumerate(drives) if one.constant is None and known[one] == 1
+        group
+        for group, one in enumerate(drives)
+        if one.constant is None and known[one] == 1 and fluxes[group] > 0.0
     ]  # those of one drive have one image anyhow
     if indirect is None or camera.point_spread.core_share < 1.0 or len(blinking) < 2:
         return SharedLight((), 0.0, 0.0)
-    fluxes = group_fluxes(light, snapshot)
     responses: dict[Hashable, NDArray[np.float32]] = {}
     films = [
         _electrons(light, snapshot, group, responses) * np.float32(exposure_s * fluxes[group])
@@ -76,18 +78,28 @@ def shared_light(light: Light, snapshot: Snapshot, exposure_s: float, most_share
     ]
     mean_e = np.sum(films, axis=0)
     noise_e2 = mean_e + dark_variance_e2(camera.sensor, exposure_s)
-    off = {group: _SWING * films[group] ** 2 / noise_e2 for group in blinking}
-    faintest = sorted(blinking, key=lambda group: float(off[group].max()))
+    faintest = sorted(blinking, key=lambda group: float((films[group] ** 2 / noise_e2).max()))
     chosen: list[int] = []
-    so_far = np.zeros_like(mean_e)
+    off = np.zeros(mean_e.shape)
+    # Sums over groups of f², f, w f (blocks); of w and w².
+    squares, together, weighted = (np.zeros(mean_e.shape) for _ in range(3))
+    weight = weight2 = 0.0
     for group in faintest:
-        if (so_far + off[group]).max() > most_share:
+        film, sends = films[group].astype(np.float64), float(fluxes[group])
+        squares += film**2
+        together += film
+        weighted += sends * film
+        weight += sends
+        weight2 += sends**2
+        spread = squares - 2.0 * together * weighted / weight + together**2 * weight2 / weight**2
+        share = _SWING * np.maximum(spread, 0.0) / noise_e2
+        if share.max() > most_share:
             break
-        so_far += off[group]
+        off = share
         chosen.append(group)
     if len(chosen) < 2:
         return SharedLight((), 0.0, 0.0)
-    return SharedLight(tuple(chosen), float(so_far.mean()), float(so_far.max()))
+    return SharedLight(tuple(chosen), float(off.mean()), float(off.max()))
 
 
 def _electrons(

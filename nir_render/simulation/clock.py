@@ -3,8 +3,9 @@
 Light is rendered once for a geometry; exposing it is arithmetic.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -273,6 +274,7 @@ def simulate(
     cache = LightCache() if cache is None else cache
     period_s = 1.0 / scene.document.clock.frame_rate_hz
     kept: dict[str, Rates] = {}
+    built: dict[float, dict[Hashable, Any]] = {}  # of the world at the last time
     begun = Begun() if begun is None else begun
     states = dict(begun.exposures)
     cameras = scene.cameras()
@@ -283,8 +285,12 @@ def simulate(
         if refreshed is not None:
             rates = refreshed.rates_at(name, time_s)
             return rates.light, rates
+        from nir_render.transport import render as transport
+
         snapshot = scene.at(time_s)
-        light = render(snapshot, name, seed=run_seed, cache=cache)
+        if time_s not in built:
+            built.clear()
+        light = transport.render(snapshot, name, run_seed, cache, built.setdefault(time_s, {}))
         kept[name] = _reused_rates(light, snapshot, kept.get(name))
         return light, kept[name]
 

@@ -7,7 +7,7 @@ in the middle: what goes round and round could be in its place there each time.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -95,6 +95,7 @@ class Refreshed:
         self._known: dict[str, dict[float, Rates]] = {}
         self._kept: dict[tuple[str, float, float], bool] = {}
         self._measured: list[RefreshError] = []
+        self._built: dict[float, dict[Hashable, Any]] = {}  # of the world at the last time
 
     def measured(self) -> list[RefreshError]:
         """Return the errors that were measured since this was last asked."""
@@ -168,7 +169,9 @@ class Refreshed:
             from nir_render.transport.render import render  # Mitsuba loads only where light is rendered
 
             snapshot = self._scene.at(time_s)
-            light = render(snapshot, name, self._seed, self._cache)
+            if time_s not in self._built:
+                self._built.clear()
+            light = render(snapshot, name, self._seed, self._cache, self._built.setdefault(time_s, {}))
             same = [
                 rates
                 for rates in known.values()

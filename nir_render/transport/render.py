@@ -1,9 +1,9 @@
 """From a scene to the light that reaches one camera."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,17 +34,24 @@ _PILOT = "pilot"
 Samples = NDArray[np.int64] | int
 
 
-def render(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None = None) -> Light:
+def render(
+    snapshot: Snapshot,
+    camera: str,
+    seed: int,
+    cache: LightCache | None = None,
+    kept: dict[Hashable, Any] | None = None,
+) -> Light:
     """Return the light that reaches a camera, `robot.camera`, in the world at one time.
 
-    What `cache` holds is not rendered again. Equal geometry gives equal bits at any time.
+    What `cache` holds is not rendered again. Equal geometry gives equal bits at any time. In `kept`, which is
+    the snapshot's, stays what is built of it, for its other cameras.
 
     Raises
     ------
     InputError
         No such camera, or the camera is inside a body.
     """
-    rendering = _rendering(snapshot, camera, seed, cache)
+    rendering = _rendering(snapshot, camera, seed, cache, kept)
     samples, short_pixels = rendering.samples()
     light = rendering.light(samples)
     return replace(light, time_s=snapshot.time_s, seed=seed, short_pixels=short_pixels)
@@ -56,17 +63,14 @@ def direct_light(snapshot: Snapshot, camera: str, seed: int) -> Light:
 
 
 def direct_lights(
-    snapshot: Snapshot, cameras: Sequence[str], seed: int, kept: dict[str, Any] | None = None
+    snapshot: Snapshot, cameras: Sequence[str], seed: int, kept: dict[Hashable, Any] | None = None
 ) -> dict[str, Light]:
     """Return the direct light alone that reaches each camera: the bits of `direct_light`, with less work.
 
     In `kept`, which is the snapshot's, stays what further cameras of it need too.
     """
     kept = {} if kept is None else kept
-    if "bodies" not in kept:
-        kept["bodies"] = bodies_of(snapshot, specular=backend().vectorised)
-    renderings = {name: _rendering(snapshot, name, seed, None) for name in cameras}
-    return {name: replace(one, bodies=kept["bodies"]).direct_light() for name, one in renderings.items()}
+    return {name: _rendering(snapshot, name, seed, None, kept).direct_light() for name in cameras}
 
 
 def mean_samples(snapshot: Snapshot, camera: str, seed: int) -> float:
@@ -86,13 +90,13 @@ def geometry_of(snapshot: Snapshot, camera: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Rendering:
-    """The light of one camera at one time, to be found or rendered; `bodies` as of `direct_table`."""
+    """The light of one camera at one time, to be found or rendered; `kept` is built of the snapshot."""
 
     site: Site
     seed: int
     cache: LightCache
     wavelengths_m: tuple[float, ...]
-    bodies: Any = None
+    kept: dict[Hashable, Any]
 
     def samples(self) -> tuple[Samples | None, int]:
         """Return the samples in each pixel of the film, None where there is no indirect light.
@@ -135,7 +139,7 @@ class _Rendering:
 
     def _pilot(self) -> Light:
         key = groups.light_seed(self.seed, "pilot", self.site.name, self._geometry)
-        return self._light(groups.pilot(self.site.snapshot, self._rays, key, self._power, self.wavelengths_m))
+        return self._light(groups.pilot(self.site.snapshot, self._built, self._rays, key))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
@@ -205,7 +209,10 @@ class _Rendering:
 
     @cached_property
     def _built(self) -> DeviceScene:
-        return groups.world_on_device(self.site.snapshot, self._power, self.wavelengths_m)
+        key = self._power.tobytes(), self.wavelengths_m
+        if key not in self.kept:
+            self.kept[key] = groups.world_on_device(self.site.snapshot, self._power, self.wavelengths_m)
+        return cast("DeviceScene", self.kept[key])
 
     @cached_property
     def _enlargement(self) -> Enlargement:
@@ -224,11 +231,20 @@ class _Rendering:
         what = f"the camera {site.name} at {snapshot.time_s:g} s"
         mitsuba_scene.check_meshes(snapshot, pose.position_m, what)
         specular = backend().vectorised
-        tables = [direct_table(world, pose, specular=specular, bodies=self.bodies) for world in self._worlds]
+        if "bodies" not in self.kept:
+            self.kept["bodies"] = bodies_of(snapshot, specular=specular)
+        bodies = self.kept["bodies"]
+        tables = [direct_table(world, pose, specular=specular, bodies=bodies) for world in self._worlds]
         return direct_over_nodes(tables)
 
 
-def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | None) -> _Rendering:
+def _rendering(
+    snapshot: Snapshot,
+    camera: str,
+    seed: int,
+    cache: LightCache | None,
+    kept: dict[Hashable, Any] | None = None,
+) -> _Rendering:
     """Return the rendering for a camera that stands where it can see; errors as `render`."""
     placed = snapshot.camera(camera)
     inside = solid_around(snapshot.shapes, placed.pose.position_m)
@@ -242,4 +258,5 @@ def _rendering(snapshot: Snapshot, camera: str, seed: int, cache: LightCache | N
         if indivisible is not None:
             raise InputError(f"{snapshot.origin}: {indivisible}")
     wavelengths_m = carried_wavelengths(snapshot, camera).wavelengths_m
-    return _Rendering(Site(snapshot, camera), seed, LightCache() if cache is None else cache, wavelengths_m)
+    cache, kept = LightCache() if cache is None else cache, {} if kept is None else kept
+    return _Rendering(Site(snapshot, camera), seed, cache, wavelengths_m, kept)

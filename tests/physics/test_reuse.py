@@ -1,5 +1,6 @@
 """Light that is found again: the same bits as rendered, and rendered only where geometry is new."""
 
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
@@ -141,3 +142,24 @@ def test_variant_is_part_of_the_key(
     render(scene, "r1.c", cache=cache)
     assert len(rendered) == 2
     assert backend().variant
+
+
+def test_what_is_built_for_one_camera_serves_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The world is brought to the device once, and the second camera's light has the bits that it has alone."""
+    scene = _scene(tmp_path, TARGET)
+    camera = scene.raw["robots"]["r1"]["rig"]["cameras"]["c"]
+    world = scene.with_({"robots.r1.rig.cameras.d": {**camera, "orientation": {"yaw": "20 deg"}}}).at(0.0)
+    alone = transport.render(world, "r1.d", 3)
+    builds: list[float] = []
+    whole = groups.world_on_device
+
+    def counted(snapshot: Snapshot, *rest: Any) -> Any:
+        builds.append(snapshot.time_s)
+        return whole(snapshot, *rest)
+
+    monkeypatch.setattr(groups, "world_on_device", counted)
+    kept: dict[Hashable, Any] = {}
+    both = [transport.render(world, name, 3, kept=kept) for name in ("r1.c", "r1.d")]
+    assert len(builds) == backend().vectorised
+    assert _bits(both[1]) == _bits(alone)
+    assert _bits(both[0]) != _bits(alone)

@@ -1,6 +1,7 @@
 """A robot that sees by frames: rendered, exposed, and read by the whole stack."""
 
 import math
+from collections.abc import Hashable
 from typing import Any
 
 from nir_render.camera.mean_frame import Rates, electron_rates, exposed_frame
@@ -47,9 +48,10 @@ class FrameSight:
         """Take a set of frames, and read it."""
         snapshot = world.snapshot()
         if not self._held and self._held_in is not None:  # it goes on in another process
-            self._held = {name: self._rendered(name, self._held_in) for name in self._cameras}
+            built: dict[Hashable, Any] = {}
+            self._held = {name: self._rendered(name, self._held_in, built) for name in self._cameras}
         if self._held_in is None or snapshot.time_s >= self._held_in.time_s + self._interval_s - _AHEAD_S:
-            self._refresh(snapshot)
+            self._refresh(snapshot, world.kept_of_snapshot)
         from nir_render.transport.render import direct_lights
 
         lights = direct_lights(snapshot, self._cameras, self._seed, world.kept_of_snapshot)
@@ -66,8 +68,8 @@ class FrameSight:
         """Leave out what can be rendered again to the same bits."""
         return {**self.__dict__, "_held": {}}
 
-    def _refresh(self, snapshot: Snapshot) -> None:
-        fresh = {name: self._rendered(name, snapshot) for name in self._cameras}
+    def _refresh(self, snapshot: Snapshot, kept: dict[Hashable, Any]) -> None:
+        fresh = {name: self._rendered(name, snapshot, kept) for name in self._cameras}
         if self._held_in is not None:
             before_s = self._held_in.time_s
             times_s = (before_s, snapshot.time_s, snapshot.time_s + self._interval_s)
@@ -81,10 +83,10 @@ class FrameSight:
             self._interval_s = min(self._interval_s * min(max(longer, 0.5), 2.0), _LONGEST_S)
         self._held, self._held_in = fresh, snapshot
 
-    def _rendered(self, name: str, snapshot: Snapshot) -> Rates:
+    def _rendered(self, name: str, snapshot: Snapshot, kept: dict[Hashable, Any]) -> Rates:
         from nir_render.transport.render import render  # Mitsuba loads only where light is rendered
 
-        return electron_rates(render(snapshot, name, self._seed), snapshot)
+        return electron_rates(render(snapshot, name, self._seed, kept=kept), snapshot)
 
     def _frame(self, snapshot: Snapshot, light: Light) -> RawFrame:
         name = light.camera

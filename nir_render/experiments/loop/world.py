@@ -1,6 +1,6 @@
 """The world of a closed loop: robots on omnidirectional bases, moved by what they want."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,7 +58,7 @@ class World:
         self.movers = {name: Mover(np.array(place_m, dtype=float)) for name, place_m in places_m.items()}
         self._scene, self._base = scene, base
         self._snapshot: Snapshot | None = None  # all look at the same one
-        self.kept_of_snapshot: dict[str, Any] = {}
+        self.kept_of_snapshot: dict[Hashable, Any] = {}
         self._reckoned = {
             name: DeadReckoning(name, scene.document.robots[name].rig.odometry or OdometryNoise(), seed)
             for name in places_m

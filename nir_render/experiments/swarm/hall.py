@@ -22,6 +22,7 @@ PACKET_S = FRAME_BITS * REPEATS / RATE_HZ
 PAUSE_S = 1.15  # lit, between the two packets of a robot: eleven bits, so that the second is in phase too
 
 _NEAREST_M = 0.3  # robots are 0.2 m wide
+_MOST_MISSES = 100_000  # for one robot: where that many places are taken, less than 5e-5 of the hall is free
 _MINUTE_S = 60.0
 _IDLE_S = 1.5  # before anyone sends: who has just begun to look must see eleven lit bits first
 _DRIFT_MOST = 0.01  # of a sender's clock: assumed
@@ -50,14 +51,27 @@ def places_m(robots: int, density_per_m2: float, seed: int) -> Array:
     """Return where robots stand, shape (robots, 2): the observer in the middle, all others anywhere.
 
     No two are nearer than 0.3 m, and none is nearer to a wall than half of that.
+
+    Raises
+    ------
+    ValueError
+        They do not fit.
     """
     random = generator(seed, "places", "swarm", 0)
     half_m = 0.5 * side_m(robots, density_per_m2) - 0.5 * _NEAREST_M
     places = np.zeros((1, 2))
+    misses = 0
     while len(places) < robots:
         place = random.uniform(-half_m, half_m, 2)
         if ((places - place) ** 2).sum(axis=1).min() >= _NEAREST_M**2:
             places = np.vstack([places, place])
+            misses = 0
+        elif (misses := misses + 1) == _MOST_MISSES:
+            raise ValueError(
+                f"{robots} robots at {density_per_m2:g} per m², {_NEAREST_M} m apart, seed {seed}: "
+                f"there is room for {len(places)} in {2.0 * half_m + _NEAREST_M:.2f} m squared; "
+                "take fewer per m²"
+            )
     return places
 
 

@@ -49,6 +49,8 @@ class Sight:
         Whether a detection is its.
     said_m, sigma_m
         What it says of the range; NaN where it says none.
+    lit_through
+        Whether the source shines all through the exposure: else its flux is of a part.
     """
 
     robot: str
@@ -59,6 +61,7 @@ class Sight:
     found: bool
     said_m: float
     sigma_m: float
+    lit_through: bool
 
     def record(self) -> list[Any]:
         """Return it as plain data."""
@@ -66,7 +69,7 @@ class Sight:
             round(value, 5) if math.isfinite(value) else None
             for value in (self.range_m, self.limit_m, self.said_m, self.sigma_m)
         ]
-        return [self.robot, self.why, self.near, self.found, *floats]
+        return [self.robot, self.why, self.near, self.found, *floats, self.lit_through]
 
 
 @dataclass(frozen=True)
@@ -155,8 +158,11 @@ def sights(
         shining = [number for number, row in enumerate(real) if row.direct_e > 0.0]
         pairs = match([real[number] for number in shining], found[camera], known[camera])
         hits = {shining[number]: found[camera][hit] for number, hit in pairs.pairs}
-        for other in (found[camera][number] for number in pairs.unmatched):
-            if other.ghost or on_a_lamp(other, lamps_px[camera]):
+        others = [found[camera][number] for number in pairs.unmatched]
+        # What calls itself a ghost is none where there is no mirror image.
+        images = [row for row in rows if row.ghost_of is not None and row.direct_e > 0.0]
+        for other in (others[number] for number in match(images, others, known[camera]).unmatched):
+            if on_a_lamp(other, lamps_px[camera]):
                 continue
             is_part = any(_is_part(other, real[number], known[camera]) for number in shining)
             parts += is_part
@@ -170,6 +176,7 @@ def sights(
             one = Sight(
                 row.robot, why, near, row.range_m, limit_m, hit is not None,
                 math.nan if hit is None else hit.range_m, math.nan if hit is None else hit.range_sigma_m,
+                row.on_fraction >= 1.0,
             )  # fmt: skip
             best[row.robot] = _better(best.get(row.robot), one)
     return InSet(tuple(best.get(robot, _unseen(robot)) for robot in robots), alarms, parts)
@@ -207,7 +214,7 @@ def _better(known: Sight | None, other: Sight) -> Sight:
 
 
 def _unseen(robot: str) -> Sight:
-    return Sight(robot, "cut", False, math.nan, math.nan, False, math.nan, math.nan)
+    return Sight(robot, "cut", False, math.nan, math.nan, False, math.nan, math.nan, lit_through=False)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -107,8 +107,10 @@ class SwarmLoop:
     """A run in the making; a step is a set of frames of all cameras of the observer."""
 
     def __init__(self, scene: Scene, plan: Swarm, seed: int) -> None:
-        if plan.robots > MOST:
-            raise ValueError(f"{plan.robots} robots: two words tell {MOST} apart")
+        if not 2 <= plan.robots <= MOST:
+            raise ValueError(
+                f"{plan.robots} robots: wanted 2 to {MOST}, one of whom looks; two words tell so many apart"
+            )
         self.plan, self.seed = plan, seed
         self._scene = hall_scene(scene, plan.robots, plan.density_per_m2, plan.bodies, plan.lasts_s, seed)
         self._world = self._scene.at(0.0)
@@ -267,8 +269,9 @@ class SwarmLoop:
             lights = direct_lights(self._world, list(self._known), self.seed)
             self._rates = {name: electron_rates(light, self._world) for name, light in lights.items()}
             return
+        kept: dict[Hashable, Any] = {}
         for name in self._known:
-            light = render(self._world, name, self.seed)
+            light = render(self._world, name, self.seed, kept=kept)
             exposure_s = own_setting(self._world.camera(name).camera, 0).exposure_s
             self._shared[name] = shared_light(light, self._world, exposure_s, OFF)
             self._rates[name] = electron_rates(light, self._world, self._shared[name].groups)

@@ -20,6 +20,7 @@ from nir_render.scene.scene import Scene
 Array = NDArray[np.float64]
 
 _MEDIAN_OF_NORMAL = 0.6745  # of the absolute value, of σ
+_CAN_BE_RANGED = ("free", "eclipsed", "merged", "hidden")
 DENSITIES_PER_M2 = (0.5, 1.0, 2.0)
 
 
@@ -58,6 +59,9 @@ class Condition:
             "parts": sum(record["parts"] for record in self.records),
             "sets_judged": len(self.plan.judged) * len(self.records),
             "range": _range_figures(free),
+            "ranges_by_sight": {
+                why: _claims([one for one in lit if one[1] == why]) for why in _CAN_BE_RANGED
+            },
             "packets": len(packets),
             "packets_received": sum(packet[3] for packet in packets),
             "packets_by_sight": self._packets_by_sight(),
@@ -178,13 +182,14 @@ def outcome_of(
 
 def _range_figures(free: Sequence[list[Any]]) -> dict[str, float | None]:
     """Return errors of ranges of robots that stand free, fully lit, beside the Cramér–Rao bound."""
-    known = [one for one in free if one[5] is not None]
+    known = [one for one in free if one[3] and one[5] is not None]
     said = np.array(
         [(one[4], one[5], one[6], one[7]) for one in known if one[6] is not None and one[7] is not None]
     )
     if not len(said):
         return {
             "number": 0.0,
+            "unranged": float(len(known)),
             "rmse_m": None,
             "limit_m": None,
             "bias_sigmas": None,
@@ -203,6 +208,23 @@ def _range_figures(free: Sequence[list[Any]]) -> dict[str, float | None]:
         "of_limit": math.sqrt(float(((off_m / limit_m) ** 2).mean())),
         "typical_of_limit": float(np.median(abs(off_m / limit_m)) / _MEDIAN_OF_NORMAL),
         "of_sigma": math.sqrt(float(((off_m / sigma_m) ** 2).mean())),
+    }
+
+
+def _claims(sights: Sequence[list[Any]]) -> dict[str, float | None]:
+    """Return how true ranges are of who shines all through: errors held against the σ they claim."""
+    steady = [one for one in sights if one[8]]
+    said = [one for one in steady if one[3] and one[6] is not None and one[7] is not None]
+    true_m, said_m, sigma_m = (np.array([one[column] for one in said]) for column in (4, 6, 7))
+    of_sigma = abs(said_m - true_m) / sigma_m
+    return {
+        "lit": float(len(steady)),
+        "found": float(sum(one[3] for one in steady)),
+        "ranged": float(len(said)),
+        "within_3_sigmas": float((of_sigma <= 3.0).sum()),
+        "off_typical": float(np.median(abs(said_m / true_m - 1.0))) if len(said) else None,
+        "sigma_typical": float(np.median(sigma_m / true_m)) if len(said) else None,
+        "of_sigma": math.sqrt(float((of_sigma**2).mean())) if len(said) else None,
     }
 
 

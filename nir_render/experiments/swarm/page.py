@@ -42,6 +42,12 @@ RULES = {
         "of these very frames, flares that overlap told apart: 1 is as good as can be. typical: the "
         "median of the errors in place of their mean square. σ is what the detector claims."
     ),
+    "what ranges claim": (
+        "of all that are lit all through the exposure, by how they can be seen: how many have a detection, a "
+        "range with a σ, and the truth within three of them. Error and σ are shares of the range, in the "
+        "median. Who is eclipsed, hidden or merged shows a part of its light, or more than it: its range may "
+        "be far off, and its σ is to say so."
+    ),
     "packets": (
         "sent in full while the observer looked; received if the track of that robot says the word, read in "
         "all five frames or in some. A word that another one sent just then is misattributed, one that "
@@ -93,6 +99,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
         sentence=sentence(outcome),
         seen=_seen(figures),
         ranges=_ranges(figures),
+        claims=_claims(figures),
         heard=_heard(figures),
         took=_took(outcome, figures),
         against=density_plot(figures),
@@ -157,13 +164,32 @@ def _ranges(figures: dict[str, Any]) -> Table:
     for one in figures["conditions"]:
         said = one["range"]
         rows.append(
-            (*_where(one), f"{said['number']:.0f}", *(metres(said[name]) for name in ("rmse_m", "limit_m")),
+            (*_where(one), f"{said['number']:.0f}", f"{said['unranged']:.0f}",
+             *(metres(said[name]) for name in ("rmse_m", "limit_m")),
              *(_number(said[name]) for name in ("of_limit", "typical_of_limit", "bias_sigmas", "of_sigma")))
         )  # fmt: skip
     headings = (
-        "bodies", "per m²", "ranges", "RMSE", "RMS of the limit", "error over limit, RMS",
-        "typical", "bias, of limits",
+        "bodies", "per m²", "ranges", "found without one", "RMSE", "RMS of the limit",
+        "error over limit, RMS", "typical", "bias, of limits",
         "error over σ, RMS",
+    )  # fmt: skip
+    return Table(headings, rows)
+
+
+def _claims(figures: dict[str, Any]) -> Table:
+    rows = []
+    for one in figures["conditions"]:
+        for why, said in one["ranges_by_sight"].items():
+            counts = [int(said[name]) for name in ("lit", "found", "ranged", "within_3_sigmas")]
+            if counts[0]:
+                rows.append(
+                    (*_where(one), why, str(counts[0]), _part(counts[1], counts[0]), str(counts[2]),
+                     _part(counts[3], counts[2]), _number(said["of_sigma"]),
+                     *(_percent(said[name]) for name in ("off_typical", "sigma_typical")))
+                )  # fmt: skip
+    headings = (
+        "bodies", "per m²", "seen as", "lit", "found", "ranges", "within 3 σ", "error over σ, RMS",
+        "typical error", "typical σ",
     )  # fmt: skip
     return Table(headings, rows)
 
@@ -295,6 +321,10 @@ def _of(number: int, of: int) -> str:
 
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else share(value, more=1)
 
 
 def _seconds(value: float | None) -> str:

@@ -131,13 +131,7 @@ def indirect(
     )
 
 
-def pilot(
-    snapshot: Snapshot,
-    rays: Rays,
-    seed: int,
-    power: NDArray[np.float64],
-    wavelengths_m: tuple[float, ...] = (BAND_M,),
-) -> Indirect | None:
+def pilot(snapshot: Snapshot, built: DeviceScene, rays: Rays, seed: int) -> Indirect | None:
     """Return a few samples in some pixels of the film, every fourth along each axis: what noise there is.
 
     A small film's are closer, so that there are a thousand. The arguments are those of `indirect`.
@@ -149,7 +143,6 @@ def pilot(
     step = int(np.clip((rows * columns / _PILOT_PIXELS) ** 0.5, 1, _PILOT_STEP))
     row, column = (middles(count, step) for count in (rows, columns))
     pixels = (row[:, None] * columns + column).ravel()
-    built = world_on_device(snapshot, power, wavelengths_m)
     counts = np.full(pixels.size, PILOT_SAMPLES)
     radiance, variance = render_pixels(snapshot, built, rays, seed, pixels, counts, scale)
     shape = (*radiance.shape[:2], row.size, column.size)

@@ -111,8 +111,9 @@ def test_detections_of_nobody_and_parts_of_who_is_partly_hidden() -> None:
         _hit(100.1), _hit(101.5),  # the second one is of nobody
         _hit(200.2), _hit(201.0), _hit(198.0), _hit(203.1),  # one, two parts, and one beyond 3 px
         _hit(300.0), _hit(400.0),  # where no light comes from
-        _hit(500.0, ghost=True),
+        _hit(500.0, ghost=True), _hit(600.0, ghost=True), _hit(601.0), # a mirror image, and one of nobody beside it
     ]  # fmt: skip
+    rows.append(_row(600.2, robot="whole", ghost_of="whole"))
     known = {CAMERA: calibration(load_scene(HALL), CAMERA)}
     in_set = sights(
         ["whole", "part", "dark", "gone", "away"], {CAMERA: rows}, {CAMERA: hits}, {CAMERA: []}, known
@@ -121,7 +122,8 @@ def test_detections_of_nobody_and_parts_of_who_is_partly_hidden() -> None:
         ("whole", "free", True), ("part", "eclipsed", True), ("dark", "dark", False), ("gone", "hidden", False),
         ("away", "cut", False),
     ]  # fmt: skip
-    assert (in_set.parts, in_set.false_alarms) == (2, 4)
+    # Whoever calls itself a ghost where there is no mirror image is a false alarm.
+    assert (in_set.parts, in_set.false_alarms) == (2, 6)
 
 
 def test_limits_are_those_beside_all_others() -> None:
@@ -190,6 +192,15 @@ def test_robots_stand_apart_within_their_hall(density_per_m2: float) -> None:
     assert apart_m[np.triu_indices(300, 1)].min() >= 0.3
     assert abs(places).max() <= half_m - 0.15
     assert places[0].tolist() == [0.0, 0.0]
+
+
+def test_who_does_not_fit_is_told() -> None:
+    """In 1.12 m squared ten robots never stand 0.3 m apart; that is said, and how many there is room for."""
+    assert len(places_m(5, 4.0, seed=0)) == 5
+    with pytest.raises(ValueError, match=r"10 robots at 8 per m².* room for [5-9] in 1.12 m squared"):
+        places_m(10, 8.0, seed=0)
+    with pytest.raises(ValueError, match="1 robots: wanted 2 to 3072"):
+        Swarm(robots=1).loop(load_scene(HALL), 0)
 
 
 def test_as_many_speak_at_a_time_as_in_a_whole_minute() -> None:
@@ -267,8 +278,8 @@ def test_a_run_that_is_saved_goes_on_to_the_same_record() -> None:
 def _record(seed: int) -> dict[str, Any]:
     """Four others: one free and found 1 σ off, one free and missed, one merged and found, one dark."""
     sights = [
-        ["r0001", "free", False, True, 2.0, 0.02, 2.02, 0.01], ["r0002", "free", True, False, 3.0, 0.05, None, None],
-        ["r0003", "merged", True, True, 4.0, 0.1, None, None], ["r0004", "dark", False, False, 1.0, None, None, None],
+        ["r0001", "free", False, True, 2.0, 0.02, 2.02, 0.01, True], ["r0002", "free", True, False, 3.0, 0.05, None, None, True],
+        ["r0003", "merged", True, True, 4.0, 0.1, 4.4, 0.1, True], ["r0004", "dark", False, False, 1.0, None, None, None, False],
     ]  # fmt: skip
     return {
         "format": 1, "seed": seed, "places_m": [[0.0, 0.0], [2.0, 0.0], [0.0, 3.0], [4.0, 0.0], [1.0, 0.0]],
@@ -294,10 +305,18 @@ def test_figures_and_page_of_a_record_by_hand(tmp_path: Path) -> None:
     assert figures["range"]["of_sigma"] == pytest.approx(2.0)
     assert figures["range"]["typical_of_limit"] == pytest.approx(1.0 / 0.6745)
     assert figures["range"]["rmse_m"] == pytest.approx(0.02)
+    claims = figures["ranges_by_sight"]
+    names = ("lit", "found", "ranged", "within_3_sigmas", "of_sigma")
+    assert [claims["free"][name] for name in names] == [8, 4, 4, 4, pytest.approx(2.0)]
+    assert [claims["merged"][name] for name in names] == [4, 4, 4, 0, pytest.approx(4.0)]
+    assert claims["merged"]["off_typical"] == pytest.approx(0.1)
+    assert claims["merged"]["sigma_typical"] == pytest.approx(0.025)
+    assert claims["hidden"]["off_typical"] is None
+    assert figures["range"]["unranged"] == 0.0
     assert figures["packets_by_sight"] == {"free": [4, 4], "merged": [2, 0]}
     assert (figures["told_in_full"], figures["identities_right"], figures["identities_wrong"]) == (6, 4, 2)
-    names = ("tracks", "tracks_off", "tracks_of_nobody", "tracks_twice")
-    assert [figures[name] for name in names] == [6, 2, 2, 2]
+    counted = ("tracks", "tracks_off", "tracks_of_nobody", "tracks_twice")
+    assert [figures[name] for name in counted] == [6, 2, 2, 2]
     assert (figures["false_alarms"], figures["parts"]) == (6, 10)
     assert figures["seconds"]["light_of_a_set"] == 9.0
     page = write_outcome(Outcome(5, "hall", [0, 1], [condition]), tmp_path)
