@@ -132,7 +132,7 @@ def sweep(
                     for ended in ending:
                         if ended.error is not None:
                             failed[ended.job.key] = ended.error
-                        elif store is not None and not part_file(parts, ended.job).is_file():
+                        elif store is not None and read_part(part_file(parts, ended.job)) is None:
                             store.fetch(part_object(ended.job), part_file(parts, ended.job))
                         done += 1
                         progress(done, len(jobs))

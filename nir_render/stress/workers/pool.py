@@ -200,7 +200,8 @@ def _started(workers: int) -> LocalCluster:
 
 
 def _plugin_name(work: Work) -> str:
-    return f"{_PLUGIN}-{hashlib.sha256(str(work.parts).encode()).hexdigest()[:12]}"
+    place = f"{work.parts} {work.store}"
+    return f"{_PLUGIN}-{hashlib.sha256(place.encode()).hexdigest()[:12]}"
 
 
 def _forget(client: Client, plugin: str) -> None:
