@@ -70,7 +70,7 @@ def run(
     loaded = read_scene(scene, settings, seed)
     folder = _render(loaded, output, overwrite, threads, keep_light, cache)
     write_file(folder / LOOK, look_png(loaded, loaded.document.clock.start_s))
-    with progress_bar("perceive") as progress:
+    with progress_bar("perceive", compiles=True) as progress:
         perceived = perceive_run(folder, estimators=chosen, progress=progress, own=own, period_s=period_s)
     if not perceived.detections:
         raise InputError(*perceived.problems)
@@ -138,7 +138,7 @@ def perceive(
     chosen = chosen_estimators(estimators, time_limit_s)
     check_period(period_s)
     own = OwnParts.of(tracker, decoder)
-    with progress_bar("perceive") as progress:
+    with progress_bar("perceive", compiles=True) as progress:
         perceived = perceive_run(
             folder,
             estimators=chosen,
@@ -175,7 +175,7 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
     from nir_render.command.terminal.tables import calibration_tables, extrinsics_table, print_table
     from nir_render.run.calibrate import FITTED_FILE, PAGE, calibrate_run
 
-    with progress_bar("calibrate") as progress:
+    with progress_bar("calibrate", compiles=True) as progress:
         told = calibrate_run(folder, progress)
     holds = not told.faults
     if as_json:
@@ -234,9 +234,9 @@ def _render(
     folder = output if output is not None else Path("outputs") / scene.document.name
     check_free(folder, overwrite)
     use_threads(threads)
-    with progress_bar("calibrate") as progress:
+    with progress_bar("calibrate", compiles=True) as progress:
         calibrations = calibrations_of(scene, progress)
-    with progress_bar("render") as progress:
+    with progress_bar("render", compiles=True) as progress:
         warnings = render_run(
             scene,
             folder,

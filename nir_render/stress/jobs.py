@@ -172,7 +172,9 @@ def is_same(job: Job, scene: Scene, made_by: Sequence[str], processor: str) -> b
 
 def _scene_hash(document: SceneDocument) -> str:
     """Return the hash of a resolved scene; what robots carry is written once, however many carry the same."""
-    hashed = hashlib.sha256(document.model_dump_json(exclude={"robots": {"__all__": {"rig"}}}).encode())
+    # Scattered robots are among the others.
+    without: dict[str, Any] = {"robots": {"__all__": {"rig"}}, "scatter": True}
+    hashed = hashlib.sha256(document.model_dump_json(exclude=without).encode())
     for robot in document.robots.values():
         hashed.update(b"\0" + _rig_text(_Same(robot.rig)))
     return hashed.hexdigest()
