@@ -106,7 +106,9 @@ def eclipses(
         # Where robots are known to carry sources so far apart, globes that are not round are the odder guess.
         of_one_robot = is_of_a_layout(likeliest, camera)
         least_gain = _LEAST_OF_A_LAYOUT if of_one_robot else LEAST_GAIN
-        if of_one_robot if likeliest.count > 2 else gain_over_oval(likeliest, camera) >= least_gain:
+        # An oval explains no more than one of several flares.
+        is_believed = of_one_robot if likeliest.count > 2 else gain_over_oval(likeliest, camera) >= least_gain
+        if is_believed:
             pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
     return pairs
 
