@@ -98,15 +98,15 @@ def _gain(
                 for column in range(left, right):
                     images[wave, row, column] += light * across[0, column]
     images[count - 2], images[count - 1] = flares_e, 1.0
-    by, flat_weight, left = images.reshape(count, -1), weight.ravel(), left_e.ravel()
+    by, flat_weight, residual = images.reshape(count, -1), weight.ravel(), left_e.ravel()
     information, inverse = np.zeros((count, count)), np.empty((count, count))
     add_information(by, flat_weight, information)
     if math.isnan(inverted(information, inverse)):
         return math.nan
     pull = np.zeros(count)
     for one in range(count):
-        for pixel in range(len(left)):
-            pull[one] += by[one, pixel] * flat_weight[pixel] * left[pixel]
+        for pixel in range(len(residual)):
+            pull[one] += by[one, pixel] * flat_weight[pixel] * residual[pixel]
     # What is round, as size, brightness and ground are, is no other shape.
     is_round = np.array([0, count - 2, count - 1])
     by_round, round_inverse = np.empty((3, 3)), np.empty((3, 3))
