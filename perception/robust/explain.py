@@ -11,13 +11,14 @@ from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
-from perception.robust.motion import moving, weighed
+from perception.robust.motion import moving
 from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, deblend, of_free_width
 from perception.robust.overlap.eclipse import eclipses
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
+from perception.robust.overlap.rivals import weighed
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame

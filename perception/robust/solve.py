@@ -30,10 +30,8 @@ _LAYOUT_KEPT_PX = 0.05
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
 _OF_STARTS = 0.5  # so fine are images that are only to tell which first guess is likelier
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
-_PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
-NEIGHBOUR_PX2 = 50.0
-NEIGHBOURS = 20.0 * NEIGHBOUR_PX2 / (1280.0 * 960.0)
-"""Of twenty flares in a frame, how many lie in the 50 px² of a blob."""
+_BLOB_PX2, _PLACES = 50.0, 200.0  # of a flare in a blob: so many px², by four e-foldings of its range
+NEIGHBOURS_PER_PX2 = 20.0 / (1280.0 * 960.0)  # of twenty flares in a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +71,7 @@ class Solution:
     log_range_of_two
         How far the range of a lone flare may be off because it may be two (`unparted`), beside its σ.
     is_doubtful
-        Whether another number of flares explains the window nearly as well (`motion.weighed`).
+        Whether another number of flares explains the window nearly as well (`rivals.weighed`).
     may_be_more
         Whether more flares were not looked for, as there are too many already (`deblend`).
     is_eclipse
@@ -114,10 +112,10 @@ class Solution:
 
         Laplace's approximation (MacKay, Neural Comput. 4, 415, 1992): an unknown costs the logarithm of how
         much narrower the data leave it than its prior, which for a flare is any of `_PLACES` places and
-        brightnesses. That others lie in the same blob is as rare as `NEIGHBOURS`, each.
+        brightnesses. That others lie in the same blob is as rare as `NEIGHBOURS_PER_PX2` says, each.
         """
         by_flares = self.count * (2.0 * math.log(_PLACES) - 3.0 * math.log(2.0 * math.pi))
-        by_chance = -2.0 * (self.count - 1) * math.log(NEIGHBOURS)
+        by_chance = -2.0 * (self.count - 1) * math.log(NEIGHBOURS_PER_PX2 * _BLOB_PX2)
         return self.deviance + self.log_information + by_flares + by_chance + self.motion_cost
 
     @property
@@ -133,9 +131,7 @@ class Solution:
 
     def again(self, window: Window | None = None) -> Problem:
         """Return the problem of fitting these flares again, or to another view of their window."""
-        return Problem(
-            self.window if window is None else window, self.starts, self.background_e, self.motions
-        )
+        return Problem(window or self.window, self.starts, self.background_e, self.motions)
 
     @property
     def most_motion_px(self) -> float:

@@ -14,10 +14,10 @@ import numpy as np
 
 from perception.model.window import Camera
 from perception.robust.goodness import drawn_out
-from perception.robust.motion import weighed
 from perception.robust.overlap.deblend import gain, halves
+from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem, Start
-from perception.robust.solve import NEIGHBOUR_PX2, NEIGHBOURS, Solution, solve
+from perception.robust.solve import NEIGHBOURS_PER_PX2, Solution, solve
 
 LONGER_CHI2 = 9.0
 """Of two degrees of freedom, from which two are tried: noise does it once in 90."""
@@ -64,7 +64,7 @@ def doubted(
         assert one is not None
         apart_px = np.hypot(*(places_px - [one.u_px[0], one.v_px[0]]).T)
         density_per_px2 = (apart_px < _AROUND_PX).sum() / (math.pi * _AROUND_PX**2)
-        likelier = 2.0 * math.log(max(density_per_px2 * NEIGHBOUR_PX2 / NEIGHBOURS, 1.0))
+        likelier = 2.0 * math.log(max(density_per_px2 / NEIGHBOURS_PER_PX2, 1.0))
         two = replace(two, deviance=one.deviance - gain(one, two) - likelier)
         both = weighed(one, two)
         # The flux is that of all that is seen, one or two.

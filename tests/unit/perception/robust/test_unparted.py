@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from perception import Detection, detect
-from perception.robust import motion
-from perception.robust.overlap import unparted
+from perception.robust.overlap import rivals, unparted
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 CAMERA = calibration(width_px=64, height_px=64, cx_px=31.5, cy_px=31.5, bit_depth=16, saturation_dn=65535)
@@ -49,7 +48,7 @@ def test_two_in_one_flare_cover_both(apart_px: float, ratio: float, most: int) -
 def test_lone_ones_are_not_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 120 from 1.5 to 9 m none is; some are tried, as noise makes them longer than wide."""
     tried = 0
-    whole = motion.weighed
+    whole = rivals.weighed
 
     def counted(*solutions: object) -> object:
         nonlocal tried
