@@ -101,6 +101,8 @@ def light_defects(scene: Scene) -> Iterator[tuple[str, Changes]]:
             )
     if scene.document.fog is not None:
         yield "fog extinction 5 %", {"fog.extinction": f"{1.05 * scene.document.fog.extinction_per_m!r} /m"}
+    if not scene.document.has_indirect_light():
+        return
     robot, own = scene.cameras()[0].split(".")
     _, camera = scene.camera(f"{robot}.{own}")
     turn_deg = math.degrees(SHIFT_PX * camera.sensor.pixel_pitch_m / camera.lens.focal_length_m)

@@ -79,7 +79,7 @@ def _show(result: "Comparison") -> None:
                 no_wrap=heading != "difference (95 %)",
                 max_width=_WIDEST,
             )
-        for compared in pair.figures:
+        for compared in pair.all_figures:
             if has_content(compared):
                 title, first, second, *_, least, _ = row_of(compared)
                 said = _SHORT.get(compared.verdict, compared.verdict)
@@ -89,4 +89,6 @@ def _show(result: "Comparison") -> None:
                 table.add_row(title, first, second, interval_text(compared, difference=True), said, least)
         print_table(table)
         recall = next(compared for compared in pair.figures if compared.figure.name == "recall")
-        typer.echo(f"{sentence_of(pair.figures, pair.identical)} {counts_sentence(recall)}".rstrip() + "\n")
+        typer.echo(
+            f"{sentence_of(pair.all_figures, pair.identical)} {counts_sentence(recall)}".rstrip() + "\n"
+        )

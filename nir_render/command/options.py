@@ -69,6 +69,15 @@ TimeLimit = Annotated[
         "begins with no further flare.",
     ),
 ]
+Period = Annotated[
+    float | None,
+    typer.Option(
+        "--period",
+        metavar="S",
+        help="Seconds from one set of frames to the next, where it is not a camera's from frame to frame: of "
+        "brackets, whose exposures are one set if they begin within half of it.",
+    ),
+]
 KeepLight = Annotated[
     bool, typer.Option("--keep-light", help="Keep the light of each frame: spectral EXR and direct table.")
 ]
@@ -108,6 +117,12 @@ def chosen_estimators(names: list[str] | None, time_limit_s: float | None) -> "d
     if time_limit_s is not None and not (math.isfinite(time_limit_s) and time_limit_s > 0.0):
         raise InputError(f"--time-limit {time_limit_s:g}: wanted seconds above 0, such as 60")
     return chosen_estimators(names or list(ESTIMATORS), time_limit_s)
+
+
+def check_period(period_s: float | None) -> None:
+    """Raise InputError where `--period` is no time."""
+    if period_s is not None and not (math.isfinite(period_s) and period_s > 0.0):
+        raise InputError(f"--period {period_s:g}: wanted seconds above 0, such as 0.1")
 
 
 def light_cache(folder: Path | None, limit_gib: float) -> "LightCache":

@@ -12,17 +12,21 @@ from nir_render.command.options import FolderArgument, Json
 
 def new_recording(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of the pictures, or a new one.")],
+    bag: Annotated[
+        Path | None,
+        typer.Option("--bag", metavar="FILE", help="Unpack the grey pictures of a ROS 2 bag (MCAP) first."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write a commented template for the frames of one's own camera: recording.yaml, to fill in."""
     from nir_render.command.terminal.console import print_json
     from nir_render.run.recording.make import FILE, new_recording
 
-    pattern = new_recording(folder)
+    patterns = new_recording(folder, bag)
     if as_json:
-        print_json({"folder": str(folder), "file": FILE, "frames": pattern})
+        print_json({"folder": str(folder), "file": FILE, "frames": patterns[0], "cameras": patterns})
     else:
-        typer.echo(f"fill in {folder / FILE} (pictures: {pattern})")
+        typer.echo(f"fill in {folder / FILE} (pictures: {', '.join(patterns)})")
         typer.echo(f"next: nir-render import {shlex.quote(str(folder))}")
 
 

@@ -17,11 +17,13 @@ from nir_render.command.options import (
     Overwrite,
     OwnDecoder,
     OwnTracker,
+    Period,
     SceneArgument,
     Seed,
     Settings,
     Threads,
     TimeLimit,
+    check_period,
     chosen_estimators,
     light_cache,
     read_scene,
@@ -43,6 +45,7 @@ def run(
     tracker: OwnTracker = None,
     decoder: OwnDecoder = None,
     time_limit_s: TimeLimit = None,
+    period_s: Period = None,
     overwrite: Overwrite = False,
     seed: Seed = None,
     threads: Threads = None,
@@ -61,13 +64,14 @@ def run(
     from nir_render.run.report import report_run
 
     chosen = chosen_estimators(estimators, time_limit_s)
+    check_period(period_s)
     own = OwnParts.of(tracker, decoder)
     cache = light_cache(light_folder, light_gib)
     loaded = read_scene(scene, settings, seed)
     folder = _render(loaded, output, overwrite, threads, keep_light, cache)
     write_file(folder / LOOK, look_png(loaded, loaded.document.clock.start_s))
-    with progress_bar("perceive") as progress:
-        perceived = perceive_run(folder, estimators=chosen, progress=progress, own=own)
+    with progress_bar("perceive", compiles=True) as progress:
+        perceived = perceive_run(folder, estimators=chosen, progress=progress, own=own, period_s=period_s)
     if not perceived.detections:
         raise InputError(*perceived.problems)
     result = evaluate_run(folder)
@@ -122,6 +126,7 @@ def perceive(
         typer.Option("--causes", help="Also write what each range's σ is made of: causes.NAME.jsonl."),
     ] = False,
     time_limit_s: TimeLimit = None,
+    period_s: Period = None,
     as_json: Json = False,
 ) -> None:
     """Detect and range flares in the frames of any folder, also one recorded by a real camera."""
@@ -131,10 +136,17 @@ def perceive(
     from nir_render.run.perceive import perceive_run
 
     chosen = chosen_estimators(estimators, time_limit_s)
+    check_period(period_s)
     own = OwnParts.of(tracker, decoder)
-    with progress_bar("perceive") as progress:
+    with progress_bar("perceive", compiles=True) as progress:
         perceived = perceive_run(
-            folder, estimators=chosen, progress=progress, own=own, calibration=calibration, causes=causes
+            folder,
+            estimators=chosen,
+            progress=progress,
+            own=own,
+            calibration=calibration,
+            causes=causes,
+            period_s=period_s,
         )
     if as_json:
         told: dict[str, Any] = {"failed": dict(perceived.failures)} if perceived.failures else {}
@@ -163,7 +175,7 @@ def calibrate(folder: FolderArgument, as_json: Json = False) -> None:
     from nir_render.command.terminal.tables import calibration_tables, extrinsics_table, print_table
     from nir_render.run.calibrate import FITTED_FILE, PAGE, calibrate_run
 
-    with progress_bar("calibrate") as progress:
+    with progress_bar("calibrate", compiles=True) as progress:
         told = calibrate_run(folder, progress)
     holds = not told.faults
     if as_json:
@@ -222,9 +234,9 @@ def _render(
     folder = output if output is not None else Path("outputs") / scene.document.name
     check_free(folder, overwrite)
     use_threads(threads)
-    with progress_bar("calibrate") as progress:
+    with progress_bar("calibrate", compiles=True) as progress:
         calibrations = calibrations_of(scene, progress)
-    with progress_bar("render") as progress:
+    with progress_bar("render", compiles=True) as progress:
         warnings = render_run(
             scene,
             folder,

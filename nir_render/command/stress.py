@@ -13,7 +13,6 @@ from nir_render.command.options import (
     Json,
     LightFolder,
     LightLimit,
-    Output,
     light_limit_bytes,
 )
 from nir_render.errors import InputError
@@ -21,12 +20,21 @@ from nir_render.errors import InputError
 if TYPE_CHECKING:
     from nir_render.stress.campaign import Campaign
     from nir_render.stress.jobs import Job
+    from nir_render.stress.store import Store
     from nir_render.stress.sweep import Sweep
 
 
 def stress(
     file: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="A campaign file (YAML).")],
-    output: Output = None,
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            help="Where it goes; outputs/NAME by default. Object storage, s3://BUCKET/PLACE, has it too.",
+        ),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -66,6 +74,7 @@ def stress(
     from nir_render.stress.campaign import load_campaign
     from nir_render.stress.jobs import plan
     from nir_render.stress.refine import sweep_refined
+    from nir_render.stress.store import Store, is_url
     from nir_render.stress.sweep import QUEUE_LOGS, StoppedError, check_folder
     from nir_render.stress.workers.cluster import Scheduler
     from nir_render.stress.workers.queue import load_queue, queued
@@ -77,14 +86,15 @@ def stress(
     queue = None if cluster is None else load_queue(cluster)
     campaign = load_campaign(file)
     limit_bytes = light_limit_bytes(light_gib)
-    folder = output if output is not None else Path("outputs") / campaign.name
+    store = Store(output) if output is not None and is_url(output) else None
+    folder = Path("outputs") / campaign.name if output is None or store is not None else Path(output)
     if status:
-        _show_status(campaign, folder, as_json)
+        _show_status(campaign, folder, store, as_json)
         return
     with progress_bar("check") as progress:
         jobs = plan(campaign, progress)
     if only_plan:
-        _show_plan(campaign, jobs, folder, as_json)
+        _show_plan(campaign, jobs, folder, store, as_json)
         return
     try:
         with contextlib.ExitStack() as stack:
@@ -102,6 +112,7 @@ def stress(
                 light=light_folder,
                 light_limit_bytes=limit_bytes,
                 scheduler=others,
+                store=store,
             )
     except StoppedError as stopped:
         note(f"{stopped}; the same command goes on: {shlex.join(['nir-render', *sys.argv[1:]])}")
@@ -111,31 +122,34 @@ def stress(
         raise typer.Exit(1)
 
 
-def _show_plan(campaign: "Campaign", jobs: "list[Job]", folder: Path, as_json: bool) -> None:
+def _show_plan(
+    campaign: "Campaign", jobs: "list[Job]", folder: Path, store: "Store | None", as_json: bool
+) -> None:
     from nir_render.command.terminal.console import print_json
     from nir_render.stress.sweep import plan_record
 
-    record = plan_record(campaign, jobs, folder)
+    record = plan_record(campaign, jobs, folder, store)
     if as_json:
         print_json(record)
     else:
         typer.echo(
             f"{campaign.name}: {record['jobs']} jobs in {record['geometries']} geometries; "
-            f"{record['done']} are done in {folder}"
+            f"{record['done']} are done in {store.url if store else folder}"
         )
         if record["refined"]:
             typer.echo(f"limits along {', '.join(record['refined'])} are refined: that adds jobs")
 
 
-def _show_status(campaign: "Campaign", folder: Path, as_json: bool) -> None:
+def _show_status(campaign: "Campaign", folder: Path, store: "Store | None", as_json: bool) -> None:
     from nir_render.command.terminal.console import print_json
     from nir_render.stress.sweep import status_record
 
-    record = status_record(campaign, folder)
+    record = status_record(campaign, folder, store)
     if as_json:
         print_json(record)
         return
-    typer.echo(f"{campaign.name}: {record['done']} of {record['jobs']} jobs are done in {folder}")
+    place = store.url if store else folder
+    typer.echo(f"{campaign.name}: {record['done']} of {record['jobs']} jobs are done in {place}")
     if record["others"]:
         typer.echo(f"{record['others']} more are of the campaign or the program as it was before")
 

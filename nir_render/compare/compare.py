@@ -7,14 +7,16 @@ from typing import Any
 
 from nir_render.compare.figures import Compared, agree, compare_figures
 from nir_render.compare.pairs import FramePair, Pairing, ScoredRun, frame_pair, pair_runs, read_scored
+from nir_render.compare.sets import compare_sets, set_pairs, sets_agree
 from nir_render.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatorComparison:
-    """An estimator of the first run and one of the second, on all paired frames.
+    """An estimator of the first run and one of the second, on all paired frames, and sets of frames.
 
-    `identical` tells that they have the same figures in every frame.
+    `sets` has the figures of what their rigs measured, none where a side has no measurements. `identical`
+    tells that they have the same figures in every frame and set.
     """
 
     first: str
@@ -22,6 +24,12 @@ class EstimatorComparison:
     frames: tuple[FramePair, ...]
     figures: tuple[Compared, ...]
     identical: bool
+    sets: tuple[Compared, ...] = ()
+
+    @property
+    def all_figures(self) -> tuple[Compared, ...]:
+        """Those of frames, then those of sets."""
+        return (*self.figures, *self.sets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,7 @@ class Comparison:
                     "first": pair.first,
                     "second": pair.second,
                     "identical": pair.identical,
-                    "figures": {compared.figure.name: compared.record() for compared in pair.figures},
+                    "figures": {compared.figure.name: compared.record() for compared in pair.all_figures},
                 }
                 for pair in self.estimators
             ],
@@ -132,4 +140,6 @@ def _compared(
     first: ScoredRun, second: ScoredRun, pairing: Pairing, names: tuple[str, str]
 ) -> EstimatorComparison:
     frames = tuple(frame_pair(key, first, second, *names) for key in pairing.keys)
-    return EstimatorComparison(*names, frames, compare_figures(frames), agree(frames))
+    sets = set_pairs(first, second, *names)
+    identical = agree(frames) and sets_agree(sets)
+    return EstimatorComparison(*names, frames, compare_figures(frames), identical, compare_sets(sets))

@@ -29,14 +29,16 @@ class Figure:
     """A figure: how it is called here and in `summary.json`, its unit, and which way is better.
 
     `kind` tells how it is made: of counted things, a mean, the root of a mean square, or a signed mean.
-    `better` is 1 where more is better, −1 where less is, 0 where neither.
+    `better` is 1 where more is better, −1 where less is, 0 where neither. `per` tells what is drawn again:
+    frames, or a rig's sets of frames.
     """
 
     name: str
     title: str
-    unit: Literal["share", "per frame", "m", "deg"]
+    unit: Literal["share", "per frame", "per set", "m", "deg"]
     kind: Kind
     better: int
+    per: Literal["frame", "set"] = "frame"
 
 
 FIGURES = (

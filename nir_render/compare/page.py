@@ -141,12 +141,12 @@ def _section(comparison: Comparison, pair: EstimatorComparison, most: int) -> Se
     labels = comparison.sides(pair)
     differing = differing_frames(pair.frames)
     shown = differing[:most]
-    rows = [_marked(row_of(compared)) for compared in pair.figures if has_content(compared)]
+    rows = [_marked(row_of(compared)) for compared in pair.all_figures if has_content(compared)]
     recall = next(compared for compared in pair.figures if compared.figure.name == "recall")
     return Section(
         title=pair.first if pair.first == pair.second else f"{pair.first} against {pair.second}",
         names=labels,
-        sentence=sentence_of(pair.figures, pair.identical),
+        sentence=sentence_of(pair.all_figures, pair.identical),
         counts=counts_sentence(recall),
         table=Table((HEADINGS[0], *labels, *HEADINGS[3:]), rows),
         plot=error_plots(pair.frames, *labels),

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from nir_render.errors import InputError
 from nir_render.evaluate.metrics import Evaluation, Score, angle_deg, evaluate
+from nir_render.evaluate.sets import SetEvaluation
 from nir_render.report.wording import counted
 from nir_render.run import folder as run_folder
-from nir_render.run.evaluate import check_frames_known
+from nir_render.run.evaluate import check_frames_known, sets_of
 from nir_render.run.folder import parse_lines
 from nir_render.run.perceive import frame_keys
 from nir_render.truth.lamps import LampTruth, parse_lamp
@@ -26,6 +27,7 @@ from perception import (
     parse_detection,
     read_calibrations,
     read_frame_records,
+    read_recording,
 )
 from perception.types import FrameKey
 
@@ -38,13 +40,17 @@ _MOST_NAMED = 3
 
 @dataclass(frozen=True, eq=False)
 class ScoredRun:
-    """A run as it was read: its frames' records, calibrations, and each frame's evaluation by itself."""
+    """A run as it was read: its frames' records, calibrations, and each frame's evaluation by itself.
+
+    `around` has what its rigs measured, set by set; None where it has no measurements.
+    """
 
     folder: Path
     records: Mapping[FrameKey, FrameRecord]
     calibrations: Mapping[str, Calibration]
     evaluations: Mapping[FrameKey, Evaluation]
     estimators: tuple[str, ...]
+    around: SetEvaluation | None = None
 
 
 @dataclass(frozen=True)
@@ -140,13 +146,35 @@ def read_scored(folder: Path, estimators: Iterable[str] = ()) -> ScoredRun:
         lamps = parse_lines(lamps_path, parse_lamp) if lamps_path.is_file() else []
         check_frames_known(keys, truth, lamps, detections, calibrations, folder)
         records = {(record.camera, record.index): record for record in read_frame_records(folder)}
+        around = _around(folder, truth, detections, lamps)
     except InputError:
         raise
     except RecordingError as error:
         raise InputError(str(error)) from None
     return ScoredRun(
-        folder, records, calibrations, _by_frame(keys, truth, lamps, detections, calibrations), tuple(paths)
+        folder,
+        records,
+        calibrations,
+        _by_frame(keys, truth, lamps, detections, calibrations),
+        tuple(paths),
+        around,
     )
+
+
+def _around(
+    folder: Path,
+    truth: Sequence[SourceTruth],
+    detections: Mapping[str, Sequence[Detection]],
+    lamps: Sequence[LampTruth],
+) -> SetEvaluation | None:
+    """Return what rigs measured, as it was scored; dark and flat frames show nothing to measure."""
+    if not any(folder.glob("measurements.*.jsonl")):
+        return None
+    recording = read_recording(folder).of_sources
+    judged = {(record.camera, record.index) for record in recording.records}
+    rows = [row for row in truth if (row.camera, row.index) in judged]
+    outlines = [row for row in lamps if (row.camera, row.index) in judged]
+    return sets_of(recording, rows, detections, outlines)
 
 
 def pair_runs(first: ScoredRun, second: ScoredRun) -> Pairing:

@@ -15,8 +15,10 @@ LEVELS = {"better": "good", "worse": "bad", "differs": "fair"}
 RULES = {
     "Pairs": "frames by camera and index, sources by robot and name. Recall is over sources that count in "
     "both runs; errors are over those that both sides found and ranged. Differences are second − first.",
-    "Interval": "paired bootstrap over frames, 95 %: what other frames like these would give. Frames of one "
-    "moment count as independent. Counts get some room for what happened in none of these frames.",
+    "Sets": "what the cameras of a rig measure together, where both sides have measurements: robots that "
+    "count in both runs; errors over those that both measured and took for robots, not for mirror images.",
+    "Interval": "paired bootstrap over frames, or sets, 95 %: what other ones like these would give. Frames "
+    "of one moment count as independent. Counts get some room for what happened in none of these frames.",
     "Verdict": "better or worse where the interval leaves out zero and six frames or more differ; of counts, "
     "where moreover a coin tossed in each differing frame would seldom do so (exact, 5 %). A bias is better "
     "where it is closer to zero. Of twenty figures without a difference, chance makes one better or worse.",
@@ -28,7 +30,8 @@ RULES = {
 def row_of(compared: Compared) -> tuple[str, ...]:
     """Return the cells of a figure, in the order of `HEADINGS`."""
     figure = compared.figure
-    of = "frame" if figure.unit == "per frame" else "source"
+    of = figure.per if figure.unit.startswith("per ") else "source"
+    over = counted(compared.count, of)
     return (
         figure.title,
         value_text(figure, compared.first),
@@ -37,7 +40,7 @@ def row_of(compared: Compared) -> tuple[str, ...]:
         interval_text(compared),
         compared.verdict,
         difference_text(figure, compared.least_seen).lstrip("+"),
-        counted(compared.count, of) + (f" in {counted(compared.frames, 'frame')}" if of == "source" else ""),
+        over if of == figure.per else f"{over} in {counted(compared.frames, figure.per)}",
     )
 
 
@@ -47,6 +50,7 @@ def has_content(compared: Compared) -> bool:
         "ranged": (1.0, 1.0),
         "ghosts_reported_per_frame": (0.0, 0.0),
         "lamps_reported_per_frame": (0.0, 0.0),
+        "set_false_alarms_per_set": (0.0, 0.0),
     }
     return (compared.first, compared.second) not in ((None, None), plain.get(compared.figure.name))
 
@@ -63,7 +67,7 @@ def sentence_of(figures: tuple[Compared, ...], identical: bool) -> str:
     if not said and not few:
         return "No difference seen in any figure."
     if few:
-        said.append(f"Some figures have fewer than {LEAST_FRAMES} frames, too few to tell.")
+        said.append(f"Some figures have fewer than {LEAST_FRAMES} frames or sets, too few to tell.")
     return " ".join(said)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nir_render.evaluate.sets import SetScore, Stand
+from nir_render.evaluate.sets import SetScore, Stand, Values
 from nir_render.evaluate.track_errors import TrueWays
 from nir_render.truth.poses import PoseTruth
 from perception.types import FrameKey, RobotPose
@@ -48,8 +48,9 @@ def stands_of(
     stands = []
     for told in robots:
         of = {owner.get(flare) for flare in told.flares}
-        true = ways.relative(told.robot, next(iter(of)) or "", told.time_s) if len(of) == 1 else None
-        stands.append(Stand(number_of.get(told.flares[0][:2], -1), told, true, len(of) > 1))
+        robot = (next(iter(of)) or "") if len(of) == 1 else ""
+        true = ways.relative(told.robot, robot, told.time_s) if len(of) == 1 else None
+        stands.append(Stand(number_of.get(told.flares[0][:2], -1), told, true, len(of) > 1, robot))
     return tuple(stands)
 
 
@@ -61,26 +62,14 @@ def heading_numbers(stands: Sequence[Stand]) -> dict[str, Any]:
     of these within 5 σ of truth, `unsaid` none at all.
     """
     errors, pulls2, wrong, unsaid = [], [], 0, 0
-    for told, true in ((each.told, each.true) for each in stands):
-        if true is None:
+    for stand in stands:
+        if stand.true is None:
             continue
-        position_m, heading_rad = true
-        offs = [
-            np.append(
-                np.array(each.position_body_m) - position_m,
-                (each.heading_rad - heading_rad + math.pi) % (2.0 * math.pi) - math.pi,
-            )
-            for each in told.hypotheses
-        ]
-        sigmas = [math.sqrt(each.covariance[3, 3]) for each in told.hypotheses]
-        said = [k for k, off in enumerate(offs) if abs(off[3]) < SAID_SIGMAS * sigmas[k]]
-        best = told.hypotheses[0].odds
-        even = [k for k in said if told.hypotheses[k].odds >= 0.5 * best]
-        unsaid += not said
-        wrong += not even
-        k = min(even or [0], key=lambda k: abs(float(offs[k][3])))
-        errors.append(math.degrees(offs[k][3]))
-        pulls2.append(float(offs[k] @ np.linalg.solve(told.hypotheses[k].covariance, offs[k])) / 4.0)
+        k, off, is_even, is_said = _held_against(stand, stand.true)
+        unsaid += not is_said
+        wrong += not is_even
+        errors.append(math.degrees(off[3]))
+        pulls2.append(float(off @ np.linalg.solve(stand.told.hypotheses[k].covariance, off)) / 4.0)
     return {
         "set_robots_told": len(stands),
         "set_robots_mixed": sum(each.mixed for each in stands),
@@ -89,3 +78,29 @@ def heading_numbers(stands: Sequence[Stand]) -> dict[str, Any]:
         "set_heading_wrong": wrong,
         "set_heading_unsaid": unsaid,
     }
+
+
+def heading_error_rad(stand: Stand) -> float:
+    """Return by how much a heading is off, scored as in `heading_numbers`; NaN where truth is not known."""
+    return math.nan if stand.true is None else float(_held_against(stand, stand.true)[1][3])
+
+
+def _held_against(stand: Stand, true: tuple[Values, float]) -> tuple[int, Values, bool, bool]:
+    """Return which hypothesis is scored, its errors, whether it is as good as the best, and truth is said.
+
+    Errors are x, y, z, heading, shape (4,).
+    """
+    position_m, heading_rad = true
+    hypotheses = stand.told.hypotheses
+    offs = [
+        np.append(
+            np.array(each.position_body_m) - position_m,
+            (each.heading_rad - heading_rad + math.pi) % (2.0 * math.pi) - math.pi,
+        )
+        for each in hypotheses
+    ]
+    sigmas = [math.sqrt(each.covariance[3, 3]) for each in hypotheses]
+    said = [k for k, off in enumerate(offs) if abs(off[3]) < SAID_SIGMAS * sigmas[k]]
+    even = [k for k in said if hypotheses[k].odds >= 0.5 * hypotheses[0].odds]
+    k = min(even or [0], key=lambda k: abs(float(offs[k][3])))
+    return k, offs[k], bool(even), bool(said)

@@ -49,13 +49,14 @@ class Stand:
     """How a robot of several sources is said to stand in a set, and how it does.
 
     `true` is the origin's place, shape (3,), and the heading (rad) in the observer's body axes, None where
-    they are not known; `mixed`: its flares are of several robots.
+    they are not known; `mixed`: its flares are of several robots; `robot` is who it is, "" where unknown.
     """
 
     number: int
     told: RobotPose
     true: tuple[Values, float] | None
     mixed: bool
+    robot: str = ""
 
 
 @dataclass(frozen=True, eq=False)

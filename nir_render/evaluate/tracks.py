@@ -58,13 +58,16 @@ class TrackEvaluation:
 
 
 def sets_in_time(
-    frames: Iterable[Exposed], calibrations: Mapping[str, Calibration]
+    frames: Iterable[Exposed], calibrations: Mapping[str, Calibration], period_s: float | None = None
 ) -> tuple[list[TimedSet], dict[FrameKey, float]]:
-    """Return the sets of frames, and when each frame was taken: `sets` and `taken_s` of `evaluate_tracks`."""
+    """Return the sets of frames, and when each frame was taken: `sets` and `taken_s` of `evaluate_tracks`.
+
+    `period_s` is that of `frame_sets`.
+    """
     listed = list(frames)
     sets: list[TimedSet] = [
         (robot_of(each[0].camera), set_time_s(each), [(frame.camera, frame.index) for frame in each])
-        for each in frame_sets(listed)
+        for each in frame_sets(listed, period_s)
     ]
     taken_s = {
         (frame.camera, frame.index): mid_exposure_s(frame, calibrations[frame.camera].height_px)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -20,9 +21,11 @@ from nir_render.report.pictures import (
     spread,
     whole_picture,
 )
+from nir_render.report.plots import causes_plot
 from nir_render.report.recording_checks import ShapesSeen, darkness_warnings, shape_warnings, shapes_seen
 from nir_render.report.style import MATPLOTLIB, look
 from nir_render.report.wording import counted, metres, share
+from perception.causes import DetectionCauses
 from perception.picture import tone_map
 from perception.rig.overlap import finest, overlap_warnings
 from perception.types import Calibration, Detection, FrameKey, RawFrame
@@ -71,6 +74,7 @@ def recording_html(
     calibrations: Mapping[str, Calibration],
     folder_name: str,
     files: Sequence[str],
+    causes: Mapping[str, Sequence[DetectionCauses]] = MappingProxyType({}),
 ) -> str:
     """Write the page.
 
@@ -88,6 +92,8 @@ def recording_html(
         The title.
     files
         Names of files that lie beside the page, to link to.
+    causes
+        By estimator, what ranges' σ are made of, where that was asked for.
 
     Returns
     -------
@@ -116,6 +122,9 @@ def recording_html(
         more=max(0, _count(found) - _MOST_ROWS),
         cameras=_cameras(cameras[:MOST_CAMERAS], calibrations),
         files=list(files),
+        causes=Drawing(causes_plot(causes), "σ of ranges by cause, against range")
+        if any(causes.values())
+        else None,
     )
 
 

@@ -75,7 +75,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         truth = [row for row in truth if (row.camera, row.index) in judged]
         lamps = [row for row in lamps if (row.camera, row.index) in judged]
         result = evaluate(keys, truth, calibrations, detections, lamps)
-        result = _with_sets(recording, result, truth, detections, lamps)
+        result = _with_sets(result, sets_of(recording, truth, detections, lamps))
         result = _with_tracks(recording, result, truth, list(detections))
         preview = _preview(recording, keys, result)
     except InputError:
@@ -115,22 +115,27 @@ def check_frames_known(
                 )
 
 
-def _with_sets(
+def sets_of(
     recording: Recording,
-    result: Evaluation,
     truth: Sequence[SourceTruth],
     detections: Mapping[str, Sequence[Detection]],
     lamps: Sequence[LampTruth],
-) -> Evaluation:
-    """Add the scores of what the rigs measured, where the folder has `measurements.*.jsonl`."""
+) -> SetEvaluation | None:
+    """Score what the rigs measured, by the folder's `measurements.*.jsonl`; None where there are none.
+
+    Raises
+    ------
+    InputError
+        Such a file is broken, or of other detections.
+    """
     folder = recording.folder
     paths = {name: folder / f"measurements.{name}.jsonl" for name in detections}
     measurements = {
         name: parse_lines(path, parse_measurement) for name, path in paths.items() if path.is_file()
     }
     if not measurements:
-        return result
-    records = frame_sets(recording.records)
+        return None
+    records = frame_sets(recording.records, run_folder.read_period_s(folder))
     sets = [[(frame.camera, frame.index) for frame in each] for each in records]
     began = {(robot_of(each[0].camera), each[0].time_s): number for number, each in enumerate(records)}
     mirrors = {
@@ -151,7 +156,13 @@ def _with_sets(
                     f"detections.{name}.jsonl does not have; run 'nir-render perceive {folder}' again"
                 )
     around = evaluate_sets(sets, truth, recording.calibrations, measurements, detections, lamps, mirrors)
-    around = _with_headings(folder, around)
+    return _with_headings(folder, around)
+
+
+def _with_sets(result: Evaluation, around: SetEvaluation | None) -> Evaluation:
+    """Add the scores of what the rigs measured."""
+    if around is None:
+        return result
     summary = dict(result.summary)
     summary["estimators"] = {
         name: {**numbers, **around.summary.get(name, {})} for name, numbers in summary["estimators"].items()
@@ -185,7 +196,8 @@ def _with_tracks(
     tracks = run_folder.lines_of(folder, "tracks", names, parse_track)
     if not tracks:
         return result
-    sets, taken_s = sets_in_time(recording.records, recording.calibrations)
+    period_s = run_folder.read_period_s(folder)
+    sets, taken_s = sets_in_time(recording.records, recording.calibrations, period_s)
     poses_path = folder / run_folder.POSES
     poses = parse_lines(poses_path, parse_pose) if poses_path.is_file() else []
     over_time = evaluate_tracks(sets, truth, recording.calibrations, tracks, poses, taken_s)

@@ -18,6 +18,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from nir_render.errors import InputError
 from perception.files.fields import Place, RecordingError, first_of, parse_json
+from perception.files.readers import number as number_of
 
 MANIFEST = "manifest.json"
 CALIBRATION = "calibration.json"
@@ -29,6 +30,7 @@ SENT = "sent.jsonl"
 FILM = "preview.gif"
 LOOK = "look.png"
 POSES = "poses.jsonl"
+SETS = "sets.json"
 _DIGEST = ".digest"
 
 Item = TypeVar("Item")
@@ -255,6 +257,28 @@ def lines_of(
     """
     paths = {name: folder / f"{kind}.{name}.jsonl" for name in names}
     return {name: parse_lines(path, parse) for name, path in paths.items() if path.is_file()}
+
+
+def write_period(folder: Path, period_s: float | None) -> None:
+    """Note of which period sets of frames were, where it was given; what an earlier call noted goes."""
+    if period_s is None:
+        (folder / SETS).unlink(missing_ok=True)
+    else:
+        write_json(folder / SETS, {"format": 1, "period_s": period_s})
+
+
+def read_period_s(folder: Path) -> float | None:
+    """Return that period, None where none was given; raise InputError where the file is broken."""
+    path = folder / SETS
+    if not path.is_file():
+        return None
+    try:
+        period_s = number_of(read_json(path), "period_s", Place(str(path)))
+    except RecordingError as error:
+        raise InputError(str(error)) from None
+    if not period_s > 0.0:
+        raise InputError(f"{path}: period_s is {period_s:g}; write a time above 0, or remove the file")
+    return period_s
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:

@@ -105,21 +105,20 @@ def chosen_estimators(names: Sequence[str], limit_s: float | None = None) -> dic
     return chosen
 
 
-def frame_estimators(names: Sequence[str]) -> dict[str, Estimator]:
-    """Return the estimators of these names that read one frame by itself, in this process.
+def estimators_in_process(names: Sequence[str]) -> dict[str, Estimator | OwnSetEstimator]:
+    """Return the estimators of these names that are functions, of a frame or of a set of frames.
 
     Raises
     ------
     InputError
-        As `chosen_estimators`, or one of them is a command or wants sets of frames.
+        As `chosen_estimators`, or one of them is a command.
     """
-    chosen: dict[str, Estimator] = {}
+    chosen: dict[str, Estimator | OwnSetEstimator] = {}
     for name, estimator in chosen_estimators(names).items():
-        if isinstance(estimator, OwnSetEstimator | CommandEstimator):
-            kind = "a command" if isinstance(estimator, CommandEstimator) else "a function of sets of frames"
+        if isinstance(estimator, CommandEstimator):
             raise InputError(
-                f"--estimator {estimator.reference}: is {kind}, which only 'nir-render run' and 'perceive' "
-                "take; give a function (frame, calibration) here"
+                f"--estimator {estimator.reference}: is a command, which only 'nir-render run' and "
+                "'perceive' take; give a function of a frame or of a set of frames here"
             )
         chosen[name] = estimator
     return chosen
@@ -133,11 +132,14 @@ def perceive_run(
     own: OwnParts = OwnParts(),  # noqa: B008
     calibration: Path | None = None,
     causes: bool = False,
+    period_s: float | None = None,
 ) -> Perceived:
     """Run estimators over the frames of a folder; write the detections of each that reads them all.
 
     Dark and flat frames are passed over. `calibration` is a file in place of the folder's own. With `causes`
-    what the σ of each range is made of is written beside the detections, else there is none of it.
+    what the σ of each range is made of is written beside the detections, else there is none of it. With
+    `period_s` sets of frames are those of that period (`frame_sets`), here and where they are scored:
+    `sets.json` says it.
 
     One's own that fails on a frame is left out from there on, and the others go on. Of it nothing is written;
     detections of an earlier call stay. `own` are a tracker and a decoder of one's own, for all of them.
@@ -157,7 +159,7 @@ def perceive_run(
                 f"{folder / run_folder.FRAMES}: names dark and flat frames only; they are for 'nir-render "
                 "calibrate', and show no source to perceive"
             )
-        found, failures, notes = _read_all(recording, estimators, progress, own)
+        found, failures, notes = _read_all(recording, estimators, progress, own, period_s)
     except InputError:
         raise
     except ValueError as error:  # a broken recording, or a frame that does not match its calibration
@@ -177,9 +179,10 @@ def perceive_run(
         if (folder / f"detections.{name}.jsonl").is_file():
             failures[name] = f"{text}\ndetections.{name}.jsonl is of an earlier call, and stays as it was"
     if counts:
+        run_folder.write_period(folder, period_s)
         note_seconds(folder, "perceive", started)
     said = [text for name, total in counts.items() for text in notes[name].warnings(name, total)]
-    return Perceived(counts, failures, (*_overlap_warnings(recording, found), *said))
+    return Perceived(counts, failures, (*_overlap_warnings(recording, found, period_s), *said))
 
 
 def _causes(recording: Recording, found: Found) -> Iterator[DetectionCauses]:
@@ -189,14 +192,16 @@ def _causes(recording: Recording, found: Found) -> Iterator[DetectionCauses]:
         yield from detection_causes(hits, known, record.gain, record.black_level_dn)
 
 
-def _overlap_warnings(recording: Recording, found: Mapping[str, tuple[Found, Follower]]) -> Iterator[str]:
+def _overlap_warnings(
+    recording: Recording, found: Mapping[str, tuple[Found, Follower]], period_s: float | None
+) -> Iterator[str]:
     """Yield, by robot, where what its cameras see contradicts how the calibration has them stand."""
     name = finest(list(found))
     if name is None:
         return
     hits, _ = found[name]
     sets = []
-    for group in frame_sets(recording.records):
+    for group in frame_sets(recording.records, period_s):
         of_cameras: dict[str, list[Detection]] = {}
         for frame in group:  # of a bracket all exposures
             of_cameras.setdefault(frame.camera, []).extend(hits.get((frame.camera, frame.index), []))
@@ -209,6 +214,7 @@ def _read_all(
     estimators: Mapping[str, RunEstimator],
     progress: Progress,
     own: OwnParts,
+    period_s: float | None,
 ) -> tuple[dict[str, tuple[Found, Follower]], dict[str, str], dict[str, "_Notes"]]:
     """Return what each estimator found and followed to the end, what went wrong with others, and notes."""
     records, calibrations = recording.records, recording.calibrations
@@ -238,7 +244,7 @@ def _read_all(
 
         for name, estimator in estimators.items():
             attempt(name, partial(start, name, estimator))
-        for group in frame_sets(records):
+        for group in frame_sets(records, period_s):
             if not found:
                 break
             frames = [recording.frame(record) for record in group]

@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 def check(document: SceneDocument) -> list[str]:
     """Return one line per problem of a document whose fields are right one by one."""
     return [
-        *_flat_cylinders(document),
+        *flat_cylinders(document),
         *_sheets_and_solids(document),
         *_pictures_without_a_place(document),
         *_fog_up_to_the_sun(document),
@@ -47,6 +47,15 @@ def check(document: SceneDocument) -> list[str]:
         *_uncovered_curves(document),
         *_cameras_inside_solids(document),
         *_cameras_and_sources_inside_their_own_bodies(document),
+    ]
+
+
+def flat_cylinders(document: SceneDocument) -> list[str]:
+    """Return one line per cylinder without a length."""
+    return [
+        f"{place}: start and end of the cylinder are the same point"
+        for place, shape in document.all_shapes().items()
+        if isinstance(shape, Cylinder) and shape.start_m == shape.end_m
     ]
 
 
@@ -135,14 +144,6 @@ def _longest_exposures_s(camera: Camera) -> dict[str, float]:
     if camera.auto_exposure is not None:
         return {"exposure": camera.exposure_s, "auto_exposure.longest": camera.auto_exposure.longest_s}
     return {"exposure": camera.exposure_s}
-
-
-def _flat_cylinders(document: SceneDocument) -> list[str]:
-    return [
-        f"{place}: start and end of the cylinder are the same point"
-        for place, shape in document.all_shapes().items()
-        if isinstance(shape, Cylinder) and shape.start_m == shape.end_m
-    ]
 
 
 def _sheets_and_solids(document: SceneDocument) -> list[str]:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from nir_render.errors import InputError, shown
 from nir_render.scene.bodies import shapes_at
-from nir_render.scene.checks import check
+from nir_render.scene.checks import check, flat_cylinders
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.emitters import Source
@@ -19,6 +19,7 @@ from nir_render.scene.emission import Emitter, light_groups
 from nir_render.scene.motion import robot_pose, robot_velocity
 from nir_render.scene.overrides import apply_overrides
 from nir_render.scene.problems import Places, explain
+from nir_render.scene.scatter.place import scattered
 from nir_render.scene.snapshot import PlacedRobot, Snapshot
 
 
@@ -117,7 +118,8 @@ class Scene:
 
     def resolved_yaml(self) -> str:
         """Return the document with everything expanded, in SI units; it loads to the same scene."""
-        data = self.document.model_dump(mode="json", by_alias=True, exclude_none=True)
+        # Scattered robots are among the others, where they stand.
+        data = self.document.model_dump(mode="json", by_alias=True, exclude_none=True, exclude={"scatter"})
         for robot in data["robots"].values():
             if robot["motion"] or "path" in robot:
                 del robot["position"], robot["orientation"]
@@ -149,9 +151,15 @@ def parse_scene(
         document = SceneDocument.model_validate(raw, context={"folder": folder})
     except ValidationError as error:
         raise InputError(*explain(error, raw, path, overrides)) from None
-    scene = Scene(document, raw, folder, path)
-    problems = check(document)
+    problems = flat_cylinders(document) if document.scatter else []  # of these nothing can be kept clear
+    if not problems:
+        try:
+            document = scattered(document)
+        except InputError as error:
+            problems = list(error.problems)
+        else:
+            problems = check(document)
     if problems:
         places = Places(path, overrides)
         raise InputError(*(places.tell_of(problem) for problem in problems))
-    return scene
+    return Scene(document, raw, folder, path)

@@ -296,13 +296,13 @@ def _beside(file: Path, estimator: str) -> str:
 
 def _not_estimators(names: Sequence[str]) -> list[str]:
     """Return what is wrong with estimators: unknown ones, files that cannot be loaded, two of one name."""
-    from nir_render.run.perceive import frame_estimators
+    from nir_render.run.perceive import estimators_in_process
 
     longest = max(names, key=len)
     if len(longest) > _LONGEST_NAME:
         return [f"{shown(longest)} is too long for an estimator; give one such as robust or file.py:function"]
     try:
-        frame_estimators(names)
+        estimators_in_process(names)
     except InputError as error:
         return [problem.removeprefix("--estimator ") for problem in error.problems]
     return []

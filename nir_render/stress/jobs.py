@@ -12,7 +12,7 @@ from typing import Any
 
 from nir_render.errors import InputError
 from nir_render.run.manifest import versions as run_versions
-from nir_render.run.perceive import frame_estimators
+from nir_render.run.perceive import estimators_in_process
 from nir_render.scene.documents.camera import Rig
 from nir_render.scene.documents.document import SceneDocument
 from nir_render.scene.scene import Scene
@@ -21,7 +21,7 @@ from nir_render.stress.design.points import Point, number_of_points, points_of
 from nir_render.transport.backend.cores import usual_workers
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.fingerprint import code_hash
-from perception.estimators import OwnEstimator
+from perception.estimators import OwnEstimator, OwnSetEstimator
 from perception.own_code import files_of
 
 # What shows results, and what is asked for, do not change them.
@@ -172,7 +172,9 @@ def is_same(job: Job, scene: Scene, made_by: Sequence[str], processor: str) -> b
 
 def _scene_hash(document: SceneDocument) -> str:
     """Return the hash of a resolved scene; what robots carry is written once, however many carry the same."""
-    hashed = hashlib.sha256(document.model_dump_json(exclude={"robots": {"__all__": {"rig"}}}).encode())
+    # Scattered robots are among the others.
+    without: dict[str, Any] = {"robots": {"__all__": {"rig"}}, "scatter": True}
+    hashed = hashlib.sha256(document.model_dump_json(exclude=without).encode())
     for robot in document.robots.values():
         hashed.update(b"\0" + _rig_text(_Same(robot.rig)))
     return hashed.hexdigest()
@@ -219,8 +221,8 @@ def made_by_of(names: Sequence[str], processor: str = "") -> tuple[str, ...]:
     from nir_render.transport.backend.variant import backend
     from nir_render.transport.cache_key import versions
 
-    estimators = frame_estimators(names)
-    own = (one.path for one in estimators.values() if isinstance(one, OwnEstimator))
+    estimators = estimators_in_process(names)
+    own = (one.path for one in estimators.values() if isinstance(one, OwnEstimator | OwnSetEstimator))
     files = sorted({file for path in own for file in files_of(path)})
     contents = (hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
     packages = (f"{name} {version}" for name, version in run_versions().items() if name != "platform")

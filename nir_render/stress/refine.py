@@ -16,6 +16,7 @@ from nir_render.stress.design.axes import Axis, with_values
 from nir_render.stress.design.points import number_of_points
 from nir_render.stress.jobs import Job, plan
 from nir_render.stress.reach import Reach, campaign_reaches
+from nir_render.stress.store import Store
 from nir_render.stress.sums import job_sums
 from nir_render.stress.sweep import Progress, Sweep, sweep
 from nir_render.stress.workers.cluster import Scheduler
@@ -33,6 +34,7 @@ def sweep_refined(
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
     scheduler: Scheduler | None = None,
+    store: Store | None = None,
 ) -> Sweep:
     """Do a campaign's jobs (`sweep`); then add values where bounds are crossed, until limits are exact.
 
@@ -62,6 +64,7 @@ def sweep_refined(
                 light=light,
                 light_limit_bytes=light_limit_bytes,
                 scheduler=scheduler,
+                store=store,
             )
         reused, known = reused + result.reused - known, len(jobs)  # what earlier rounds did is not counted
         result = replace(result, reused=reused)

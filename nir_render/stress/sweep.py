@@ -1,7 +1,9 @@
 """A campaign from beginning to end: jobs that are not done yet are done, then the table and the page."""
 
+import json
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +18,11 @@ from nir_render.run.folder import disk_error, locked, read_json, write_file, wri
 from nir_render.run.manifest import versions
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.jobs import Job
+from nir_render.stress.store import Store
 from nir_render.stress.summary import summary_of
 from nir_render.stress.table import gathered, read_part, write_table
 from nir_render.stress.workers.cluster import MARK, Scheduler
-from nir_render.stress.workers.pool import PART_KIND, Work, part_file, run_jobs
+from nir_render.stress.workers.pool import PART_KIND, PARTS, Work, part_file, part_object, run_jobs
 from nir_render.transport.backend.cores import cores, usual_workers
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.backend.variant import backend
@@ -27,7 +30,8 @@ from nir_render.transport.backend.variant import backend
 MANIFEST = "campaign.json"
 TABLE, PAGE, JOBS, PLANNED = "table.parquet", "report.html", "jobs.jsonl", "planned.json"
 QUEUE_LOGS = ".queue"  # what workers say that a job queue has started
-_PARTS, _LIGHT, _SCRATCH, _LOCK = "jobs", "light", ".workers", ".lock"
+_LIGHT, _SCRATCH, _LOCK = "light", ".workers", ".lock"
+_AT_ONCE = 16  # requests to object storage
 
 
 Progress = Callable[[int, int], None]
@@ -56,6 +60,7 @@ class Sweep:
     reused: int
     folder: Path
     warnings: tuple[str, ...]
+    store: Store | None = None
 
 
 def sweep(
@@ -68,6 +73,7 @@ def sweep(
     light: Path | None = None,
     light_limit_bytes: int = 4 * 2**30,
     scheduler: Scheduler | None = None,
+    store: Store | None = None,
 ) -> Sweep:
     """Do the jobs of a campaign that the folder does not hold yet, and gather all into its table.
 
@@ -85,18 +91,23 @@ def sweep(
         How large that may grow.
     scheduler
         One whose workers do the jobs instead; `workers` then has no say.
+    store
+        Object storage that holds what the folder does: what is done there is not done again, and each job is
+        put there by the worker that has done it.
 
     Raises
     ------
     InputError
-        The folder is taken, another process works in it, the disk is full.
+        The folder is taken, another process works in it, the disk is full, the storage refuses.
     StoppedError
         By Ctrl-C; what was done stays, and the same call goes on.
     """
     _claim(folder, campaign)
     with locked(folder / _LOCK, f"{folder}: another nir-render works on this campaign; wait for its end"):
-        parts = folder / _PARTS
+        parts = folder / PARTS
         write_json(folder / PLANNED, {"format": 1, "jobs": [job.key for job in jobs]})
+        if store is not None:
+            _exchange(store, campaign, folder, jobs)
         missing = [job for job in jobs if read_part(part_file(parts, job)) is None]
         done, failed = len(jobs) - len(missing), dict[str, str]()
         progress(done, len(jobs))
@@ -107,13 +118,22 @@ def sweep(
             threads = max(cores() // workers, 1) if scheduler is None else scheduler.threads
             scene = replace(campaign.scene, folder=campaign.scene.folder.absolute())
             work = Work(
-                scene, campaign.estimators, parts.absolute(), kept, light_limit_bytes, threads, cpu_name()
+                scene,
+                campaign.estimators,
+                parts.absolute(),
+                kept,
+                light_limit_bytes,
+                threads,
+                cpu_name(),
+                store=store,
             )
             try:
                 with closing(run_jobs(work, missing, workers, folder / _SCRATCH, scheduler)) as ending:
                     for ended in ending:
                         if ended.error is not None:
                             failed[ended.job.key] = ended.error
+                        elif store is not None and read_part(part_file(parts, ended.job)) is None:
+                            store.fetch(part_object(ended.job), part_file(parts, ended.job))
                         done += 1
                         progress(done, len(jobs))
             except KeyboardInterrupt:
@@ -121,10 +141,35 @@ def sweep(
         for place in (folder, parts, folder / _LIGHT):
             _remove_abandoned(place, ".*.partial-*")
         _remove_abandoned(parts, f"{MARK}*")
-        return _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
+        result = _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
+        if store is not None:
+            for name in (TABLE, JOBS, MANIFEST):
+                store.put(folder / name, name)
+        return replace(result, store=store)
 
 
-def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[str, Any]:
+def _exchange(store: Store, campaign: Campaign, folder: Path, jobs: Sequence[Job]) -> None:
+    """Put what this machine has done before into object storage, and fetch what others have."""
+    check_store(store, campaign)
+    for name in (MANIFEST, PLANNED):
+        store.put(folder / name, name)
+    there = store.names(PARTS)
+
+    def exchange(job: Job) -> None:
+        file = part_file(folder / PARTS, job)
+        whole = read_part(file) is not None
+        if whole and file.name not in there:
+            store.put(file, part_object(job))
+        elif not whole and file.name in there:
+            store.fetch(part_object(job), file)
+
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        list(pool.map(exchange, jobs))
+
+
+def plan_record(
+    campaign: Campaign, jobs: Sequence[Job], folder: Path, store: Store | None = None
+) -> dict[str, Any]:
     """Return what a sweep has to do, as one JSON object: jobs, those that the folder holds, geometries.
 
     `refined` names the axes along which limits are found more exactly, which adds jobs as they are found.
@@ -132,11 +177,14 @@ def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[s
 
     Errors as `sweep`.
     """
-    done = 0
-    if folder.exists():
+    held: set[str] = set()
+    if store is not None:
+        check_store(store, campaign)
+        held = store.names(PARTS)
+    elif folder.exists():
         check_folder(folder, campaign)
-        held = {path.name for path in (folder / _PARTS).glob("*")}
-        done = sum(part_file(folder / _PARTS, job).name in held for job in jobs)
+        held = {path.name for path in (folder / PARTS).glob("*")}
+    done = sum(part_file(folder / PARTS, job).name in held for job in jobs)
     geometries = len({job.light for job in jobs})
     return {
         "campaign": campaign.name,
@@ -147,7 +195,7 @@ def plan_record(campaign: Campaign, jobs: Sequence[Job], folder: Path) -> dict[s
     }
 
 
-def status_record(campaign: Campaign, folder: Path) -> dict[str, Any]:
+def status_record(campaign: Campaign, folder: Path, store: Store | None = None) -> dict[str, Any]:
     """Return how far the last sweep of a folder has come, as one JSON object, without planning anew.
 
     `jobs` are those that it planned, `done` those of them whose files are there; `others` are files of jobs
@@ -158,11 +206,21 @@ def status_record(campaign: Campaign, folder: Path) -> dict[str, Any]:
     InputError
         The folder is not this campaign's, or no sweep has begun there.
     """
-    check_folder(folder, campaign)
-    if not (folder / PLANNED).is_file():
-        raise InputError(f"{folder}: no sweep has begun there; without --status it begins")
-    planned = {f"{key}{PART_KIND}" for key in read_json(folder / PLANNED)["jobs"]}
-    held = {path.name for path in (folder / _PARTS).glob(f"*{PART_KIND}") if not path.name.startswith(".")}
+    if store is None:
+        check_folder(folder, campaign)
+        begun = read_json(folder / PLANNED) if (folder / PLANNED).is_file() else None
+        held = {path.name for path in (folder / PARTS).glob(f"*{PART_KIND}")}
+    else:
+        check_store(store, campaign)
+        written = store.read(PLANNED)
+        begun = None if written is None else json.loads(written)
+        held = {name for name in store.names(PARTS) if name.endswith(PART_KIND)}
+    if begun is None:
+        raise InputError(
+            f"{store.url if store else folder}: no sweep has begun there; without --status it begins"
+        )
+    held = {name for name in held if not name.startswith(".")}
+    planned = {f"{key}{PART_KIND}" for key in begun["jobs"]}
     return {
         "campaign": campaign.name,
         "jobs": len(planned),
@@ -192,12 +250,22 @@ def check_folder(folder: Path, campaign: Campaign) -> None:
     if folder.is_dir() and not all(path.name.startswith(begun) for path in folder.iterdir()):
         if not (folder / MANIFEST).is_file():
             raise InputError(f"{folder}: holds files that are no campaign's; give a new folder")
-        facts = read_json(folder / MANIFEST)
-        name = facts.get("name") if isinstance(facts, dict) else None
-        if name != campaign.name:
-            raise InputError(
-                f"{folder}: holds the campaign {name!r}, not {campaign.name!r}; give another folder"
-            )
+        _check_name(str(folder), read_json(folder / MANIFEST), campaign)
+
+
+def check_store(store: Store, campaign: Campaign) -> None:
+    """Raise InputError where object storage holds what is not this campaign's."""
+    written = store.read(MANIFEST)
+    if written is not None:
+        _check_name(store.url, json.loads(written), campaign)
+    elif store.names():
+        raise InputError(f"{store.url}: holds objects that are no campaign's; give a new place")
+
+
+def _check_name(place: str, facts: Any, campaign: Campaign) -> None:
+    name = facts.get("name") if isinstance(facts, dict) else None
+    if name != campaign.name:
+        raise InputError(f"{place}: holds the campaign {name!r}, not {campaign.name!r}; give another folder")
 
 
 def _claim(folder: Path, campaign: Campaign) -> None:
@@ -208,7 +276,7 @@ def _claim(folder: Path, campaign: Campaign) -> None:
         # First of all files, so that a folder is known for what it is whenever this is killed.
         if not (folder / MANIFEST).is_file():
             write_json(folder / MANIFEST, {"format": 1, "name": campaign.name})
-        (folder / _PARTS).mkdir(exist_ok=True)
+        (folder / PARTS).mkdir(exist_ok=True)
     except OSError as error:
         raise disk_error(folder, error) from None
 
@@ -240,7 +308,7 @@ def _gather(
     done: list[Job] = []
     failed = dict(failed)
     for job in jobs:
-        part = None if job.key in failed else read_part(part_file(folder / _PARTS, job))
+        part = None if job.key in failed else read_part(part_file(folder / PARTS, job))
         if part is None:
             failed.setdefault(job.key, "its file is gone")
             continue
@@ -288,7 +356,7 @@ def _noise_warnings(table: pa.Table) -> Iterator[str]:
 
 
 def write_report(result: Sweep) -> Path:
-    """Write the page of a sweep beside its table; returns its path."""
+    """Write the page of a sweep beside its table, in object storage too; returns its path."""
     from nir_render.stress.page.page import campaign_html
 
     facts = read_json(result.folder / MANIFEST)
@@ -297,4 +365,6 @@ def write_report(result: Sweep) -> Path:
     facts = {**shown, "commands": commands, "warnings": result.warnings}
     page = result.folder / PAGE
     write_file(page, campaign_html(result.campaign, result.table, facts).encode())
+    if result.store is not None:
+        result.store.put(page, PAGE)
     return page

@@ -85,9 +85,14 @@ def range_in_fog_m(clear_air_range_m: ArrayLike, extinction_per_m: float) -> Arr
 
 
 def size_alone(
-    range_m: Array, sigma_m: Array, by_flux_m: Array, flux_share_sigma: Array
+    range_m: Array,
+    sigma_m: Array,
+    by_flux_m: Array,
+    flux_share_sigma: Array,
+    constant_sigma: Array | float = LOOSE,
+    least: float = _TOLD_BY_SIZE,
 ) -> tuple[Array, Array]:
-    """Return what size alone says of ranges that were fitted with a loosened calibration, NaN where nothing.
+    """Return what size alone says of ranges that were fitted to size and flux, NaN where nothing.
 
     Parameters
     ----------
@@ -97,17 +102,22 @@ def size_alone(
         By flux in clear air.
     flux_share_sigma
         Standard deviation of the flux, relatively.
+    constant_sigma
+        That of the range constant, relatively, with which they were fitted: that of `loosened` as it is.
+    least
+        Of what flux tells, with that constant, so much at least must size tell to be heard.
 
     Returns
     -------
     Ranges and their standard deviations, of the shape of what is given.
     """
-    of_flux2 = (0.5 * LOOSE) ** 2 + (0.5 * flux_share_sigma) ** 2
+    of_flux2 = (0.5 * constant_sigma) ** 2 + (0.5 * flux_share_sigma) ** 2
     both2 = (sigma_m / range_m) ** 2
     precision = 1.0 / both2 - 1.0 / of_flux2
-    told = precision > _TOLD_BY_SIZE / of_flux2
+    told = precision > least / of_flux2
     precision = np.where(told, precision, 1.0)
     log_range = (np.log(range_m) / both2 - np.log(by_flux_m) / of_flux2) / precision
+    log_range = np.where(told, log_range, 0.0)
     return np.where(told, np.exp(log_range), np.nan), np.where(
         told, np.exp(log_range) / np.sqrt(precision), np.nan
     )

@@ -131,7 +131,7 @@ def expectation(
 
 
 @compiled
-def _information(jacobian: Array, weight: Array, into: Array) -> None:
+def add_information(jacobian: Array, weight: Array, into: Array) -> None:
     """Add J W Jᵀ."""
     size, pixels = jacobian.shape
     weighted = np.empty(pixels)
@@ -178,7 +178,7 @@ def slopes(
             pull[pixel] = mills / sigma
             weight[pixel] *= kept if of_average else curvature
     information[:] = precision
-    _information(jacobian, weight, information)
+    add_information(jacobian, weight, information)
     for one in range(len(values)):
         total = 0.0
         for pixel in range(len(expected)):
@@ -206,6 +206,24 @@ def objective(
         for other in range(len(values)):
             total += values[one] * precision[one, other] * values[other]
     return total, logs
+
+
+@compiled
+def unlikeliness(
+    view: View, sources: Sources, structure: Structure, known: Known, precision: Array, values: Array
+) -> float:
+    """Return −2 ln L of some values of the unknowns, as `maximise` does of the likeliest; infinite if none.
+
+    The arguments are as for that.
+    """
+    count, pixels = len(sources.log_range_at), view.image_e.size
+    step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
+    if not is_inside(values, view, count, step):
+        return math.inf
+    expected, variance, jacobian = np.empty(pixels), np.empty(pixels), np.empty((len(values), pixels))
+    expectation(values, view, sources, structure, known, expected, jacobian, variance)
+    total, logs = objective(view, values, expected, variance, precision, known.clip_e)
+    return total + logs
 
 
 @compiled

@@ -118,8 +118,7 @@ def measure_set(
         mirrors,
         *((extinction.per_m, extinction.sigma_per_m) if extinction is not None else ()),
     )
-    cameras = tuple(dict.fromkeys(frame.camera for frame in frames))
-    return replace(seen, robots=told_robots(known, detections, calibrations, measurements, cameras))
+    return replace(seen, robots=told_robots(known, frames, detections, calibrations, measurements))
 
 
 def _kept(found: Sequence[Detection], now: Sequence[Detection]) -> Detections:

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.rig.frame_sets import Exposed
 from perception.rig.moving import OneTime
 from perception.rig.pose.gates import GATE_CHI2, HEADINGS, Places, fitting
 from perception.rig.pose.partings import Candidate, told_apart
-from perception.rig.pose.posterior import LEAST_ODDS, evidence_alone, posterior
-from perception.rig.pose.sights import Sights, carried
-from perception.rig.rays import UNKNOWN_RANGE
-from perception.rig.sightings import CAMERAS_MOST, CAMERAS_SHARE, LEAST_NOISE, UNCLAIMED_RANGE
+from perception.rig.pose.posterior import LEAST_ODDS, Posterior, evidence_alone, posterior
+from perception.rig.pose.sights import Sights, carried, sights_of, symmetries
 from perception.types import Calibration, Detection, Layout, Measurement, PoseHypothesis, RobotPose
 
 Array = NDArray[np.float64]
@@ -42,10 +41,10 @@ class _Seen:
 
 def told_robots(
     known: OneTime,
+    frames: Sequence[Exposed],
     detections: Sequence[Sequence[Detection]],
     calibrations: Mapping[str, Calibration],
     measurements: Sequence[Measurement],
-    cameras: Sequence[str],
 ) -> tuple[RobotPose, ...]:
     """Return the robots with several sources that a set of measurements shows.
 
@@ -57,19 +56,18 @@ def told_robots(
     ----------
     known
         What the detections say, at one time.
-    detections, calibrations
-        As for `measure_set`.
+    frames, detections, calibrations
+        As for `measure_set`. Layouts are those that any camera of the set knows, by their kind.
     measurements
         Made of the detections.
-    cameras
-        Of the set: layouts are those that any of them knows, by their kind.
     """
+    cameras = dict.fromkeys(frame.camera for frame in frames)
     of_kind = {each.kind: each for camera in cameras for each in calibrations[camera].layouts}
     layouts = [each for each in of_kind.values() if _tells_heading(each)]
     claimed = any(math.isfinite(hit.range_sigma_m) for each in detections for hit in each)
     if not layouts or not claimed or len(measurements) < 2:
         return ()
-    seen = _seen(measurements, sights_of(known, detections, calibrations), known)
+    seen = _seen(measurements, sights_of(known, frames, detections, calibrations), known)
     candidates = _candidates(seen, layouts)
     alone = [_alone(rows, seen.sights) for rows in seen.rows]
     return tuple(_robot(chosen, odds, seen, known.time_s) for chosen, odds in told_apart(candidates, alone))
@@ -80,56 +78,12 @@ def _tells_heading(layout: Layout) -> bool:
     return bool(across_m.max() > _LEAST_ACROSS_M)
 
 
-def sights_of(
-    known: OneTime, detections: Sequence[Sequence[Detection]], calibrations: Mapping[str, Calibration]
-) -> Sights:
-    """Return what detections say, with the errors that they share told from their own."""
-    found = known.sightings
-    rays, n = found.rays, len(found.keys)
-    hits = [hit for each in detections for hit in each]
-    names = list(dict.fromkeys(hit.camera for hit in hits))
-    camera = np.array([names.index(hit.camera) for hit in hits])
-    sigmas = [calibrations[name].sigma for name in names]
-    turned_rad = np.array([sigma.get("rotation_body_camera", 0.0) for sigma in sigmas])[camera]
-    moved_m = np.array([sigma.get("position_body_m", 0.0) for sigma in sigmas])[camera]
-    constant = np.array([_relative_sigma_of_k(calibrations[name]) for name in names])[camera]
-    sigma_m, common_m = np.array([(hit.range_sigma_m, hit.range_sigma_common_m) for hit in hits]).T
-    ranged = np.isfinite(rays.range_m)
-    claimed = ranged & np.isfinite(sigma_m)
-    at_m = np.where(ranged, rays.range_m, 1.0)
-    common = np.where(claimed, np.nan_to_num(common_m) / at_m, 0.0)
-    of_camera2 = np.minimum(CAMERAS_SHARE * common**2, CAMERAS_MOST**2)
-    noise2 = np.maximum(np.where(claimed, sigma_m / at_m, 0.0) ** 2 - common**2, LEAST_NOISE**2)
-    noise2 += found.together.noise**2 - rays.noise**2  # where the observer moved between its cameras
-    own = np.zeros((n, 3, 3))
-    own[:, :2, :2] = found.together.angular_rad2 - found.mounting_rad2[:, None, None] * np.eye(2)
-    own[:, 2, 2] = np.where(claimed, noise2, np.where(ranged, UNCLAIMED_RANGE**2, UNKNOWN_RANGE**2))
-    # The share of a range that comes of flux: its answer to an error of K over that of K/F alone.
-    by_flux = np.ones(n)
-    stated = claimed & (constant > 0.0)
-    by_flux[stated] = np.minimum(1.0, 2.0 * common[stated] / constant[stated])
-    of_one = np.zeros((n, 3, 7))
-    of_one[:, :2, :3] = turned_rad[:, None, None] * np.cross(rays.axes[:, 2:], rays.axes[:, :2])
-    of_one[:, :, 3:6] = (moved_m / at_m)[:, None, None] * rays.axes
-    of_one[:, 2, 6] = np.sqrt(of_camera2)
-    shared = np.zeros((n, 3, len(names), 7))
-    shared[np.arange(n), :, camera] = of_one
-    return Sights(
-        rays.origin_m, rays.axes, np.log(rays.range_m), by_flux, own, shared.reshape(n, 3, -1),
-        np.sqrt(common**2 - of_camera2),
-    )  # fmt: skip
-
-
-def _relative_sigma_of_k(calibration: Calibration) -> float:
-    sigma = calibration.sigma.get("range_constant_dn_m2_per_s", 0.0)
-    return sigma / calibration.range_constant_dn_m2_per_s
-
-
 def _seen(measurements: Sequence[Measurement], sights: Sights, known: OneTime) -> _Seen:
     """Return the measurements that may be sources of robots, and where they are."""
     row_of = {key: row for row, key in enumerate(known.sightings.keys)}
     told = [each for each in measurements if each.ghost != "yes"]
     rows = [tuple(row_of[key] for key in each.detections) for each in told]
+    sizes = sights.size.tolist()
     noise = sights.own[:, 2, 2].tolist()
     best = np.array([min(some, key=noise.__getitem__) for some in rows], dtype=np.int64)
     range_m = np.exp(sights.log_range[best])
@@ -140,7 +94,7 @@ def _seen(measurements: Sequence[Measurement], sights: Sights, known: OneTime) -
     order = np.argsort((place_m**2).sum(axis=1), kind="stable")[:MOST_FLARES]
     return _Seen(
         tuple(told[k] for k in order),
-        tuple(rows[k] for k in order),
+        tuple((*rows[k], *(sizes[row] for row in rows[k] if sizes[row] >= 0)) for k in order),
         Places(best[order], place_m[order], noise_m2[order]),
         sights,
     )
@@ -203,9 +157,18 @@ def _candidate(members: tuple[int, ...], seen: _Seen, layout: Layout, fits: Pair
         return None
     counts = [len(seen.rows[k]) for k in members]
     body, ways = carried(layout), []
+    turns = symmetries(layout)
+    known: dict[tuple[int, ...], Posterior | None] = {}
     for way, headings in _ways(members, sources, fits):
-        shown = np.repeat(np.array(way), counts)
-        found = posterior(seen.sights, rows, body, shown, headings, GATE_CHI2 + 3 * len(rows))
+        if way not in known:
+            shown = np.repeat(np.array(way), counts)
+            known[way] = posterior(seen.sights, rows, body, shown, headings, GATE_CHI2 + 3 * len(rows))
+            for turn_rad, onto in turns:  # the same said otherwise
+                again = known[way]
+                known[tuple(onto[source] for source in way)] = (
+                    None if again is None else again.turned(turn_rad)
+                )
+        found = known[way]
         if found is not None:
             log_prior = len(members) * math.log(SEEN) + hidden * math.log(1.0 - SEEN)
             ways.append((way, found, found.log_evidence + log_prior + math.log(PER_M3)))

@@ -11,15 +11,19 @@ from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
-from perception.robust.motion import moving, weighed
+from perception.robust.motion import moving
 from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, deblend, of_free_width
-from perception.robust.overlap.eclipse import LEAST_RADIUS_PX, eclipses
+from perception.robust.overlap.eclipse import eclipses
+from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
+from perception.robust.overlap.pairs import LEAST_RADIUS_PX
+from perception.robust.overlap.rivals import weighed
+from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.search.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
-from perception.robust.solve import Solution, solve
+from perception.robust.solve import Solution, solve, start_costs
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 HALO_SEEMS_SIGMAS = 1.5
@@ -44,11 +48,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     -------
     What explains each best; None where nothing does.
     """
-    problems = [
-        (index, Problem(cluster.window, starts, cluster.background_e))
-        for index, cluster in enumerate(found)
-        for starts in guesses(cluster, prepared)
-    ]
+    problems = _likely([_first_problems(cluster, prepared) for cluster in found], camera)
     chosen: list[Solution | None] = [None] * len(found)
     for (index, _), solution in zip(problems, solve([p for _, p in problems], camera), strict=True):
         held = chosen[index]
@@ -62,13 +62,15 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     # flares would explain better.
     parted: dict[int, Solution] = {}
     cut_short: set[int] = set()
+    plain: list[Solution | None] = [None] * len(found)
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
         parted = _parted(plain, prepared.shape, camera, cut_short)
-        for index, pair in eclipses(found, plain, parted, camera).items():
+        may_be = [one is None or may_be_other_shape(one, camera) for one in plain]
+        for index, pair in eclipses(found, plain, parted, may_be, camera).items():
             if _explains_all(pair, prepared.shape) and _is_better(pair, parted.get(index)):
                 parted[index] = pair
-        for index, piece in cut_discs(found, plain, camera).items():
+        for index, piece in cut_discs(found, plain, parted, may_be, camera).items():
             if _explains_all(piece, prepared.shape) and _is_better(piece, parted.get(index)):
                 parted[index] = piece
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
@@ -94,10 +96,37 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, more in parted.items():
         if _is_better(more, chosen[index]):
             chosen[index] = more
+    if prepared.frame.line_time_s == 0.0:
+        for index, one_or_two in doubted(chosen, plain, camera).items():
+            chosen[index] = one_or_two
     for index in cut_short:
         one = chosen[index]
         if one is not None and asks_for_more(one):
             chosen[index] = replace(one, may_be_more=True)
+    return chosen
+
+
+def _first_problems(cluster: Cluster, prepared: PreparedFrame) -> list[Problem]:
+    """Return a cluster's problems: the same window with each set of first guesses, from the faintest on."""
+    return [Problem(cluster.window, starts, cluster.background_e) for starts in guesses(cluster, prepared)]
+
+
+def _likely(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple[int, Problem]]:
+    """Return by index of the cluster which problems to follow: those likelier than what lies beside them.
+
+    From one that is not the climb would lead to where a likelier one leads.
+    """
+    several = [each for of_one in problems if len(of_one) > 1 for each in of_one]
+    costs = iter(start_costs(several, camera))
+    chosen = []
+    for index, of_one in enumerate(problems):
+        if len(of_one) == 1:
+            chosen.append((index, of_one[0]))
+            continue
+        cost = [math.inf, *(next(costs) for _ in of_one), math.inf]
+        chosen += [
+            (index, each) for at, each in enumerate(of_one, 1) if cost[at] <= min(cost[at - 1], cost[at + 1])
+        ]
     return chosen
 
 

@@ -62,7 +62,11 @@ class LeftOver:
     @cached_property
     def is_good(self) -> bool:
         """Whether chance alone may leave so much on the flares."""
-        return self.pixels == 0 or _is_likely(self.pixels, self.chi2)
+        return self.may_be_good(0.0)
+
+    def may_be_good(self, less_chi2: float) -> bool:
+        """Tell whether chance alone may leave so much were χ² less by that."""
+        return self.pixels == 0 or _is_likely(self.pixels, self.chi2 - less_chi2)
 
     @property
     def share(self) -> float:

@@ -36,7 +36,8 @@ class MeasuredFlare:
     """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
 
     `log_range_doubt` is the part of the relative σ of its range that comes of what sources hide, of each
-    other and of the background; `log_range_doubt_common` that of the background alone.
+    other and of the background, and of its being two perhaps; `log_range_doubt_common` that of the background
+    alone.
     """
 
     u_px: float
@@ -135,7 +136,7 @@ def _judged(
     drawn_out = solution.motion_px is not None and solution.window.on_edges
     doubted = misfit or cluster.is_clipped or drawn_out
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
-    if doubted and left.share > most_left:
+    if doubted and left.share > most_left and solution.log_range_of_two == 0.0:
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
@@ -162,7 +163,8 @@ def _measurement(
     flux_e = float(solution.flux_e[index])
     flux_sigma_e = float(solution.flux_sigma_e[index]) * widening
     hidden = _hidden_log_range(solution, index)
-    log_sigma = math.hypot(float(solution.log_range_sigma[index]) * widening, hidden / math.sqrt(3.0))
+    doubt = math.hypot(hidden / math.sqrt(3.0), solution.log_range_of_two)
+    of_one = math.hypot(float(solution.log_range_sigma[index]) * widening, hidden / math.sqrt(3.0))
     of_background = float(solution.log_range_hidden[index])
     # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.
     range_m = math.nan
@@ -174,7 +176,7 @@ def _measurement(
     if clips.any() and len(prepared.bad_at):
         clips &= ~prepared.bad[blob.box.slices]
     saturated = bool(clips.any())
-    told_sigma = log_sigma
+    told_sigma = of_one  # that it may be two does not make a clipped one a bound
     if may_be_in_fog(prepared.calibration):
         # The range that this fit states is loosely tied to the flux, which tells it in fog.
         told_sigma = math.hypot(0.5 * flux_sigma_e / flux_e, hidden / math.sqrt(3.0))
@@ -188,13 +190,13 @@ def _measurement(
         flux_sigma_e=flux_sigma_e,
         background_e=solution.background_e,
         range_m=range_m,
-        range_sigma_m=math.nan if bound_only else range_m * log_sigma,
+        range_sigma_m=math.nan if bound_only else range_m * math.hypot(of_one, solution.log_range_of_two),
         range_sigma_common_m=math.nan if bound_only else range_m * float(solution.log_range_common[index]),
-        log_range_doubt=math.hypot(of_background * widening, hidden / math.sqrt(3.0)),
+        log_range_doubt=math.hypot(of_background * widening, doubt),
         log_range_doubt_common=of_background,
         saturated=saturated,
         misfit=misfit,
-        is_doubtful=solution.is_doubtful or hidden > log_sigma,
+        is_doubtful=solution.is_doubtful or hidden > of_one,
         may_be_more=solution.may_be_more,
         on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges or left.peak_sigmas > RESIDUAL_SIGMAS,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.layout import Sources, View
-from perception.model.pixels import maximise
+from perception.model.pixels import maximise, unlikeliness
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import MOTION_PX, Camera, lay_out
@@ -28,9 +28,10 @@ _MOST_LAYOUTS = 7
 _LAYOUT_KEPT = 0.02
 _LAYOUT_KEPT_PX = 0.05
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
+_OF_STARTS = 0.5  # so fine are images that are only to tell which first guess is likelier
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
-_PLACES = 200.0  # of a flare in a blob: 50 px² by four e-foldings of its range
-_NEIGHBOURS = 20.0 * 50.0 / (1280.0 * 960.0)  # of twenty flares in a frame, how many lie in those 50 px²
+_BLOB_PX2, _PLACES = 50.0, 200.0  # of a flare in a blob: so many px², by four e-foldings of its range
+NEIGHBOURS_PER_PX2 = 20.0 / (1280.0 * 960.0)  # of twenty flares in a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +68,10 @@ class Solution:
     motion_px, motion_cost
         How far each moves along u and v during the exposure, shape (flares, 2), None where none may; and what
         that costs a priori (`model.window`).
+    log_range_of_two
+        How far the range of a lone flare may be off because it may be two (`unparted`), beside its σ.
     is_doubtful
-        Whether another number of flares explains the window nearly as well (`motion.weighed`).
+        Whether another number of flares explains the window nearly as well (`rivals.weighed`).
     may_be_more
         Whether more flares were not looked for, as there are too many already (`deblend`).
     is_eclipse
@@ -98,6 +101,7 @@ class Solution:
     log_information: float
     motion_px: Array | None = None
     motion_cost: float = 0.0
+    log_range_of_two: float = 0.0
     is_doubtful: bool = False
     may_be_more: bool = False
     is_eclipse: bool = False
@@ -108,10 +112,10 @@ class Solution:
 
         Laplace's approximation (MacKay, Neural Comput. 4, 415, 1992): an unknown costs the logarithm of how
         much narrower the data leave it than its prior, which for a flare is any of `_PLACES` places and
-        brightnesses. That others lie in the same blob is as rare as `_NEIGHBOURS`, each.
+        brightnesses. That others lie in the same blob is as rare as `NEIGHBOURS_PER_PX2` says, each.
         """
         by_flares = self.count * (2.0 * math.log(_PLACES) - 3.0 * math.log(2.0 * math.pi))
-        by_chance = -2.0 * (self.count - 1) * math.log(_NEIGHBOURS)
+        by_chance = -2.0 * (self.count - 1) * math.log(NEIGHBOURS_PER_PX2 * _BLOB_PX2)
         return self.deviance + self.log_information + by_flares + by_chance + self.motion_cost
 
     @property
@@ -127,9 +131,7 @@ class Solution:
 
     def again(self, window: Window | None = None) -> Problem:
         """Return the problem of fitting these flares again, or to another view of their window."""
-        return Problem(
-            self.window if window is None else window, self.starts, self.background_e, self.motions
-        )
+        return Problem(window or self.window, self.starts, self.background_e, self.motions)
 
     @property
     def most_motion_px(self) -> float:
@@ -176,6 +178,8 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     -------
     A solution for each, None where the fit did not converge.
     """
+    if not problems:
+        return []
     moving = replace(camera, motion_px=MOTION_PX)
     fits = [Fit(problem, camera if problem.motions is None else moving) for problem in problems]
     solved: dict[int, Solution] = {}
@@ -190,6 +194,20 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
         found = solutions_of([fit for _, fit in done], of_camera)
         solved.update((index, one) for (index, _), one in zip(done, found, strict=True))
     return [solved.get(index) for index in range(len(fits))]
+
+
+def start_costs(problems: Sequence[Problem], camera: Camera) -> list[float]:
+    """Return −2 ln L of each problem's first guesses, all at rest, but for a constant of its window.
+
+    By coarse images: they tell apart guesses whose fluxes differ several times.
+    """
+    if not problems:
+        return []
+    fits = [Fit(problem, camera) for problem in problems]
+    laid, imaged, _ = _laid_out(fits, camera, None, finer=_OF_STARTS)
+    ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
+    parts = zip(fits, [0, *ends], ends, strict=False)
+    return [f.unlikeliness(laid.part(a, b)) if imaged[a:b].all() else math.inf for f, a, b in parts]
 
 
 class Fit:
@@ -229,15 +247,27 @@ class Fit:
             [self.covariance[at : at + step, at : at + step] for at in range(0, self.layout.width, step)]
         )
 
+    @property
+    def view(self) -> View:
+        """The window as compiled loops see it."""
+        box, window = self.window.box, self.window
+        known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
+        return View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
+
+    @property
+    def prior(self) -> Array:
+        """Precision of the unknowns a priori."""
+        return self.layout.prior(self.structure, self.known.motion_px)
+
+    def unlikeliness(self, sources: Sources) -> float:
+        """Return −2 ln L of the present values but for a constant, with images as laid out for them."""
+        return unlikeliness(self.view, sources, self.structure, self.known, self.prior, self.values)
+
     def climb(self, sources: Sources, reach_px: Array) -> None:
         """Go on to the greatest likelihood, with images as laid out, of so large radii."""
-        box, layout = self.window.box, self.layout
-        window = self.window
-        known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
-        view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
         self.deviance, self.log_information = maximise(
-            view, sources, self.structure, self.known, layout.prior(self.structure, self.known.motion_px),
-            layout.most_step, self.values, self.covariance, self.expected_e.ravel(),
+            self.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
+            self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
         self.converged = math.isfinite(self.deviance)
         growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
@@ -247,12 +277,10 @@ class Fit:
 def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
-    hidden_px = hidden_px_at_1_m(own, camera)
     background_e = np.concatenate([fit.background_e for fit in fits])
-    hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
     motion_px = _motion_px(own, fits[0])
     laid_px = None if motion_px is None else motion_px + _LINE_KEPT_PX
-    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], log_range_by_size(own, fits[0]), hidden_e, laid_px)
+    laid, imaged, hidden_px = _laid_out(fits, camera, laid_px)
     reach_px = laid.reach_px
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
@@ -274,6 +302,19 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
         for fit, first, end in zip(fits, [0, *ends], ends, strict=False)
         if fit.converged and moved[first:end].any()
     ]
+
+
+def _laid_out(
+    fits: Sequence[Fit], camera: Camera, moved_px: Array | None, finer: float = 1.0
+) -> tuple[Sources, NDArray[np.bool_], Array | None]:
+    """Lay out the sources of fits; beside what `lay_out` returns, how many pixels each would hide at 1 m."""
+    own = np.concatenate([fit.own for fit in fits])
+    background_e = np.concatenate([fit.background_e for fit in fits])
+    hidden_px = hidden_px_at_1_m(own, camera)
+    hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
+    by_size = log_range_by_size(own, fits[0])
+    fineness = np.full(len(own), finer)
+    return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px, fineness), hidden_px
 
 
 def hidden_px_at_1_m(own: Array, camera: Camera) -> Array | None:

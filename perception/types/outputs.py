@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 class Detection:
     """One flare found in one frame.
 
-    `flux_dn` is the background-subtracted integral, `mean_dn` the mean grey value over the blob as read
+    `flux_dn` is the background-subtracted integral, of one that something hides in part (another source, a
+    straight edge) that of the whole, as `range_m` is; `mean_dn` the mean grey value over the blob as read
     (black level included), `background_dn` the local background as read. `range_sigma_m` and the pixel
     sigmas are what the estimator claims; NaN where it makes no claim. `range_m` is NaN where no range
     could be had, and a lower bound of the flux (so an upper bound of the range) where `saturated` and not

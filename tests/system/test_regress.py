@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -120,6 +121,12 @@ def test_create_check_update(tmp_path: Path) -> None:
     done = _run("update", suite, "--reason", "a <darker> wall", "--page", str(page), "--renders", "8")
     assert done["made"] == ["small"]
     assert "a &lt;darker&gt; wall" in page.read_text()
+    blinks = re.findall(
+        r'class="blink".*?src="(.*?)".*?class="other" src="(.*?)"', page.read_text(), re.DOTALL
+    )
+    before, after = blinks[:2]  # the light of r2, which is not the same
+    assert before == after[::-1]
+    assert before[0] != before[1]
     assert _run("check", suite)["holds"]
     history = json.loads((suite / "references" / "small" / "reference.json").read_text())["history"]
     assert [one["reason"] for one in history] == ["created", "a <darker> wall"]

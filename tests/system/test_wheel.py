@@ -31,7 +31,9 @@ def test_the_wheel_carries_templates_presets_and_examples(tmp_path: Path) -> Non
     for example in (ROOT / "scenes").rglob("*.yaml"):
         assert f"nir_render/data/{example.relative_to(ROOT).as_posix()}" in names
     assert {"nir_render/data/scenes/my_estimator.py", "nir_render/data/scenes/pallet.obj"} < names
-    assert {"sun", "export", "test"} <= set(message_from_bytes(about).get_all("Provides-Extra", []))
+    assert {"sun", "export", "cluster", "s3", "test"} <= set(
+        message_from_bytes(about).get_all("Provides-Extra", [])
+    )
 
 
 def test_who_cites_the_package_names_its_version_and_licence() -> None:

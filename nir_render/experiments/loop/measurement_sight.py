@@ -1,7 +1,7 @@
 """A robot that sees by measurements: as the detector makes them, drawn about the truth, without frames."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import cast
@@ -104,7 +104,9 @@ class MeasurementSight:
     flares drawn out. Two within 2 px are one at their centre of light, and not ranged; below 8 σ of flux
     nothing is found. Where a source was not found its pixels are drawn: how dark it is the stack measures.
 
-    `hidden` names by camera the sources that bodies hide from it; by default they hide none.
+    `visible` says by camera how much of sources it sees whom bodies hide, in part or whole: of so much less
+    light, they seem so much farther, and σ does not know it. Of resolved ones the detector does know it
+    mostly: this is the harsher.
     """
 
     def __init__(
@@ -113,10 +115,10 @@ class MeasurementSight:
         robot: str,
         seed: int,
         keep_signals: bool = False,
-        hidden: Mapping[str, Collection[str]] = MappingProxyType({}),
+        visible: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
     ) -> None:
         self._robot, self._seed = robot, seed
-        self._hidden = {name: frozenset(hidden.get(name, ())) for name in scene.document.cameras_of(robot)}
+        self._visible = {name: dict(visible.get(name, {})) for name in scene.document.cameras_of(robot)}
         self._cameras = scene.document.cameras_of(robot)
         self._known = {name: calibration(scene, name) for name in self._cameras}
         self._exposure_s = {name: scene.camera(name)[1].exposure_s for name in self._cameras}
@@ -169,13 +171,14 @@ class MeasurementSight:
         ):
             if name.startswith(f"{self._robot}.") or not _is_in_view(place_px, known):
                 continue
-            if name in self._hidden[frame.camera]:
-                continue
+            shown = self._visible[frame.camera].get(name, 1.0)
             bound, lit_e = self._bound(frame, range_m, float(place_px[0]), float(place_px[1]))
             # A source that is brighter than its type seems so much nearer, and one that was lit for a part
-            # of the exposure so much farther.
+            # of the exposure, or seen in part, so much farther.
             brighter = placed.source.sent_flux_w / placed.source.of_its_type.sent_flux_w
-            level = float(mean_level(drive_of(placed.source), frame.time_s, frame.exposure_s)) * brighter
+            level = (
+                float(mean_level(drive_of(placed.source), frame.time_s, frame.exposure_s)) * brighter * shown
+            )
             flux_e = level * lit_e
             images.append(_Image(float(place_px[0]), float(place_px[1]), range_m, flux_e))
             if flux_e < _LEAST_SNR * bound.flux_sigma_e:

@@ -13,7 +13,6 @@ from nir_render.camera.mean_frame import MeanFrame, Rates, electron_rates, expos
 from nir_render.camera.shared_light import SharedLight, shared_light
 from nir_render.camera.timing.exposure_control import own_setting
 from nir_render.camera.timing.shutter import mid_exposure_s
-from nir_render.evaluate.match import MIN_VISIBLE_FRACTION
 from nir_render.experiments.loop.journal import Told
 from nir_render.experiments.loop.measurement_sight import MeasurementSight
 from nir_render.experiments.swarm.film import MOST_PICTURES, encoded, picture_file
@@ -66,7 +65,8 @@ class Swarm:
     ----------
     level
         `frames`: rendered, exposed, and read by the whole stack. `measurements`: detections drawn about the
-        truth (`MeasurementSight`) of whom bodies do not hide; what is found of single frames is not judged.
+        truth (`MeasurementSight`), fainter where bodies hide a part; what is found of single frames is not
+        judged.
     robots, density_per_m2
         How many stand in the hall, the observer among them, and how densely.
     bodies
@@ -205,7 +205,7 @@ class SwarmLoop:
     def _measured(self, clock: "_Clock") -> Told:
         """Draw the detections of a set, and read them."""
         if self._sight is None:
-            self._sight = MeasurementSight(self._scene, OBSERVER, self.seed, hidden=self._hidden())
+            self._sight = MeasurementSight(self._scene, OBSERVER, self.seed, visible=self._visible())
             self._rates = {}
         seen = self._sight.look(_Standing(self._world, self._done / self.plan.rate_hz))
         words = seen.messages
@@ -228,13 +228,13 @@ class SwarmLoop:
             lines[SENT] = [packet.record() for packet in sent_packets(self._scene)]
         return lines
 
-    def _hidden(self) -> dict[str, list[str]]:
-        """Return by camera the sources of which less than half is seen."""
-        found: dict[str, list[str]] = {}
+    def _visible(self) -> dict[str, dict[str, float]]:
+        """Return by camera how much is seen of each source that is not seen whole."""
+        found: dict[str, dict[str, float]] = {}
         for name, rates in self._rates.items():
             table, groups = rates.light.direct, rates.light.groups
-            rows = np.flatnonzero((table.facet < 0) & (table.visible_fraction < MIN_VISIBLE_FRACTION))
-            found[name] = [groups[table.group[row]] for row in rows]
+            rows = np.flatnonzero((table.facet < 0) & (table.visible_fraction < 1.0))
+            found[name] = {groups[table.group[row]]: float(table.visible_fraction[row]) for row in rows}
         return found
 
     def record(self) -> dict[str, Any]:

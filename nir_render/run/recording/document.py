@@ -5,6 +5,7 @@ template states them beside each key.
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
@@ -156,11 +157,15 @@ class SourceGiven(Document):
 
 
 class CameraGiven(Document):
-    """A camera, and the frames it took; counts and electrons are those of the frames as recorded."""
+    """A camera, and the frames it took; counts and electrons are those of the frames as recorded.
+
+    `times` is a file with the time of each frame in seconds, one a line, in place of a frame rate.
+    """
 
     frames: Annotated[str, Field(min_length=1, max_length=1000)]
     exposure_s: Annotated[Time, Field(gt=0, le=1e4)]
-    frame_rate_hz: Annotated[Frequency, Field(gt=1e-6, le=1e9)]
+    frame_rate_hz: Annotated[Frequency, Field(gt=1e-6, le=1e9)] | None
+    times: Annotated[str, Field(min_length=1, max_length=1000)] | None = None
     focal_length: Annotated[Measured, WithSigma(LENGTH, PIXELS, unsaid=0.02)]
     pixel_pitch_m: Annotated[Length, Field(gt=1e-9, le=1e-2)] | None = None
     bit_depth_bit: Annotated[Bits, Field(ge=1, le=16)]
@@ -188,9 +193,16 @@ class CameraGiven(Document):
     transmission: Annotated[Measured, WithSigma(FRACTION, unsaid=0.1)] = Measured(0.8, 0.1, FRACTION)
     quantum_efficiency: Annotated[Measured, WithSigma(FRACTION, unsaid=0.2)] = Measured(0.12, 0.06, FRACTION)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _times_need_no_frame_rate(cls, data: Any) -> Any:
+        return {"frame_rate": None, **data} if isinstance(data, Mapping) and "times" in data else data
+
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         problems = []
+        if (self.frame_rate_hz is None) == (self.times is None):
+            problems.append("frame_rate and times: each says when frames were taken; write one of them")
         if self.bit_depth_bit != int(self.bit_depth_bit):
             problems.append(f"bit_depth is {self.bit_depth_bit:g} bit; write a whole number of bits")
         if self.focal_length.quantity is LENGTH and self.pixel_pitch_m is None:
@@ -227,4 +239,5 @@ def recording_schema() -> dict[str, Any]:
     schema = RecordingDocument.model_json_schema(by_alias=True)
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "nir_render recording"
+    schema["$defs"]["CameraGiven"]["required"].remove("frame_rate")  # a file of times stands in its place
     return schema

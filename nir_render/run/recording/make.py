@@ -1,7 +1,9 @@
 """The stages `new-recording` and `import`: a template, and what becomes of it once it is filled in."""
 
+import itertools
+import math
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +12,12 @@ from pydantic import ValidationError
 
 from nir_render.errors import InputError, shown
 from nir_render.run import folder as run_folder
+from nir_render.run.recording.bag import Topic, unpacked
 from nir_render.run.recording.calibration import Assumed, camera_calibration
 from nir_render.run.recording.document import CameraGiven, KnownRange, Measured, RecordingDocument
 from nir_render.run.recording.pictures import KINDS, Pictures, find_pictures, read_pictures
 from nir_render.run.recording.range_constant import Constant, from_data_sheets, from_known_ranges
+from nir_render.scene.documents.files import find_file
 from nir_render.scene.problems import Places, explain
 from nir_render.scene.text.yaml_text import read_yaml
 from perception import (
@@ -47,30 +51,61 @@ class Imported:
     lossy_sigma_dn: float
 
 
-def new_recording(folder: Path) -> str:
-    """Write the template into a folder, which may hold pictures already; returns the pattern of their names.
+def new_recording(folder: Path, bag: Path | None = None) -> list[str]:
+    """Write the template into a folder, which may hold pictures already; returns the patterns of their names.
+
+    With a `bag` its pictures are written into the folder first, with the time of each.
 
     Raises
     ------
     InputError
-        The folder holds a `recording.yaml` already, or cannot be written.
+        The folder holds a `recording.yaml` already, or cannot be written; a bag that is none, or without
+        pictures of grey.
     """
     if folder.is_file():
         raise InputError(f"{folder}: is a file; give the folder that holds the pictures, or a new one")
     path = folder / FILE
     if path.exists():
         raise InputError(f"{path}: is there already; fill it in, or take it away for a new one")
-    pattern, seen = "frames/*.png", ""
+    if bag is not None:
+        topics = unpacked(bag, folder)
+        _write_template(folder, topics[0].pattern, topics)
+        return [topic.pattern for topic in topics]
+    pattern = "frames/*.png"
     pictures = (
         [one for one in sorted(folder.rglob("*")) if one.suffix.lower() in KINDS] if folder.is_dir() else []
     )
     if pictures:
         first = pictures[0].relative_to(folder)
         pattern = (first.parent / f"*{first.suffix}").as_posix()
-        seen = _seen(folder, first, len(find_pictures(folder, pattern)))
-    text = _TEMPLATE.read_text(encoding="utf-8").format(frames=pattern, seen=seen)
-    run_folder.write_file(path, text.encode())
-    return pattern
+    _write_template(folder, pattern, ())
+    return [pattern]
+
+
+def _write_template(folder: Path, pattern: str, topics: Sequence[Topic]) -> None:
+    """Write the template for pictures of a pattern, and for further cameras of a bag."""
+    when, about = "frame_rate:", 'such as "30 Hz"; or "times: FILE", the time of each in s, one a line'
+    if topics:
+        when, about = f"times: {topics[0].times}", "of each frame, in s; or write a frame_rate"
+    more = "".join(
+        f'\n  {one.camera}:\n    frames: "{one.pattern}"\n    times: {one.times}\n'
+        + "".join(f"    {key}:\n" for key in ("exposure", "focal_length", "pixel_pitch", "bit_depth"))
+        for one in topics[1:]
+    )
+    found = sorted(folder.glob(pattern)) if folder.is_dir() else []
+    camera = topics[0].camera if topics else "r1.front"
+    text = _TEMPLATE.read_text(encoding="utf-8").format(
+        frames=pattern,
+        seen=_seen(folder, found[0].relative_to(folder), len(find_pictures(folder, pattern)))
+        if found
+        else "",
+        camera=f"{camera}:",
+        first=camera,
+        when=when,
+        about_when=about,
+        more=more,
+    )
+    run_folder.write_file(folder / FILE, text.encode())
 
 
 def _seen(folder: Path, first: Path, count: int) -> str:
@@ -230,12 +265,13 @@ def _camera(
     name: str, given: CameraGiven, document: RecordingDocument, pictures: Pictures, folder: Path
 ) -> tuple[Imported, list[dict[str, Any]]]:
     """Return what becomes of a camera, and its lines of `frames.jsonl`."""
+    times_s = _times_s(given, pictures, folder)
     calibration, assumed = camera_calibration(name, given, document.source, pictures)
     records = [
         FrameRecord(
             camera=name,
             index=index,
-            time_s=index / given.frame_rate_hz,
+            time_s=times_s[index],
             exposure_s=given.exposure_s,
             line_time_s=given.line_time_s,
             gain=1.0,
@@ -264,6 +300,23 @@ def _camera(
     known = replace(calibration, range_constant_dn_m2_per_s=constant.value_dn_m2_per_s, sigma=sigma)
     lines = [{"format": 1, **vars(record)} for record in records]
     return Imported(known, len(records), constant, tuple(assumed), pictures.lossy_sigma_dn), lines
+
+
+def _times_s(given: CameraGiven, pictures: Pictures, folder: Path) -> list[float]:
+    """Return when each picture was taken, by the frame rate or by the file of times."""
+    count = len(pictures.files)
+    if given.times is None:
+        assert given.frame_rate_hz is not None  # one of the two is there
+        return [index / given.frame_rate_hz for index in range(count)]
+    try:
+        times_s = [float(line) for line in find_file(given.times, folder).read_text().split()]
+    except ValueError as error:
+        raise ValueError(f"times: {given.times}: {error}; wanted a time in seconds on each line") from None
+    if len(times_s) != count:
+        raise ValueError(f"times: {given.times} has {len(times_s)} times, and there are {count} pictures")
+    if not all(math.isfinite(one) and one < other for one, other in itertools.pairwise([*times_s, math.inf])):
+        raise ValueError(f"times: {given.times}: times must increase from line to line")
+    return times_s
 
 
 def _without_empty(raw: Any) -> Any:

@@ -9,6 +9,7 @@ from nir_render.errors import InputError
 from nir_render.run import folder as run_folder
 from nir_render.run.folder import note_seconds, parse_lines
 from perception import Detection, RawFrame, RecordingError, parse_detection, read_recording
+from perception.files.detections import parse_causes
 from perception.types import FrameKey
 
 _FRAMES_KEPT = 16
@@ -41,6 +42,7 @@ def report_recording(folder: Path) -> Path:
             calibrations=recording.calibrations,
             folder_name=folder.resolve().name,
             files=run_folder.files_beside(folder / "report.html"),
+            causes=run_folder.lines_of(folder, "causes", list(found), parse_causes),
         )
     except RecordingError as error:
         raise InputError(str(error)) from None

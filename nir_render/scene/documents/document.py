@@ -24,15 +24,15 @@ from nir_render.errors import shown
 from nir_render.geometry import rectangle_frame
 from nir_render.scene.documents.ambient.lamps import IlluminanceDocument, Lamp
 from nir_render.scene.documents.ambient.sun import Sky, Skylight, Sun
-from nir_render.scene.documents.base import Document, Fraction, Name, Orientation, Position, Positive, Time
-from nir_render.scene.documents.camera import Rig
+from nir_render.scene.documents.base import Document, Fraction, Name, Positive, Time
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import expand_preset, preset_names
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import MaterialDocument, is_black
+from nir_render.scene.documents.robots.robot import Robot, Scatter
 from nir_render.scene.documents.shapes import ShapeDocument, by_material
 from nir_render.scene.documents.times.clocks import Clock
-from nir_render.scene.documents.times.motion import Moving, Waypoint
+from nir_render.scene.documents.times.motion import Waypoint
 from nir_render.spectra.lambert import polygon_share
 
 __all__ = ["Clock", "Robot", "SceneDocument", "Waypoint"]
@@ -43,23 +43,6 @@ _LARGEST_SEED = 2**63 - 1
 _LEAST_PERCENT, _MOST_PERCENT = 0.1, 100.0
 _NOISE_EXAMPLE = "5 % of temporal variance"
 _NOISE_FORM = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*%\s+of\s+temporal\s+variance\s*")
-
-
-class Robot(Moving):
-    """A robot: its rig, and either a fixed pose or a motion: through waypoints, or along a path."""
-
-    rig: Rig
-    position_m: Position = (0.0, 0.0, 0.0)
-    orientation: Orientation = Orientation()
-
-    @model_validator(mode="after")
-    def _one_way_to_move(self) -> Self:
-        told = self.model_fields_set & {"position_m", "orientation"}
-        if self.motion and told:
-            raise ValueError("write either 'position' and 'orientation', or 'motion', not both")
-        if self.path is not None and told:
-            raise ValueError("write either 'position' and 'orientation', or 'path', not both")
-        return self
 
 
 def parse_noise(text: object) -> float:
@@ -193,7 +176,8 @@ class RenderSettings(Document):
 class SceneDocument(Document):
     """A scene: robots with sources and cameras, surroundings, and when frames are taken by whom.
 
-    `beacons` are what others let shine: spheres as robots' sources are, where the scene puts them.
+    `beacons` are what others let shine: spheres as robots' sources are, where the scene puts them. `scatter`
+    adds groups of robots at random free places.
     """
 
     format: Literal[1]
@@ -202,7 +186,8 @@ class SceneDocument(Document):
     clock: Clock = Clock()
     render: RenderSettings = RenderSettings()
     observe: Annotated[tuple[str, ...], Field(min_length=1)]
-    robots: Annotated[dict[Name, Robot], Field(min_length=1)]
+    robots: dict[Name, Robot] = {}
+    scatter: dict[Name, Scatter] | None = None
     materials: dict[Name, MaterialDocument] = {}
     shapes: dict[Name, ShapeDocument] = {}
     lamps: dict[Name, Lamp] = {}
@@ -242,6 +227,23 @@ class SceneDocument(Document):
         for name in sorted(named & known - set(materials)):
             materials[name] = expand_preset(name, "materials", folder)
         return {**data, "materials": materials} if materials else data
+
+    @model_validator(mode="after")
+    def _add_scattered_robots(self) -> Self:
+        """Add them at the origin: `scene.scatter.place` finds their places once all else is read."""
+        added: dict[str, Robot] = {}
+        for group, scatter in (self.scatter or {}).items():
+            for name in scatter.names(group):
+                if name in self.robots or name in added:
+                    raise ValueError(
+                        f"scatter.{group}: there is a robot {name!r} already; rename one of them"
+                    )
+                added[name] = Robot.model_construct(rig=scatter.rig)
+        if not self.robots and not added:
+            raise ValueError("robots: there is none; write such as robots: {r1: {rig: infra_swarm}}")
+        if added:
+            object.__setattr__(self, "robots", {**self.robots, **added})
+        return self
 
     @model_validator(mode="after")
     def _expand_materials_of_bodies(self, info: ValidationInfo) -> Self:

@@ -2,15 +2,19 @@
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
 
 from nir_render.evaluate.metrics import Evaluation, Score, angle_deg, evaluate
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Shot, simulate
+from nir_render.simulation.odometry import observers_astir, odometry_of
 from nir_render.stress.job.sequences import Row, Sequences
 from nir_render.transport.cache import LightCache
-from perception import Calibration, Detection, Estimator, detect
+from perception import Calibration, Detection, Estimator, OwnSetEstimator, detect, frame_sets
+from perception.rig.frame_sets import robot_of
+from perception.types import FrameKey
 
 _TRUTH_FIELDS = (
     *(
@@ -32,7 +36,7 @@ _DETECTION_FIELDS = (
 
 
 def execute(
-    scene: Scene, estimators: Mapping[str, Estimator], cache: LightCache | None = None
+    scene: Scene, estimators: Mapping[str, Estimator | OwnSetEstimator], cache: LightCache | None = None
 ) -> tuple[list[Row], str]:
     """Render and perceive a scene; return the rows of the table, and the SHA-256 of all frames' counts.
 
@@ -47,17 +51,56 @@ def execute(
     hashed = hashlib.sha256()
     calibrations: dict[str, Calibration] = {camera: calibration(scene, camera) for camera in scene.cameras()}
     sequences = Sequences(scene, list(estimators), calibrations)
-    for shot in simulate(scene, cache=cache):
-        camera = shot.frame.camera
-        hashed.update(f"{camera} {shot.frame.index}\0".encode() + shot.frame.data_dn.tobytes())
-        found = {
-            name: detect(shot.frame, calibrations[camera], estimator)
-            for name, estimator in estimators.items()
-        }
-        rows += _rows(scene, shot, calibrations[camera], found)
-        sequences.take(shot.frame, shot.truth, found)
+    finder = _Finder(scene, estimators, calibrations)
+    for _, shots in groupby(simulate(scene, cache=cache), key=lambda shot: shot.frame.index):
+        for shot, found in finder.found(shots):
+            camera = shot.frame.camera
+            hashed.update(f"{camera} {shot.frame.index}\0".encode() + shot.frame.data_dn.tobytes())
+            rows += _rows(scene, shot, calibrations[camera], found)
+            sequences.take(shot.frame, shot.truth, found)
     rows += sequences.rows()
     return rows, hashed.hexdigest()
+
+
+class _Finder:
+    """The estimators at work on the frames of one index; only those of sets make frames wait for others."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        estimators: Mapping[str, Estimator | OwnSetEstimator],
+        calibrations: Mapping[str, Calibration],
+    ) -> None:
+        self._estimators, self._calibrations = estimators, calibrations
+        self._of_sets = {name: one for name, one in estimators.items() if isinstance(one, OwnSetEstimator)}
+        moving = observers_astir(scene) if self._of_sets else []
+        self._odometry = {robot: odometry_of(scene, robot, scene.document.seed) for robot in moving}
+
+    def found(self, shots: Iterable[Shot]) -> Iterator[tuple[Shot, dict[str, Sequence[Detection]]]]:
+        """Yield each shot with what every estimator finds in it."""
+        if self._of_sets:
+            shots = list(shots)
+        in_sets = {name: self._in_sets(one, shots) for name, one in self._of_sets.items()}
+        for shot in shots:
+            key = (shot.frame.camera, shot.frame.index)
+            yield (
+                shot,
+                {
+                    name: in_sets[name].get(key, [])
+                    if isinstance(one, OwnSetEstimator)
+                    else detect(shot.frame, self._calibrations[key[0]], one)
+                    for name, one in self._estimators.items()
+                },
+            )
+
+    def _in_sets(self, estimator: OwnSetEstimator, shots: Iterable[Shot]) -> dict[FrameKey, list[Detection]]:
+        """Return what an estimator of sets finds, by frame."""
+        hits: dict[FrameKey, list[Detection]] = {}
+        for frames in frame_sets([shot.frame for shot in shots]):
+            odometry = self._odometry.get(robot_of(frames[0].camera))
+            for hit in estimator(frames, self._calibrations, odometry):
+                hits.setdefault((hit.camera, hit.index), []).append(hit)
+        return hits
 
 
 def _rows(

@@ -26,10 +26,11 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.scheduler import KilledWorker
 
 from nir_render.errors import InputError
-from nir_render.run.perceive import frame_estimators
+from nir_render.run.perceive import estimators_in_process
 from nir_render.scene.scene import Scene
 from nir_render.stress.job.execute import execute
 from nir_render.stress.jobs import Job, is_same, made_by_of
+from nir_render.stress.store import Store
 from nir_render.stress.table import read_part, write_part
 from nir_render.stress.workers.cluster import (
     SCHEDULER_SETTINGS,
@@ -45,8 +46,9 @@ from nir_render.stress.workers.recycle import JOBS, recycle
 from nir_render.transport.backend.cores import cores, thread_settings
 from nir_render.transport.backend.variant import set_threads
 from nir_render.transport.cache import LightCache
-from perception import Estimator
+from perception import Estimator, OwnSetEstimator
 
+PARTS = "jobs"
 PART_KIND = ".parquet"
 _STARTS = 4
 _MEMORY_LIMIT_BYTES = 256 * 2**20
@@ -62,7 +64,8 @@ class Work:
     `scene` is what the jobs' settings change; `threads` how many each worker computes with, None where
     workers of one host share its cores; `processor` that of the machine that asks; `jobs_per_process` how
     many a worker does before it begins anew. All paths are absolute, those of the scene and of estimators
-    too: workers have folders of their own.
+    too: workers have folders of their own. With a `store`, what a worker has written into its `parts` is put
+    there, and workers elsewhere need not share folders with this program.
     """
 
     scene: Scene
@@ -73,6 +76,7 @@ class Work:
     threads: int | None
     processor: str
     jobs_per_process: int = JOBS
+    store: Store | None = None
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,11 @@ class Done:
 def part_file(parts: Path, job: Job) -> Path:
     """Return where a job leaves its rows."""
     return parts / f"{job.key}{PART_KIND}"
+
+
+def part_object(job: Job) -> str:
+    """Return how a job's rows are called in object storage."""
+    return f"{PARTS}/{job.key}{PART_KIND}"
 
 
 def run_jobs(
@@ -118,7 +127,8 @@ def run_jobs(
             if scheduler is None:
                 client = stack.enter_context(_client(workers))
             else:
-                terms = stack.enter_context(terms_of((work.parts, work.light)))
+                shared = (work.parts, work.light) if work.store is None else ()
+                terms = stack.enter_context(terms_of(shared))
                 client = stack.enter_context(connected(scheduler.address, terms))
             plugin = _plugin_name(work)
             _tell_workers(client, _Context(work, terms), plugin)
@@ -190,7 +200,8 @@ def _started(workers: int) -> LocalCluster:
 
 
 def _plugin_name(work: Work) -> str:
-    return f"{_PLUGIN}-{hashlib.sha256(str(work.parts).encode()).hexdigest()[:12]}"
+    place = f"{work.parts} {work.store}"
+    return f"{_PLUGIN}-{hashlib.sha256(place.encode()).hexdigest()[:12]}"
 
 
 def _forget(client: Client, plugin: str) -> None:
@@ -247,7 +258,7 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
 
     def __init__(self, work: Work, terms: Terms | None) -> None:
         self.work, self.terms = work, terms
-        self._estimators: dict[str, Estimator] | None = None
+        self._estimators: dict[str, Estimator | OwnSetEstimator] | None = None
         self._made_by: tuple[str, ...] = ()
         self._cache: LightCache | None = None
         self._threads = 0
@@ -264,7 +275,7 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
         if self._estimators is None:  # here, not at the start: Mitsuba's variant belongs to this thread
             if self.terms is not None:
                 check_this_worker(self.terms)
-            self._estimators = frame_estimators(self.work.estimators)
+            self._estimators = estimators_in_process(self.work.estimators)
             self._cache = LightCache(
                 self.work.light,
                 limit_bytes=self.work.light_limit_bytes,
@@ -272,8 +283,10 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
             )
             self._made_by = made_by_of(self.work.estimators, self.work.processor)
         self._share_cores()
-        if read_part(part_file(self.work.parts, job)) is not None:
-            return  # by a worker that was killed before it could say so
+        file = part_file(self.work.parts, job)
+        if read_part(file) is not None:  # by a worker that was killed before it could say so
+            self._put(job, file)
+            return
         if not is_same(job, self.work.scene, self._made_by, self.work.processor):
             raise RefusedError(
                 f"the worker {get_worker().address} would do another job than was asked for: a file of the "
@@ -283,7 +296,12 @@ class _Context(WorkerPlugin):  # type: ignore[misc]
         self._jobs += 1
         scene = self.work.scene.with_(job.settings)
         rows, frames_sha256 = execute(scene, self._estimators, self._cache)
-        write_part(part_file(self.work.parts, job), rows, frames_sha256)
+        write_part(file, rows, frames_sha256)
+        self._put(job, file)
+
+    def _put(self, job: Job, file: Path) -> None:
+        if self.work.store is not None:
+            self.work.store.put(file, part_object(job))
 
     def begin_anew_in_time(self) -> None:
         """Have another process take the place of this one, where the job that ends is its last."""

@@ -7,7 +7,7 @@ that sees it. Errors that flares share (range constant, the camera's pose) are p
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,14 @@ class Posterior:
 
     modes: tuple[Mode, ...]
     log_evidence: float
+
+    def turned(self, turn_rad: float) -> "Posterior":
+        """Return that of a robot whose sources stand as another's do, but for such a turn of its axes."""
+        modes = tuple(
+            replace(mode, heading_rad=(mode.heading_rad + turn_rad + math.pi) % (2.0 * math.pi) - math.pi)
+            for mode in self.modes
+        )
+        return Posterior(modes, self.log_evidence)
 
 
 def posterior(

@@ -6,30 +6,22 @@ bright the source is and how its limb bends still tell how far it is.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import image_radius_px
-from perception.model.layout import Sources, View
-from perception.model.pixels import (
-    FIRST_DAMPING,
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    inverted,
-    is_inside,
-    objective,
-    slopes,
-    spread_nodes,
-)
-from perception.model.sensor import pixel_variance_e2
+from perception.model.layout import Sources
+from perception.model.pixels import spread_nodes
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, gain
-from perception.robust.overlap.eclipse import LEAST_RADIUS_PX, finer, is_as_bright, lit_pixels
+from perception.robust.overlap.climb import Climb
+from perception.robust.overlap.deblend import LEAST_GAIN, gain
+from perception.robust.overlap.eclipse import finer, is_as_bright, lit_pixels
 from perception.robust.overlap.hidden import RAMP_PX
+from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.problem import Problem
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
@@ -42,8 +34,6 @@ _DIRECTIONS = 16  # of the line, first guesses
 _TRIED, _GOOD = 7, 2
 _MOSTLY_SEEN = 0.8  # of the radius, up to the line: first guess where a whole disc explains most
 _BESIDE_PX = 1.0
-_MOST_STEPS = 30
-_SETTLED = 0.02
 _MOST_TURN_RAD, _MOST_SHIFT_PX = 0.3, 1.0
 _LOOSE = 1e-6  # precision of the line's prior
 _LEAST_HIDDEN, _LEAST_SEEN = 0.01, 0.15  # of the disc's area
@@ -52,6 +42,8 @@ _LEAST_HIDDEN, _LEAST_SEEN = 0.01, 0.15  # of the disc's area
 def cut_discs(
     found: Sequence[Cluster],
     plain: Sequence[Solution | None],
+    parted: Mapping[int, Solution],
+    may_be: Sequence[bool],
     camera: Camera,
 ) -> dict[int, Solution]:
     """Explain windows by one resolved sphere, a part of which a straight edge hides.
@@ -60,8 +52,10 @@ def cut_discs(
     ----------
     found
         The clusters.
-    plain
-        What explains each so far: a flare for each blob, None where nothing does.
+    plain, parted
+        What explains each so far: a flare for each blob, None where nothing does; and, by index, more.
+    may_be
+        Which may be of another shape (`limb.may_be_other_shape`): the others are not tried.
     camera
         The camera.
 
@@ -71,15 +65,16 @@ def cut_discs(
     """
     cuts = {}
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
-        if cluster.is_in_crowd or not (one is None or asks_for_more(one)):
+        if cluster.is_in_crowd or not may_be[index]:
             continue
         fits = [_Cut(cluster, guess, camera) for guess in _guesses(cluster, camera)]
         fits.sort(key=lambda fit: fit.objective)
         if fits and one is not None and one.count == 1:
             fits.insert(0, _Cut(cluster, _where_light_lacks(one), camera))
+        to_beat = parted[index].cost if index in parted else math.inf
         good: list[Solution] = []
         for fit in fits[:_TRIED]:
-            cut = fit.solution() if len(good) < _GOOD else None
+            cut = fit.solution(to_beat) if len(good) < _GOOD else None
             if cut is not None and cut.left_over.is_good and (one is None or gain(one, cut) >= LEAST_GAIN):
                 good.append(cut)
         if good:
@@ -130,7 +125,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
     return guesses
 
 
-class _Cut:
+class _Cut(Climb):
     """The fit of a sphere behind an edge to a window, on its way from a first guess.
 
     Its unknowns are those of a lone flare and, after them, the direction away from what is lit at a right
@@ -140,93 +135,25 @@ class _Cut:
     def __init__(self, cluster: Cluster, guess: Guess, camera: Camera) -> None:
         u_px, v_px, log_range, turn, edge_px = guess
         problem = Problem(cluster.window, [(u_px, v_px, log_range)], cluster.background_e)
-        self._fit = fit = Fit(problem, camera)
-        self._camera, self._from = camera, np.array([u_px, v_px])
-        box, window = fit.window.box, fit.window
-        self._known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
-        self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, self._known_e)
-        self._finer = np.array([finer(camera)])
+        fit, self._finer, self._from = Fit(problem, camera), np.array([finer(camera)]), np.array([u_px, v_px])
         size = fit.layout.size
-        self._values = np.array([*fit.values, turn, edge_px])
-        self._most_step = np.array([*fit.layout.most_step, _MOST_TURN_RAD, _MOST_SHIFT_PX])
-        self._prior = np.diag([*np.zeros(size), _LOOSE, _LOOSE])
-        self._prior[:size, :size] = fit.layout.prior(fit.structure, 0.0)
-        self._covariance = np.empty((size + 2, size + 2))
-        self._expected, self._jacobian = self._expectation(self._values)
-        self.objective = self._objective(self._values, self._expected)
+        prior = np.diag([*np.zeros(size), _LOOSE, _LOOSE])
+        prior[:size, :size] = fit.prior
+        most_step = np.array([*fit.layout.most_step, _MOST_TURN_RAD, _MOST_SHIFT_PX])
+        super().__init__(fit, camera, np.array([*fit.values, turn, edge_px]), most_step, prior)
 
-    def solution(self) -> Solution | None:
-        """Return what is likeliest; None where no maximum is reached, or hardly any is hidden or seen."""
-        if not self._climb() or not _LEAST_SEEN < self._seen < 1.0 - _LEAST_HIDDEN:
+    def solution(self, to_beat: float) -> Solution | None:
+        """Return what is likeliest; None where no maximum is reached, or hardly any is hidden or seen.
+
+        Nor where its cost would be greater than `to_beat`.
+        """
+        if not self._reach(to_beat) or not _LEAST_SEEN < self._seen < 1.0 - _LEAST_HIDDEN:
             return None
         found = solutions_of([self._fit], self._camera)[0]
         # A priori the line has any direction, and cuts the disc anywhere.
         volume = 2.0 * math.pi * 2.0 * float(found.image_radius_px[0])
         price = 2.0 * math.log(volume) - 2.0 * math.log(2.0 * math.pi)
         return replace(found, log_information=found.log_information + price, is_doubtful=True)
-
-    def _climb(self) -> bool:
-        """Go on to the greatest likelihood, as `pixels.maximise` does; tell whether it is reached."""
-        clip_e, layout, size = self._fit.known.clip_e, self._fit.layout, len(self._values)
-        gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
-        damped = np.empty((size, size))
-        damping, is_new = FIRST_DAMPING, True
-        for _ in range(_MOST_STEPS):
-            if is_new:
-                variance = self._variance(self._expected)
-                slopes(
-                    self._view, self._values, self._expected, self._jacobian, variance, self._prior, clip_e,
-                    False, gradient, fisher,
-                )  # fmt: skip
-                if math.isnan(inverted(fisher, inverse)):
-                    return False
-                if gradient @ inverse @ gradient < _SETTLED:
-                    break
-                before = self._objective(self._values, self._expected, variance)
-            np.copyto(damped, fisher)
-            np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))
-            if math.isnan(inverted(damped, damped)):
-                return False
-            trial = self._values + np.clip(damped @ gradient, -self._most_step, self._most_step)
-            is_new = False
-            if is_inside(trial, self._view, layout.sources, layout.per_source):
-                expected, jacobian = self._expectation(trial)
-                after = self._objective(trial, expected, variance)
-                is_new = after <= before * (1.0 + 1e-9) + 1e-9
-            if is_new:
-                self._values, self._expected, self._jacobian = trial, expected, jacobian
-                damping = max(0.1 * damping, LEAST_DAMPING)
-            else:
-                damping *= 10.0
-                if not damping < MOST_DAMPING:
-                    return False
-        else:
-            return False
-        return self._finish(gradient, fisher, inverse)
-
-    def _finish(self, gradient: Array, fisher: Array, inverse: Array) -> bool:
-        """Write the fit's values and covariance, the line's place and direction left free."""
-        fit, size = self._fit, self._fit.layout.size
-        expected, self._jacobian = self._expectation(self._values)
-        slopes(
-            self._view, self._values, expected, self._jacobian, self._variance(expected), self._prior,
-            fit.known.clip_e, True, gradient, fisher,
-        )  # fmt: skip
-        fit.log_information = inverted(fisher, inverse)
-        fit.values[:], fit.covariance[:] = self._values[:size], inverse[:size, :size]
-        fit.expected_e = expected.reshape(fit.window.image_e.shape)
-        fit.deviance = self._objective(self._values, expected)
-        return math.isfinite(fit.log_information)
-
-    def _variance(self, expected: Array) -> Array:
-        window = self._fit.window
-        return np.asarray(pixel_variance_e2(expected, window.floor_e2, window.prnu))
-
-    def _objective(self, values: Array, expected: Array, variance: Array | None = None) -> float:
-        """Return −2 ln L but for a constant of the window; with given variances without their logarithms."""
-        own = self._variance(expected) if variance is None else variance
-        total, logs = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
-        return float(total + logs) if variance is None else float(total)
 
     def _expectation(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
@@ -249,7 +176,7 @@ class _Cut:
         beside = slice(layout.background + 1, layout.size)
         jacobian[layout.background] = 1.0
         jacobian[beside] = fit.structure.columns
-        expected = background_e + self._known_e.ravel() + values[beside] @ fit.structure.columns
+        expected = background_e + self._view.known_e.ravel() + values[beside] @ fit.structure.columns
         expected = expected + flux * image[0]
         grown = image[3] + changes[2]
         jacobian[:2] = flux * (image[1:3] + changes[:2])

@@ -146,9 +146,9 @@ def _more(current: Solution) -> list[list[Start]]:
         log_range = flares[0][2] + 0.5 * math.log(float(current.flux_e[0]) / brought)
         guesses.append([*flares, (*place, log_range)])
     worst = int(np.argmax([_misfit(current, u, v) for u, v, _ in flares]))
-    halves = _halves(current, worst)
-    if halves is not None:
-        guesses.append([*flares[:worst], *halves, *flares[worst + 1 :]])
+    two = halves(current, worst)
+    if two is not None:
+        guesses.append([*flares[:worst], *two, *flares[worst + 1 :]])
     peaks = _sharp_peaks(current)
     if current.count == 1 and 2 <= len(peaks) <= MOST_FLARES:
         guesses.append(peaks)
@@ -183,8 +183,11 @@ def _misfit(current: Solution, u_px: float, v_px: float) -> float:
     return float(np.sum(current.residual_e[near] ** 2 / current.variance_e2(MODEL_ERROR)[near]))
 
 
-def _halves(current: Solution, index: int) -> tuple[Start, Start] | None:
-    """Return two flares in place of one, along the axis in which the image is longer than the model's."""
+def halves(current: Solution, index: int, apart_widths: float = 1.4) -> tuple[Start, Start] | None:
+    """Return two flares in place of one, along the axis in which the image is longer than the model's.
+
+    None where it is so along no axis. They are so many widths of the image apart.
+    """
     u, v, log_range = current.starts[index]
     box = current.window.box
     rows, columns = np.ogrid[: box.height, : box.width]
@@ -197,7 +200,7 @@ def _halves(current: Solution, index: int) -> tuple[Start, Start] | None:
     values, axes = np.linalg.eigh(longer)
     if not values[1] > 0.0:
         return None
-    half_px = 0.7 * width_px
+    half_px = 0.5 * apart_widths * width_px
     du, dv = (half_px * axes[:, 1]).tolist()
     farther = log_range + 0.5 * math.log(2.0)
     return (u + du, v + dv, farther), (u - du, v - dv, farther)

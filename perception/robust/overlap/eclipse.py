@@ -14,35 +14,34 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera, pixel_turn
 from perception.model.flare import image_radius_px
-from perception.model.layout import View
-from perception.model.pixels import (
-    FIRST_DAMPING,
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    inverted,
-    is_inside,
-    objective,
-    slopes,
-)
-from perception.model.sensor import pixel_variance_e2
+from perception.model.layout import UNUSABLE
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
+from perception.robust.goodness import MODEL_ERROR, drawn_out
+from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
 from perception.robust.overlap.hidden import expectation_of_two
 from perception.robust.overlap.oval import gain_over_oval
+from perception.robust.overlap.pairs import (
+    OTHER_SIGMAS,
+    are_apart,
+    is_near,
+    is_of_a_layout,
+    knows_layouts,
+    least_radius_px,
+    nearest_two,
+    pair_of,
+)
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
 Array = NDArray[np.float64]
 
-LEAST_RADIUS_PX = 1.5
-"""Smaller images tell hardly anything of which of two hides the other."""
-
-_SMALLEST_PX = 0.5  # of the one behind
+_LEAST_OF_A_LAYOUT = -6.0  # of 2 Δ ln L: an oval is believed where it is twenty times as likely as they are
+_DRAWN_OUT_CHI2 = 14.0  # of two degrees of freedom: by chance once in a thousand
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
-_MOST_STEPS = 25  # what is no eclipse goes on without an end
 _DIMMEST, _BRIGHTEST = (
     0.5,
     1.5,
@@ -51,18 +50,18 @@ _DIMMEST, _BRIGHTEST = (
 _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
 
-_OTHER_SIGMAS = 3.0
-# In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
-_SETTLED = 0.02
-
 
 def eclipses(
     found: Sequence[Cluster],
     plain: Sequence[Solution | None],
     parted: Mapping[int, Solution],
+    may_be: Sequence[bool],
     camera: Camera,
 ) -> dict[int, Solution]:
     """Explain windows by two resolved spheres, one partly behind the other.
+
+    Where robots are known to carry several sources, smaller ones too, others may be beside them, and two that
+    stand as far apart as a robot's are believed where one that is not quite round would explain as much.
 
     Parameters
     ----------
@@ -70,6 +69,8 @@ def eclipses(
         The clusters.
     plain, parted
         What explains each so far: a flare for each blob, None where nothing does; and, by index, more.
+    may_be
+        Which may be of another shape (`limb.may_be_other_shape`): of the others only pairs are tried.
     camera
         The camera.
 
@@ -77,24 +78,37 @@ def eclipses(
     -------
     By index what explains a window well; nothing where nothing does.
     """
-    pairs = {}
+    pairs, least_px, of_layouts = {}, least_radius_px(camera), knows_layouts(camera)
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd:
             continue
         guesses: list[list[Start]] = []
-        if one is None or (one.count == 1 and asks_for_more(one)):
+        if of_layouts and one is not None and one.count > 1 and asks_for_more(one):
+            guesses = _guesses_beside(cluster, one, camera)
+        if one is None or (one.count == 1 and (may_be[index] or (of_layouts and _is_long(one)))):
             guesses = _guesses(cluster, camera)
-        of_two = [each.starts for each in (one, parted.get(index)) if each is not None and _is_near(each)]
+        of_two = [
+            each.starts
+            for each in (one, parted.get(index))
+            if each is not None and (of_layouts or each.count == 2) and is_near(each, least_px)
+        ]
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
         fits.sort(key=lambda fit: fit.objective)
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
         good: list[Solution] = []
         for fit in fits:
             pair = fit.solution() if len(good) < _TRIED else None
-            if pair is not None and _is_pair(pair) and _are_apart(pair, camera):
+            if pair is not None and _is_pair(pair, least_px) and are_apart(pair, camera):
                 good.append(pair)
         likeliest = min(good, key=lambda pair: pair.cost, default=None)
-        if likeliest is not None and gain_over_oval(likeliest, camera) >= LEAST_GAIN:
+        if likeliest is None:
+            continue
+        # Where robots are known to carry sources so far apart, globes that are not round are the odder guess.
+        of_one_robot = is_of_a_layout(likeliest, camera)
+        least_gain = _LEAST_OF_A_LAYOUT if of_one_robot else LEAST_GAIN
+        # An oval explains no more than one of several flares.
+        is_believed = of_one_robot if likeliest.count > 2 else gain_over_oval(likeliest, camera) >= least_gain
+        if is_believed:
             pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
     return pairs
 
@@ -104,45 +118,40 @@ def _may_be_other(pair: Solution, camera: Camera) -> bool:
 
     Tried with its outer edge held where it is seen, at the range of the nearer, and half way there.
     """
-    near, far = int(np.argmax(pair.image_radius_px)), int(np.argmin(pair.image_radius_px))
-    (near_u, near_v, near_log), (far_u, far_v, far_log) = pair.starts[near], pair.starts[far]
+    near, far = sorted(pair_of(pair), key=lambda k: -float(pair.image_radius_px[k]))
+    starts = pair.starts
+    (near_u, near_v, near_log), (far_u, far_v, far_log) = starts[near], starts[far]
     apart_px = max(math.hypot(far_u - near_u, far_v - near_v), 1e-9)
     for share in (0.5, 1.0):
         log_range = far_log + share * (near_log - far_log)
         inwards = float(pair.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
-        starts: list[Start] = [(near_u, near_v, near_log), (*place, log_range)]
-        other = _Eclipse(Problem(pair.window, starts, pair.background_e), camera).solution()
-        if other is None or other.cost > pair.cost + _RIVAL:
+        starts[far] = (*place, log_range)
+        climb = _Eclipse(Problem(pair.window, starts, pair.background_e), camera)
+        other = climb.solution()
+        # One that goes on without an end is not excluded where it has come as far as the pair.
+        above = climb.so_far - pair.deviance if other is None else other.cost - pair.cost
+        if above > _RIVAL:
             continue
-        farthest = abs(other.log_range.max() - pair.log_range.max())
-        if farthest > _OTHER_SIGMAS * float(pair.log_range_sigma[far]):
+        log_ranges = climb.log_ranges if other is None else other.log_range
+        farthest = abs(log_ranges[[near, far]].max() - pair.log_range[far])
+        if farthest > OTHER_SIGMAS * float(pair.log_range_sigma[far]):
             return True
     return False
 
 
-def _is_pair(several: Solution) -> bool:
+def _is_long(one: Solution) -> bool:
+    """Tell whether an image is longer than wide, however well one flare explains it but for that."""
+    window = one.window
+    chi2, _, _ = drawn_out(
+        window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu
+    )
+    return chi2 > _DRAWN_OUT_CHI2
+
+
+def _is_pair(several: Solution, least_px: float) -> bool:
     """Tell whether flares are two, well fitted, resolved, and one within two radii of the other."""
-    return several.left_over.is_good and _is_near(several)
-
-
-def _is_near(several: Solution) -> bool:
-    """Tell whether flares are two, resolved, and one within two radii of the other."""
-    if several.count != 2:
-        return False
-    apart_px = math.hypot(several.u_px[0] - several.u_px[1], several.v_px[0] - several.v_px[1])
-    near_px, far_px = float(several.image_radius_px.max()), float(several.image_radius_px.min())
-    return near_px > LEAST_RADIUS_PX and far_px > _SMALLEST_PX and apart_px < 2.0 * near_px + far_px
-
-
-def _are_apart(pair: Solution, camera: Camera) -> bool:
-    """Tell whether two spheres may stand where they are said to: middles two radii apart, or more."""
-    place = direction_camera(np.column_stack([pair.u_px, pair.v_px]), camera.calibration)
-    place *= np.exp(pair.log_range)[:, None]
-    between = place[0] - place[1]
-    apart_m = float(np.linalg.norm(between))
-    sigma_m = float(np.hypot(*(place @ between / max(apart_m, 1e-12) * pair.log_range_sigma)))
-    return bool(apart_m + _OTHER_SIGMAS * sigma_m >= 2.0 * camera.radius_m)
+    return several.left_over.is_good and is_near(several, least_px)
 
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
@@ -155,7 +164,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
     near_px = 0.5 * (float(np.ptp(across)) + 1.0)
-    if near_px < LEAST_RADIUS_PX:
+    if near_px < least_radius_px(camera):
         return []
     corner = np.array([window.box.left, window.box.top], dtype=np.float64)
     u_px, v_px = (corner + middle).tolist()
@@ -176,6 +185,23 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
                 starts.append((u, v, math.log(at_1_m_px / radius_px)))
             guesses.append(starts)
     return guesses
+
+
+def _guesses_beside(cluster: Cluster, several: Solution, camera: Camera) -> list[list[Start]]:
+    """Return first guesses of two discs in the place of that flare which explains what is around it worst."""
+    window, rest = cluster.window, list(several.starts)
+    rows, columns = np.indices(window.image_e.shape)
+    away_px = [
+        np.hypot(columns + window.box.left - u, rows + window.box.top - v)
+        for u, v in zip(several.u_px, several.v_px, strict=True)
+    ]
+    nearest = np.argmin(away_px, axis=0)
+    left2 = several.residual_e**2 / several.variance_e2(MODEL_ERROR)
+    worst = int(np.argmax([left2[nearest == k].sum() for k in range(several.count)]))
+    del rest[worst]
+    around = np.where(nearest == worst, window.state, UNUSABLE).astype(np.uint8)
+    alone = replace(cluster, window=replace(window, state=around))
+    return [[*two, *rest] for two in _guesses(alone, camera)]
 
 
 def lit_pixels(cluster: Cluster) -> tuple[float, Array] | None:
@@ -202,108 +228,43 @@ def is_as_bright(
     return _DIMMEST / spread * source_e < most_e and least_e < _BRIGHTEST * spread * source_e
 
 
-class _Eclipse:
+class _Eclipse(Climb):
     """The fit of two spheres to a window, on its way from first guesses."""
 
     def __init__(self, problem: Problem, camera: Camera) -> None:
-        self._fit = fit = Fit(problem, camera)
-        self._camera = camera
-        box, window = fit.window.box, fit.window
-        known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
-        self._view = View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
-        self._prior = fit.layout.prior(fit.structure, 0.0)
-        self._finer = finer(camera)
-        self._expected, self._jacobian = self._expectation(fit.values)
-        self.objective = self._objective(fit.values, self._expected)
+        fit, self._finer = Fit(problem, camera), finer(camera)
+        self._pair = nearest_two(np.array(problem.starts)[:, :2])
+        super().__init__(fit, camera, fit.values.copy(), fit.layout.most_step, fit.prior)
 
     def solution(self) -> Solution | None:
         """Return what is likeliest; None where no maximum is reached."""
-        if not self._climb():
+        if not self._reach():
             return None
         return solutions_of([self._fit], self._camera)[0]
-
-    def _climb(self) -> bool:
-        """Go on to the greatest likelihood, as `pixels.maximise` does; tell whether it is reached."""
-        fit, clip_e = self._fit, self._fit.known.clip_e
-        size = fit.layout.size
-        gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
-        damped = np.empty((size, size))
-        damping, is_new = FIRST_DAMPING, True
-        for _ in range(_MOST_STEPS):
-            if is_new:
-                variance = self._variance(self._expected)
-                slopes(
-                    self._view, fit.values, self._expected, self._jacobian, variance, self._prior, clip_e,
-                    False, gradient, fisher,
-                )  # fmt: skip
-                log_det = inverted(fisher, inverse)
-                if math.isnan(log_det):
-                    return False
-                if gradient @ inverse @ gradient < _SETTLED:
-                    break
-                before = self._objective(fit.values, self._expected, variance)
-            np.copyto(damped, fisher)
-            np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))
-            if math.isnan(inverted(damped, damped)):
-                return False
-            trial = fit.values + np.clip(damped @ gradient, -fit.layout.most_step, fit.layout.most_step)
-            is_new = False
-            if is_inside(trial, self._view, fit.layout.sources, fit.layout.per_source):
-                expected, jacobian = self._expectation(trial)
-                after = self._objective(trial, expected, variance)
-                is_new = after <= before * (1.0 + 1e-9) + 1e-9
-            if is_new:
-                fit.values[:], self._expected, self._jacobian = trial, expected, jacobian
-                damping = max(0.1 * damping, LEAST_DAMPING)
-            else:
-                damping *= 10.0
-                if not damping < MOST_DAMPING:
-                    return False
-        else:
-            return False
-        variance = self._variance(self._expected)
-        slopes(
-            self._view, fit.values, self._expected, self._jacobian, variance, self._prior, clip_e,
-            True, gradient, fisher,
-        )  # fmt: skip
-        fit.log_information = inverted(fisher, fit.covariance)
-        fit.expected_e = self._expected.reshape(fit.window.image_e.shape)
-        fit.deviance = self._objective(fit.values, self._expected)
-        return math.isfinite(fit.log_information)
-
-    def _variance(self, expected: Array) -> Array:
-        window = self._fit.window
-        return np.asarray(pixel_variance_e2(expected, window.floor_e2, window.prnu))
-
-    def _objective(self, values: Array, expected: Array, variance: Array | None = None) -> float:
-        """Return −2 ln L but for a constant of the window; with given variances without their logarithms."""
-        own = self._variance(expected) if variance is None else variance
-        total, logs = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
-        return float(total + logs) if variance is None else float(total)
 
     def _expectation(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
         fit, camera, layout = self._fit, self._camera, self._fit.layout
         own = layout.of_sources(values)
         by_size = log_range_by_size(own, fit)
-        near = int(np.argmin(by_size))
+        near, far = sorted(self._pair, key=lambda k: float(by_size[k]))
         hidden_px = hidden_px_at_1_m(own, camera)
         hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
-        fineness = np.where(np.arange(2) == near, 1.0, self._finer)
+        fineness = np.where(np.arange(layout.sources) == far, self._finer, 1.0)
         laid, imaged = lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=fineness)
         fit.log_flux_at_1_m, fit.image_radius_px = laid.log_flux_at_1_m, laid.reach_px
         flux = np.exp(laid.log_flux_at_1_m - 2.0 * own[:, 2])
         flux[~imaged] = math.nan  # nowhere to go on to
-        middle_px, first, end = own[near : near + 1, :2], *laid.first_node[1 - near : 3 - near]
+        middle_px, first, end = own[near : near + 1, :2], *laid.first_node[far : far + 2]
         offset = np.column_stack([laid.node_u_px[first:end], laid.node_v_px[first:end]])
-        away = direction_camera(own[1 - near, :2] + offset, camera.calibration)
+        away = direction_camera(own[far, :2] + offset, camera.calibration)
         away -= direction_camera(middle_px, camera.calibration)
         turn = pixel_turn(middle_px, camera.calibration)[0]
         radius_rad = math.asin(min(camera.radius_m * math.exp(-float(by_size[near])), 1.0))
         expected = np.empty(self._view.image_e.size)
         jacobian = np.zeros((layout.size, len(expected)))
         expectation_of_two(
-            values, near, flux, away, turn, radius_rad, self._view, laid, fit.structure, fit.known,
+            values, near, far, flux, away, turn, radius_rad, self._view, laid, fit.structure, fit.known,
             expected, jacobian,
         )  # fmt: skip
         return expected, jacobian

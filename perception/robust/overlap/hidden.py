@@ -1,4 +1,4 @@
-"""What pixels expect of two spheres, one of which hides a part of the other: compiled.
+"""What pixels expect of spheres, one of which hides a part of another: compiled.
 
 Each quadrature node of the farther counts by how much of it stands out from behind the nearer.
 """
@@ -21,17 +21,17 @@ RAMP_PX = 0.4
 
 @compiled
 def expectation_of_two(
-    values: Array, near: int, flux: Array, away: Array, turn: Array, radius_rad: float, view: View,
+    values: Array, near: int, far: int, flux: Array, away: Array, turn: Array, radius_rad: float, view: View,
     sources: Sources, structure: Structure, known: Known, expected: Array, jacobian: Array,
 ) -> None:  # fmt: skip
-    """Compute λ and its derivatives, as `pixels.expectation`, of two spheres, one before the other.
+    """Compute λ and its derivatives, as `pixels.expectation`, of spheres, one of them before another.
 
     Parameters
     ----------
     values, view, sources, structure, known
         As there; nothing moves.
-    near, flux
-        Which of both is the nearer; the flux of each, were it whole, shape (2,).
+    near, far, flux
+        Which one hides a part of which; the flux of each, were it whole, shape (sources,).
     away, turn, radius_rad
         Of the farther's nodes, the unit directions less that of the nearer, shape (nodes, 3); how directions
         turn with pixels about the nearer (`bearing.pixel_turn`); and the nearer's radius.
@@ -40,7 +40,8 @@ def expectation_of_two(
     """
     has_slack, has_width = known.tie_spread > 0.0, known.width_spread > 0.0
     step = 3 + has_slack
-    width, background = 2 * step, 2 * step + has_width
+    width = len(flux) * step
+    background = width + has_width
     expected[:], jacobian[background] = values[background] + view.known_e.ravel(), 1.0
     for wave in range(len(structure.columns)):
         expected += values[background + 1 + wave] * structure.columns[wave]
@@ -48,11 +49,11 @@ def expectation_of_two(
     sigma_px = known.psf_sigma_px
     if has_width:
         sigma_px *= math.exp(known.width_spread * values[width])
-    seen, hidden = _behind(values, near, step, away, turn, radius_rad, view, sources, sigma_px)
+    seen, hidden = _behind(values, far, step, away, turn, radius_rad, view, sources, sigma_px)
     image = np.empty((5, *view.image_e.shape))
     flat, changes = image.reshape(5, -1), hidden.reshape(4, -1)
-    for source in range(2):
-        at, of_near, is_far = source * step, near * step, source != near
+    for source in range(len(flux)):
+        at, of_near, is_far = source * step, near * step, source == far
         image[:] = 0.0
         place = (values[at] - view.left, values[at + 1] - view.top)
         spread_nodes(seen, source, place, 1.0, (0.0, 0.0), sigma_px, image)
@@ -79,7 +80,7 @@ def expectation_of_two(
 
 @compiled
 def _behind(
-    values: Array, near: int, step: int, away: Array, turn: Array, radius_rad: float, view: View,
+    values: Array, far: int, step: int, away: Array, turn: Array, radius_rad: float, view: View,
     sources: Sources, sigma_px: float,
 ) -> tuple[Sources, Array]:  # fmt: skip
     """Return of the farther source what stands out, and how that changes.
@@ -88,7 +89,6 @@ def _behind(
     row and ln size, and by the ln size of the nearer, for what is hidden alone; by the nearer's place it
     changes as by its own, the other way.
     """
-    far = 1 - near
     rows, columns = view.image_e.shape
     changes, weight = np.zeros((4, rows, columns)), sources.weight.copy()
     across, down, by = np.empty((3, columns)), np.empty((3, rows)), np.empty(4)

@@ -15,7 +15,14 @@ import pytest
 from nir_render.compare.compare import compare_runs
 from nir_render.compare.page import compare_html, differing_frames
 from nir_render.truth.sources import SourceTruth
-from perception import calibration_document, detection_record, encode_png16, frame_record
+from perception import (
+    calibration_document,
+    detection_record,
+    encode_png16,
+    frame_record,
+    measure_set,
+    measurement_record,
+)
 from perception.types import Detection
 from tests.system.command import nir_render
 from tests.unit.report.cases import Page, calibration, detection, frame, truth
@@ -112,6 +119,38 @@ def test_figures_are_over_what_both_were_asked(runs: tuple[Path, Path]) -> None:
         "only the first run has detections of old",
         "only the second run has detections of new",
     )
+
+
+def test_what_rigs_measure_is_compared_set_by_set(tmp_path: Path) -> None:
+    """Ranges 4 and 1 cm long of the same two sources, one called an image in one set of the second run."""
+    for name, error_m in (("before", 0.04), ("after", 0.01)):
+        found = _all({"r2": [error_m] * FRAMES, "r3": [error_m] * FRAMES})
+        folder = _write(tmp_path / name, {"mine": found})
+        lines = []
+        for index in range(FRAMES):
+            hits = [hit for hit in found if hit.index == index]
+            seen = measure_set([frame(index=index)], [hits], {"r1.front": calibration()}).measurements
+            called = name == "after" and index == 3
+            lines += [
+                measurement_record(dataclasses.replace(one, ghost="yes" if called and k == 0 else "no"))
+                for k, one in enumerate(seen)
+            ]
+        _lines(folder / "measurements.mine.jsonl", lines)
+    (pair,) = compare_runs(tmp_path / "before", tmp_path / "after").estimators
+    figures = {compared.figure.name: compared for compared in pair.sets}
+    assert set(figures) == {
+        "set_recall", "set_false_alarms_per_set", "set_position_rmse_m", "set_range_rmse_m"
+    }  # fmt: skip
+    assert (figures["set_recall"].first, figures["set_recall"].second) == (1.0, 15 / 16)
+    ranges = figures["set_range_rmse_m"]
+    assert (ranges.count, ranges.frames, ranges.verdict) == (15, FRAMES, "better")
+    assert [ranges.first, ranges.second] == pytest.approx([0.04, 0.01])
+    assert ranges.difference == pytest.approx(-0.03)
+    page = compare_html(compare_runs(tmp_path / "before", tmp_path / "after"))
+    assert "15 sources in 8 sets" in page
+    (same,) = compare_runs(tmp_path / "after", tmp_path / "after").estimators
+    assert same.identical
+    assert all(each.difference == 0.0 for each in same.sets)
 
 
 def test_a_run_against_itself_and_its_copy_is_exactly_zero(runs: tuple[Path, Path], tmp_path: Path) -> None:

@@ -75,6 +75,30 @@ def test_measurements_scatter_by_their_bound() -> None:
     assert np.mean([hit.range_sigma_m for hit in found]) == pytest.approx(bound.range_sigma_m, rel=0.03)
 
 
+def test_who_is_hidden_in_part_seems_fainter_and_farther() -> None:
+    """Of .64 of the light: 1.25 times as far, to the bound; whole hidden ones are not found, others as before."""
+    scene = _bare()
+    places_m = {
+        "leader": np.array([2.06, 0.0]),
+        "follower2": np.array([2.06, 0.3]),
+        "follower3": np.array([2.06, -0.3]),
+        "follower1": np.zeros(2),
+    }
+    snapshot = World(scene, places_m, Base(), seed=1).snapshot()
+    visible = {"follower1.front": {"leader.top": 0.64, "follower2.top": 0.0}}
+    part, whole = (MeasurementSight(scene, "follower1", seed=4, visible=some) for some in (visible, {}))
+    seen, free = (
+        sorted(sight._images_and_detections(_frame(sight), snapshot)[1], key=lambda hit: hit.u_px)
+        for sight in (part, whole)
+    )
+    assert (len(seen), len(free)) == (2, 3)
+    (ahead,) = (hit for hit in seen if abs(hit.u_px - free[1].u_px) < 1.0)
+    assert ahead.range_m == pytest.approx(1.25 * free[1].range_m, rel=1e-6)
+    assert ahead.flux_dn == pytest.approx(0.64 * free[1].flux_dn, rel=0.02)
+    (aside,) = (hit for hit in seen if hit is not ahead)
+    assert (aside.u_px, aside.range_m) in [(hit.u_px, hit.range_m) for hit in (free[0], free[2])]
+
+
 def _frame(sight: MeasurementSight) -> Any:
     return sight._exposed("follower1.front", 0, 0.0)
 

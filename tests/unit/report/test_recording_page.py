@@ -1,6 +1,7 @@
 """The page of a recording without truth, and what it warns of."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from perception import (
     encode_png16,
     frame_record,
 )
+from perception.causes import CAUSES, DetectionCauses
 from perception.types import Calibration
 from tests.system.command import nir_render
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
@@ -45,7 +47,9 @@ def _frames(camera: Calibration = CAMERA, background_e: float = 0.0) -> list[Raw
 FRAMES = _frames()
 
 
-def _page(frames: list[RawFrame], camera: Calibration) -> str:
+def _page(
+    frames: list[RawFrame], camera: Calibration, causes: Mapping[str, Sequence[DetectionCauses]] | None = None
+) -> str:
     found = {"robust": {(one.camera, one.index): detect(one, camera) for one in frames}}
     by_key = {(one.camera, one.index): one for one in frames}
     return recording_html(
@@ -55,7 +59,17 @@ def _page(frames: list[RawFrame], camera: Calibration) -> str:
         calibrations={camera.camera: camera},
         folder_name="<folder>",
         files=["frames.jsonl"],
+        causes=causes or {},
     )
+
+
+def test_what_sigmas_are_made_of_is_drawn_where_it_was_asked_for() -> None:
+    parts = dict.fromkeys(CAUSES, 0.0) | {"own_light_m": 0.03, "read_noise_m": 0.04}
+    of_one = [DetectionCauses("r1.front", 0, k, 2.0 + k, 0.05, parts, 0.0) for k in range(3)]
+    for causes in ({}, {"robust": of_one}):
+        page = _page(FRAMES[:1], CAMERA, causes)
+        assert ("What the σ of a range is made of" in page) == bool(causes)
+        assert page.count('<figure class="plot">') == 1 + bool(causes)
 
 
 def test_it_shows_frames_and_ranges_with_their_sigma() -> None:

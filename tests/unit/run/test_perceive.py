@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from nir_render.errors import InputError
-from nir_render.run.perceive import chosen_estimators, frame_estimators, perceive_run
+from nir_render.run.folder import read_period_s
+from nir_render.run.perceive import chosen_estimators, estimators_in_process, perceive_run
 from perception import (
     Odometry,
     calibration_document,
@@ -179,14 +180,45 @@ def test_two_commands_of_one_name_are_refused() -> None:
         chosen_estimators([f"a=cmd: {sys.executable} x", f"a=cmd: {sys.executable} y"])
 
 
-def test_what_cannot_read_a_frame_by_itself_is_no_estimator_of_a_campaign(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text("def sets(frames, calibrations, odometry): ...\n")
-    for reference, kind in (
-        (f"a=cmd: {sys.executable}", "is a command"),
-        (f"{tmp_path / 'own.py'}:sets", "sets of frames"),
-    ):
-        with pytest.raises(InputError, match=kind):
-            frame_estimators([reference])
+def test_a_command_is_no_estimator_of_a_campaign() -> None:
+    with pytest.raises(InputError, match="is a command"):
+        estimators_in_process([f"a=cmd: {sys.executable}"])
+
+
+def test_exposures_of_a_bracket_are_one_set_where_the_period_is_given(recording: Path) -> None:
+    """Three exposures 10 ms apart, every second: by the median interval nine sets, in fact three of two cameras."""
+    lines = []
+    for camera in (FRONT, LEFT):
+        for number in range(9):
+            exposure_s = (1.2e-4, 2.4e-4, 4.8e-4)[number % 3]
+            mean_e = expected_e(camera, [(60.3, 49.8, 2.0)], exposure_s, 1.0)
+            taken = dataclasses.replace(
+                expose(mean_e, camera, random(72, number), exposure_s),
+                index=number,
+                time_s=number // 3 + 0.01 * (number % 3),
+            )
+            name = f"{camera.camera}-{number}.png"
+            (recording / name).write_bytes(encode_png16(taken.data_dn))
+            lines.append(json.dumps(frame_record(taken, name)))
+    (recording / "frames.jsonl").write_text("\n".join(lines))
+    chosen = chosen_estimators(["robust"])
+
+    def sets() -> list[int]:
+        said = (recording / "measurements.robust.jsonl").read_text().splitlines()
+        return sorted(len(json.loads(line)["detections"]) for line in said)
+
+    perceive_run(recording, estimators=chosen, progress=lambda *_: None)
+    assert len(sets()) > 3
+    assert read_period_s(recording) is None
+    perceive_run(recording, estimators=chosen, progress=lambda *_: None, period_s=1.0)
+    assert sets() == [6, 6, 6]  # one source, in three exposures of two cameras that stand in one place
+    assert read_period_s(recording) == 1.0
+    (recording / "sets.json").write_text('{"format": 1, "period_s": -1}')
+    with pytest.raises(InputError, match="write a time above 0"):
+        read_period_s(recording)
+    for wrong in ("0", "nan"):
+        done = nir_render("perceive", str(recording), "--period", wrong, cwd=recording)
+        assert (done.returncode, "wanted seconds above 0, such as 0.1" in done.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("limit", ["0", "-1", "nan", "inf"])

@@ -8,7 +8,7 @@ import pytest
 import nir_render as nr
 from nir_render.evaluate.metrics import evaluate
 from nir_render.run.evaluate import evaluate_run
-from nir_render.run.perceive import chosen_estimators, perceive_run
+from nir_render.run.perceive import chosen_estimators, estimators_in_process, perceive_run
 from nir_render.run.render import render_run
 from nir_render.stress.job.execute import execute
 from perception import ESTIMATORS, detect
@@ -52,6 +52,28 @@ def test_rows_say_what_evaluate_says() -> None:
         ]
         assert sum(alarms) / 3 == summary["false_alarms_per_frame"]
         assert sum(row["kind"] == "false_alarm" and row["estimator"] == name for row in rows) == sum(alarms)
+
+
+def test_an_estimator_of_sets_gets_the_cameras_of_a_robot_together(tmp_path: Path) -> None:
+    """Two cameras, two times: what `robust` finds frame by frame; no odometry, as the observer rests."""
+    (tmp_path / "own.py").write_text(
+        "from perception import detect\n"
+        "def sets(frames, calibrations, odometry):\n"
+        "    assert [frame.camera for frame in frames] == ['r1.front', 'r1.left'] and odometry is None\n"
+        "    return [hit for frame in reversed(frames) for hit in detect(frame, calibrations[frame.camera])]\n"
+    )
+    aside = {"robots.r1.rig.cameras.left.orientation": {"yaw": "20 deg"}}
+    scene = nr.load_scene(SCENE, {"clock.frames": 2, "observe": ["r1.front", "r1.left"], **aside})
+    own = estimators_in_process(["robust", f"{tmp_path / 'own.py'}:sets"])
+    rows, frames_sha256 = execute(scene, own)
+    alone, same_sha256 = execute(scene, {"robust": ESTIMATORS["robust"]})
+    assert frames_sha256 == same_sha256
+    of = {
+        name: [{**row, "estimator": ""} for row in rows if row["estimator"] == name]
+        for name in ("robust", "sets")
+    }
+    assert of["sets"] == of["robust"] == [{**row, "estimator": ""} for row in alone]
+    assert sum(row["kind"] == "source" and row["found"] for row in of["sets"]) == 4
 
 
 def test_an_estimator_that_sees_ghosts_has_its_false_alarms_in_the_rows() -> None:

@@ -163,7 +163,7 @@ def test_a_scheduler_that_is_gone_is_told_in_words(
     monkeypatch.setattr(pool, "_client", lambda _: contextlib.nullcontext(SimpleNamespace(submit=submit)))
     monkeypatch.setattr(pool, "_tell_workers", lambda *_: None)
     monkeypatch.setattr(pool, "as_completed", iter)
-    work = cast("Work", SimpleNamespace(threads=1, parts=tmp_path))
+    work = cast("Work", SimpleNamespace(threads=1, parts=tmp_path, store=None))
     job = cast("Job", SimpleNamespace(key="a", light="b"))
     with pytest.raises(InputError, match="the same command goes on"):
         list(run_jobs(work, [job], 1, tmp_path / "scratch"))

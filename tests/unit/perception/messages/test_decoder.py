@@ -4,13 +4,15 @@ from typing import Any
 
 import pytest
 
-from perception.messages.decoder import decode
+from perception.messages.decoder import Decoder, decode
 from perception.messages.paper import decode_paper
 from perception.messages.settings import DecoderSettings
 from perception.messages.uart import COMMANDS, aliases
 from perception.types import Signal
 from tests.unit.perception.messages.wire import signal
 from tests.unit.perception.simulation import random
+
+SAMPLES = ("time_s", "exposure_s", "level", "sigma_dark", "sigma_lit")
 
 
 def _sent(case: int, k: int, noise: float, seconds: float = 9.5, **how: Any) -> tuple[int, float, Signal]:
@@ -61,3 +63,17 @@ def test_the_papers_decoder_reads_what_is_plain_and_fails_where_light_is_faint()
         faint += [message.word for message in decode_paper(heard)] == [word]
     assert plain >= 14
     assert faint <= 8
+
+
+def test_tracks_that_begin_at_once_do_their_work_in_turn() -> None:
+    """All twenty ended their blocks of half a second in the same sample; what is read is the same for each."""
+    (word, _, heard), said, most = _sent(2109, 0, 0.1), [], 0
+    decoders = [Decoder("", track) for track in range(1, 21)]
+    for at in range(len(heard.time_s)):
+        one = Signal("", 0, *(getattr(heard, name)[at : at + 1] for name in SAMPLES))
+        before = [decoder._done for decoder in decoders]
+        said += [message.word for decoder in decoders for message in decoder.push(one)]
+        most = max(most, sum(d._done > was for d, was in zip(decoders, before, strict=True)))
+    said += [message.word for decoder in decoders for message in decoder.finish()]
+    assert said == [word] * 20
+    assert most <= 4

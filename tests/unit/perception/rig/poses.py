@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,19 @@ from tests.unit.perception.rig.world import detection, frame_without_pixels, rig
 
 Array = NDArray[np.float64]
 
-PX, RELATIVE, COMMON = 0.02, 0.005, 0.001
-"""Of each detection: pixels, range by itself, range by K (whose σ is 0.2 % in this rig)."""
+COMMON = 0.001
+"""Of each detection's range, by K (whose σ is 0.2 % in this rig)."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Of each detection: pixels, and its range by itself."""
+
+    px: float = 0.02
+    relative: float = 0.005
+
+
+FINE = Noise()
 
 ALIKE = Layout("pair", ((0.06, 0.0, 0.28), (-0.06, 0.0, 0.28)), (1.0, 1.0))
 UNLIKE = replace(ALIKE, relative_flux=(1.0, 0.5))
@@ -31,7 +43,7 @@ def between(angle_rad: float, turn: float = 2.0 * math.pi) -> float:
     return (angle_rad + 0.5 * turn) % turn - 0.5 * turn
 
 
-def bound_rad(cameras: dict[str, Calibration], layout: Layout, pose: Array) -> float:
+def bound_rad(cameras: dict[str, Calibration], layout: Layout, pose: Array, noise: Noise = FINE) -> float:
     """Return the least σ of a heading: Fisher's information of x, y, z, heading and K's error, by differences."""
 
     def seen(unknown: Array) -> Array:
@@ -41,8 +53,8 @@ def bound_rad(cameras: dict[str, Calibration], layout: Layout, pose: Array) -> f
                 hit = seen_by(camera, unknown[:3] + turned(unknown[3]) @ np.array(place), -1.0)
                 was = seen_by(camera, pose[:3] + turned(pose[3]) @ np.array(place))
                 if hit is not None and was is not None:
-                    logarithm = (math.log(hit[2]) + COMMON * unknown[4]) / RELATIVE
-                    told += [hit[0] / PX, hit[1] / PX, logarithm]
+                    logarithm = (math.log(hit[2]) + COMMON * unknown[4]) / noise.relative
+                    told += [hit[0] / noise.px, hit[1] / noise.px, logarithm]
         return np.array(told)
 
     at, step = np.append(pose, 0.0), 1e-5
@@ -69,6 +81,7 @@ def labelled(
     robots: Sequence[tuple[Layout, Array]],
     rng: np.random.Generator,
     hidden: Sequence[tuple[int, int]] = (),
+    noise: Noise = FINE,
 ) -> list[list[tuple[Detection, tuple[int, int]]]]:
     """As `sighted`, each detection with the robot and source that it is of."""
     errors = rng.normal(size=len(robots))
@@ -80,7 +93,7 @@ def labelled(
             if (k, n) not in hidden
             for hit in (
                 detection(
-                    camera, pose[:3] + turned(pose[3]) @ np.array(place), rng, px=PX, relative=RELATIVE,
+                    camera, pose[:3] + turned(pose[3]) @ np.array(place), rng, px=noise.px, relative=noise.relative,
                     common=COMMON, common_error=errors[k], factor=layout.relative_flux[n] ** -0.5,
                 ),
             )
@@ -117,38 +130,72 @@ class Figures:
     lost: int
 
 
-def figures(layout: Layout, poses: int, turn: float = 2.0 * math.pi, seed: int = 5) -> Figures:
-    cameras = {name: replace(camera, layouts=(layout,)) for name, camera in rig().items()}
+class Look(Protocol):
+    """What is told of a robot at a pose: robots, which source each flare of the only one is, and the bound."""
+
+    def __call__(
+        self, cameras: dict[str, Calibration], layout: Layout, pose: Array, rng: np.random.Generator
+    ) -> tuple[tuple[RobotPose, ...], tuple[int, ...], float]: ...
+
+
+def drawn(
+    cameras: dict[str, Calibration],
+    layout: Layout,
+    pose: Array,
+    rng: np.random.Generator,
+    noise: Noise = FINE,
+) -> tuple[tuple[RobotPose, ...], tuple[int, ...], float]:
+    """Look by detections that are drawn from the errors that they claim; who lacks a flare is not told."""
+    seen = labelled(cameras, [(layout, pose)], rng, noise=noise)
+    robots = told(cameras, [[hit for hit, _ in each] for each in seen])
+    if len(robots) != 1 or len(robots[0].flares) != len(layout.places_body_m):
+        return (), (), math.nan
+    by_camera = dict(zip(cameras, seen, strict=True))
+    sources = tuple(by_camera[camera][number][1][1] for camera, _, number in robots[0].flares)
+    return robots, sources, bound_rad(cameras, layout, pose, noise)
+
+
+def pose_of(rng: np.random.Generator) -> Array:
+    """Return x, y, z, heading 1 to 5 m away, anywhere around, turned anyhow."""
+    range_m, bearing, heading = rng.uniform(1, 5), rng.uniform(-np.pi, np.pi), rng.uniform(-np.pi, np.pi)
+    return np.array([range_m * np.cos(bearing), range_m * np.sin(bearing), rng.uniform(-0.1, 0.1), heading])
+
+
+def figures(
+    layout: Layout,
+    poses: int,
+    turn: float = 2.0 * math.pi,
+    seed: int = 5,
+    look: Look = drawn,
+    **changes: Any,
+) -> Figures:
+    """Return the figures of so many poses; `changes` are of the cameras' calibrations."""
+    cameras = {name: replace(camera, layouts=(layout,)) for name, camera in rig(**changes).items()}
     rng = np.random.default_rng(seed)
     rows, lost = [], 0
     for _ in range(poses):
-        range_m, bearing, heading = rng.uniform(1, 5), rng.uniform(-np.pi, np.pi), rng.uniform(-np.pi, np.pi)
-        pose = np.array(
-            [range_m * np.cos(bearing), range_m * np.sin(bearing), rng.uniform(-0.1, 0.1), heading]
-        )
-        seen = labelled(cameras, [(layout, pose)], rng)
-        robots = told(cameras, [[hit for hit, _ in each] for each in seen])
-        if len(robots) != 1 or len(robots[0].flares) != len(layout.places_body_m):
+        pose = pose_of(rng)
+        robots, sources, bound = look(cameras, layout, pose, rng)
+        if len(robots) != 1:
             lost += 1
             continue
-        by_camera = dict(zip(cameras, seen, strict=True))
-        sources = tuple(by_camera[camera][number][1][1] for camera, _, number in robots[0].flares)
-        best = robots[0].hypotheses[0]
+        hypotheses, heading = robots[0].hypotheses, float(pose[3])
+        best = hypotheses[0]
         off = np.array(
             [*(np.array(best.position_body_m) - pose[:3]), between(best.heading_rad - heading, turn)]
         )
         pull2 = float(off @ np.linalg.solve(best.covariance, off))
-        right = [each for each in robots[0].hypotheses if is_at(each, heading)]
-        alike = [each for each in robots[0].hypotheses if is_at(each, best.heading_rad, turn)]
+        right = [each for each in hypotheses if is_at(each, heading)]
+        alike = [each for each in hypotheses if is_at(each, best.heading_rad, turn)]
         rows.append((
-            off[3], math.sqrt(best.covariance[3, 3]), bound_rad(cameras, layout, pose),
+            off[3], math.sqrt(best.covariance[3, 3]), bound,
             sum(each.odds for each in right), sum(each.odds for each in right if each.sources == sources),
             best.odds, sum(each.odds for each in alike), not is_at(best, heading, turn),
             best.sources != sources, pull2,
         ))  # fmt: skip
-    error, sigma, bound, right, named, odds, alike_odds, astray, swapped, pulls2 = np.array(rows).T
+    error, sigma, bounds, shares, named, odds, alike_odds, astray, swapped, pulls2 = np.array(rows).T
     return Figures(
-        error, sigma, bound, right, named, odds, alike_odds, astray.astype(bool), swapped.astype(bool),
+        error, sigma, bounds, shares, named, odds, alike_odds, astray.astype(bool), swapped.astype(bool),
         pulls2, lost,
     )  # fmt: skip
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from perception.rig.measure_set import measure_set
-from perception.types import Layout, Odometry
+from perception.rig.pose.sights import symmetries
+from perception.types import Layout, Odometry, RobotPose
 from tests.unit.perception.rig.poses import (
     ALIKE,
     THREE,
@@ -86,6 +87,62 @@ def test_a_flare_without_a_range_is_of_the_robot_whose_flares_are_beside_its_ray
     for robot in robots:
         own = min(poses, key=lambda pose: np.linalg.norm(pose[:3] - robot.hypotheses[0].position_body_m))
         assert any(is_at(each, own[3]) for each in robot.hypotheses)
+
+
+def test_what_looks_alike_is_reckoned_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two like LEDs, and an equilateral triangle: hypotheses are those of reckoning each naming by itself."""
+    corners = [0.3 + k * 2.0 * math.pi / 3.0 for k in range(3)]
+    places = tuple((0.07 * math.cos(corner), 0.07 * math.sin(corner), 0.28) for corner in corners)
+    triangle = Layout("triangle", places, (1.0, 1.0, 1.0))
+    assert len(symmetries(ALIKE)) == 1
+    assert len(symmetries(triangle)) == 2
+    assert symmetries(UNLIKE) == symmetries(THREE) == ()
+    rng = np.random.default_rng(16)
+    for layout in (ALIKE, triangle):
+        cameras = {name: replace(camera, layouts=(layout,)) for name, camera in rig().items()}
+        for _ in range(5):
+            pose = np.array([2.0, 0.3, 0.0, rng.uniform(-np.pi, np.pi)])
+            hits = sighted(cameras, [(layout, pose)], rng)
+            (once,) = told(cameras, hits)
+            with monkeypatch.context() as patch:
+                patch.setattr("perception.rig.robots.symmetries", lambda _: ())
+                (each,) = told(cameras, hits)
+
+            def said(robot: RobotPose) -> list[tuple[tuple[int, ...], float, float, float]]:
+                return sorted(
+                    (one.sources, round(one.heading_rad % (2.0 * math.pi), 6), one.odds, one.covariance[3, 3])
+                    for one in robot.hypotheses
+                    if one.odds > 1e-3
+                )
+
+            assert [one[0] for one in said(once)] == [one[0] for one in said(each)]
+            assert np.array([one[1:] for one in said(once)]) == pytest.approx(
+                np.array([one[1:] for one in said(each)]), rel=2e-2
+            )
+
+
+def test_a_merged_flare_is_not_taken_at_its_word() -> None:
+    """Two of three LEDs are one flare, 12 % too near: by its own σ the other two would head elsewhere."""
+    cameras = {name: replace(camera, layouts=(THREE,)) for name, camera in rig().items()}
+    rng = np.random.default_rng(17)
+    told_robots, said = 0, 0
+    for _ in range(40):
+        pose = np.array([4.0, 0.3, 0.0, rng.uniform(-np.pi, np.pi)])
+        hits = sighted(cameras, [(THREE, pose)], rng, hidden=[(0, 0)])
+        off = [
+            [
+                replace(hit, merged=True, u_px=hit.u_px + 0.6, range_m=0.88 * hit.range_m, bearing_body=(math.nan,) * 3)
+                if k == 1
+                else hit
+                for k, hit in enumerate(each)
+            ]
+            for each in hits
+        ]  # fmt: skip
+        robots = told(cameras, off)
+        told_robots += len(robots)
+        said += any(is_at(each, pose[3]) for robot in robots for each in robot.hypotheses)
+    assert told_robots >= 36
+    assert said == told_robots
 
 
 def test_one_led_alone_is_no_robot() -> None:

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -19,9 +20,14 @@ from nir_render.run.recording.document import (
 )
 from nir_render.scene.text.units import FRACTION, LENGTH, PIXELS
 
-TEMPLATE = (
-    (Path(make.__file__).parent / "template.yaml").read_text(encoding="utf-8").format(frames="*.png", seen="")
-)
+
+def _template() -> str:
+    with TemporaryDirectory() as folder:
+        make.new_recording(Path(folder))
+        return (Path(folder) / make.FILE).read_text(encoding="utf-8")
+
+
+TEMPLATE = _template()
 CAMERA = {
     "frames": "*.png", "exposure": "1 ms", "frame_rate": "30 Hz", "focal_length": "4 mm", "pixel_pitch": "5 um",
     "bit_depth": "8 bit",

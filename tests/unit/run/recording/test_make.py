@@ -255,8 +255,34 @@ def test_the_template_names_the_pictures_that_it_finds(tmp_path: Path, pictures:
     (tmp_path / "raw").mkdir()
     for path in pictures.iterdir():
         (tmp_path / "raw" / path.name).write_bytes(path.read_bytes())
-    assert new_recording(tmp_path) == "raw/*.png"
+    assert new_recording(tmp_path) == ["raw/*.png"]
     text = (tmp_path / "recording.yaml").read_text(encoding="utf-8")
     assert "8 of them; the first has 200 × 160 pixels of 8 bits" in text
     assert yaml.safe_load(text)["cameras"]["r1.front"]["frames"] == "raw/*.png"
-    assert new_recording(tmp_path / "new") == "frames/*.png"
+    assert new_recording(tmp_path / "new") == ["frames/*.png"]
+
+
+def test_times_of_a_file_are_the_frames(tmp_path: Path, pictures: Path) -> None:
+    times_s = [0.0, 0.0333, 0.07, 0.1, 0.2, 0.3, 0.4, 0.5]
+    folder = _folder(tmp_path, pictures, times="times.txt")
+    document = yaml.safe_load((folder / "recording.yaml").read_text())
+    times = folder / "times.txt"
+
+    def imported(written: str, *keys: str) -> None:
+        times.write_text(written)
+        cameras = document["cameras"]["r1.front"]
+        kept = {key: value for key, value in cameras.items() if key not in keys}
+        (folder / "recording.yaml").write_text(yaml.safe_dump({**document, "cameras": {"r1.front": kept}}))
+        import_recording(folder, overwrite=True)
+
+    imported("\n".join(map(str, times_s)), "frame_rate")
+    assert [frame.time_s for frame in read_recording(folder).frames()] == times_s
+    for written, keys, said in (
+        ("0\n1", ("frame_rate",), "times.txt has 2 times, and there are 8 pictures"),
+        ("0 1 2 3 4 5 5 6", ("frame_rate",), "must increase"),
+        ("0 1 2 3 4 5 x 6", ("frame_rate",), "wanted a time in seconds on each line"),
+        ("0 1 2 3 4 5 6 7", (), "frame_rate and times: each says when"),
+        ("0 1 2 3 4 5 6 7", ("frame_rate", "times"), "frame_rate: this key is missing"),
+    ):
+        with pytest.raises(InputError, match=said):
+            imported(written, *keys)

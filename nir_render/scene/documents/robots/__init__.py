@@ -1,0 +1,1 @@
+"""Models of robots: those that are written one by one, and groups that are scattered."""

@@ -1,0 +1,1 @@
+"""Robots at random places: what is free, and where each is put."""

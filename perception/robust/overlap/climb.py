@@ -1,0 +1,138 @@
+"""The way from a first guess to the greatest likelihood, where a part of a sphere is hidden.
+
+As `model.pixels.maximise`, but images are laid out anew at each step: what is hidden changes with them. Nodes
+that come and go at an edge leave the likelihood no smoother than they are, so a climb may go to and fro
+about its end; one that has come so far, and explains too little, is given up.
+"""
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.pixels import (
+    FIRST_DAMPING,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    inverted,
+    is_inside,
+    objective,
+    slopes,
+)
+from perception.model.sensor import pixel_variance_e2
+from perception.model.window import Camera
+from perception.robust.solve import Fit, solutions_of
+
+Array = NDArray[np.float64]
+
+_MOST_STEPS = 30  # what is of another shape goes on without an end
+# In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
+_SETTLED = 0.02
+_JUDGED_AFTER = 4  # steps
+_MORE_TO_GAIN, _TIMES_TO_GAIN = 10.0, 3.0  # in −2 ln L, over what is to be had to first order
+
+
+class Climb(ABC):
+    """The fit of a window's sources, a part of which is hidden, on its way.
+
+    Its unknowns are the fit's, and maybe others after them.
+    """
+
+    def __init__(self, fit: Fit, camera: Camera, values: Array, most_step: Array, prior: Array) -> None:
+        self._fit, self._camera, self._view = fit, camera, fit.view
+        self._values, self._most_step, self._prior = values, most_step, prior
+        self._expected, self._jacobian = self._expectation(values)
+        self.objective = self._objective(values, self._expected)
+
+    @abstractmethod
+    def _expectation(self, values: Array) -> tuple[Array, Array]:
+        """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
+
+    @property
+    def so_far(self) -> float:
+        """−2 ln L where it stands."""
+        return self._objective(self._values, self._expected)
+
+    @property
+    def log_ranges(self) -> Array:
+        """Logarithms of the sources' ranges where it stands, as their fluxes say."""
+        return self._fit.layout.of_sources(self._values[: self._fit.layout.size])[:, 2]
+
+    def _reach(self, to_beat: float = math.inf) -> bool:
+        """Go on to the greatest likelihood, and write it into the fit; tell whether it is reached.
+
+        It is not where what is ahead is no good explanation, or has a greater cost than `to_beat`.
+        """
+        layout, size = self._fit.layout, len(self._values)
+        gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
+        damped = np.empty((size, size))
+        damping, is_new = FIRST_DAMPING, True
+        for done in range(_MOST_STEPS):
+            if is_new:
+                variance = self._variance(self._expected)
+                self._slopes(variance, gradient, fisher, of_average=False)
+                self._fit.log_information = inverted(fisher, inverse)
+                if math.isnan(self._fit.log_information):
+                    return False
+                to_gain = float(gradient @ inverse @ gradient)
+                if to_gain < _SETTLED:
+                    break
+                if done >= _JUDGED_AFTER and not self._is_promising(inverse, to_gain, to_beat):
+                    return False
+                before = self._objective(self._values, self._expected, variance)
+            np.copyto(damped, fisher)
+            np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))
+            if math.isnan(inverted(damped, damped)):
+                return False
+            trial = self._values + np.clip(damped @ gradient, -self._most_step, self._most_step)
+            is_new = False
+            if is_inside(trial, self._view, layout.sources, layout.per_source):
+                expected, jacobian = self._expectation(trial)
+                after = self._objective(trial, expected, variance)
+                is_new = after <= before * (1.0 + 1e-9) + 1e-9
+            if is_new:
+                self._values, self._expected, self._jacobian = trial, expected, jacobian
+                damping = max(0.1 * damping, LEAST_DAMPING)
+            else:
+                damping *= 10.0
+                if not damping < MOST_DAMPING:
+                    return False
+        else:
+            return False
+        # A trial that was none may have been laid out last.
+        self._expected, self._jacobian = self._expectation(self._values)
+        self._slopes(self._variance(self._expected), gradient, fisher, of_average=True)
+        self._fit.log_information = inverted(fisher, inverse)
+        self._write(inverse)
+        self._fit.deviance = self._objective(self._values, self._expected)
+        return math.isfinite(self._fit.log_information)
+
+    def _is_promising(self, covariance: Array, to_gain: float, to_beat: float) -> bool:
+        """Tell whether what lies ahead, so much likelier to first order, may be good, at no greater cost."""
+        self._write(covariance)
+        self._fit.deviance = self.so_far
+        here, ahead = solutions_of([self._fit], self._camera)[0], _MORE_TO_GAIN + _TIMES_TO_GAIN * to_gain
+        return here.left_over.may_be_good(ahead) and here.cost - ahead <= to_beat
+
+    def _write(self, covariance: Array) -> None:
+        """Write what is reached into the fit, the unknowns that are not its own left free."""
+        fit, size = self._fit, self._fit.layout.size
+        fit.values[:], fit.covariance[:] = self._values[:size], covariance[:size, :size]
+        fit.expected_e = self._expected.reshape(fit.window.image_e.shape)
+
+    def _slopes(self, variance: Array, gradient: Array, fisher: Array, *, of_average: bool) -> None:
+        slopes(
+            self._view, self._values, self._expected, self._jacobian, variance, self._prior,
+            self._fit.known.clip_e, of_average, gradient, fisher,
+        )  # fmt: skip
+
+    def _variance(self, expected: Array) -> Array:
+        window = self._fit.window
+        return np.asarray(pixel_variance_e2(expected, window.floor_e2, window.prnu))
+
+    def _objective(self, values: Array, expected: Array, variance: Array | None = None) -> float:
+        """Return −2 ln L but for a constant of the window; with given variances without their logarithms."""
+        own = self._variance(expected) if variance is None else variance
+        total, logs = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
+        return float(total + logs) if variance is None else float(total)

@@ -1,0 +1,93 @@
+"""Lone flares that may be two too near to be told apart: their sigmas cover both.
+
+Two sources within a width of the point spread are one flare, hardly longer than wide, as bright as both:
+taken for one it is too near by up to a factor of √2, which no σ of a lone flare says. Where an image is
+longer than wide, or smaller than its flux says, two are tried; they need not explain it so much better that
+they are told as two.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from perception.model.window import Camera
+from perception.robust.goodness import drawn_out
+from perception.robust.overlap.deblend import gain, halves
+from perception.robust.overlap.rivals import weighed
+from perception.robust.problem import Problem, Start
+from perception.robust.solve import NEIGHBOURS_PER_PX2, Solution, solve
+
+LONGER_CHI2 = 9.0
+"""Of two degrees of freedom, from which two are tried: noise does it once in 90."""
+
+_AROUND_PX = 50.0
+_STEP_PX = 0.25
+_NEAR_WIDTHS = 0.6
+
+
+def doubted(
+    chosen: Sequence[Solution | None], at_rest: Sequence[Solution | None], camera: Camera
+) -> dict[int, Solution]:
+    """Return by index lone flares that may be two, their sigmas wider by what those differ.
+
+    How likely two are is a matter of how much better they explain the window, with a point spread that is not
+    quite known (`deblend.gain`), of what their unknowns cost (`Solution.cost`), and of how many flares there
+    are around: of a robot in a crowd a second one is likelier than of one far from all others.
+
+    Parameters
+    ----------
+    chosen, at_rest
+        What explains each window, and what a single flare at rest does; None where there is none.
+    """
+    tried: list[int] = []
+    problems = []
+    for index, (one, lone) in enumerate(zip(chosen, at_rest, strict=True)):
+        if one is None or lone is None or one.count != 1 or lone.count != 1 or one.is_eclipse:
+            continue
+        if not lone.left_over.is_good or _longer_chi2(lone) > LONGER_CHI2:
+            for starts in (halves(lone, 0), halves(lone, 0, _NEAR_WIDTHS) or _beside(lone)):
+                if starts is not None:
+                    tried.append(index)
+                    problems.append(Problem(one.window, starts, one.background_e))
+    if not tried:
+        return {}
+    pairs: dict[int, Solution] = {}
+    for index, two in zip(tried, solve(problems, camera), strict=True):
+        if two is not None and two.left_over.is_good and two.ranged.all():
+            pairs[index] = min(pairs.get(index, two), two, key=lambda pair: pair.cost)
+    places_px = np.array([(one.u_px[0], one.v_px[0]) for one in chosen if one is not None])
+    wider = {}
+    for index, two in pairs.items():
+        one = chosen[index]
+        assert one is not None
+        apart_px = np.hypot(*(places_px - [one.u_px[0], one.v_px[0]]).T)
+        density_per_px2 = (apart_px < _AROUND_PX).sum() / (math.pi * _AROUND_PX**2)
+        likelier = 2.0 * math.log(max(density_per_px2 / NEIGHBOURS_PER_PX2, 1.0))
+        two = replace(two, deviance=one.deviance - gain(one, two) - likelier)
+        both = weighed(one, two)
+        # The flux is that of all that is seen, one or two.
+        wider[index] = replace(
+            both,
+            flux_sigma_e=one.flux_sigma_e,
+            log_range_sigma=one.log_range_sigma,
+            log_range_of_two=math.sqrt(float(both.log_range_sigma[0] ** 2 - one.log_range_sigma[0] ** 2)),
+        )
+    return wider
+
+
+def _beside(lone: Solution) -> tuple[Start, Start]:
+    """Return two flares of half the light, close to each other."""
+    u_px, v_px, log_range = lone.starts[0]
+    farther = log_range + 0.5 * math.log(2.0)
+    return (u_px - _STEP_PX, v_px, farther), (u_px + _STEP_PX, v_px, farther)
+
+
+def _longer_chi2(lone: Solution) -> float:
+    """Return by how much an image is longer than wide, χ² of two degrees of freedom."""
+    window = lone.window
+    chi2, _, _ = drawn_out(
+        window.image_e, window.state, lone.expected_e, lone.flares_e, window.floor_e2, window.prnu
+    )
+    return chi2
