@@ -192,6 +192,8 @@ def _short(value: object) -> str:
 def _difference(one: object, other: object) -> float:
     if one == other:
         return 0.0
+    if isinstance(one, tuple | list) and isinstance(other, tuple | list) and len(one) == len(other):
+        return max(map(_difference, one, other))
     if not (isinstance(one, int | float) and isinstance(other, int | float)):
         return math.inf
     # Angles, places and times may be 0.

@@ -66,7 +66,9 @@ def doubted(
         density_per_px2 = (apart_px < _AROUND_PX).sum() / (math.pi * _AROUND_PX**2)
         likelier = 2.0 * math.log(max(density_per_px2 / NEIGHBOURS_PER_PX2, 1.0))
         two = replace(two, deviance=one.deviance - gain(one, two) - likelier)
-        both = weighed(one, two)
+        both = weighed(replace(one, is_doubtful=False), two)
+        if not both.is_doubtful:
+            continue
         # The flux is that of all that is seen, one or two.
         wider[index] = replace(
             both,

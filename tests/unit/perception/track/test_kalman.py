@@ -121,7 +121,9 @@ def measured(truth_m: Array, case: Case, rng: np.random.Generator) -> Observatio
     off = rng.normal(0.0, case.bearing_rad, (n, 2))
     bearing = axes[:, 2] + np.einsum("ni,nij->nj", off, axes[:, :2])
     bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
-    range_m = far / np.sqrt(1.0 + case.flux_noise_at_1_m * far**2 * rng.normal(size=n))
+    # No detection has a flux below 0, which noise makes of one in thousands.
+    flux = np.maximum(1.0 + case.flux_noise_at_1_m * far**2 * rng.normal(size=n), 0.05)
+    range_m = far / np.sqrt(flux)
     claimed = 0.5 * case.flux_noise_at_1_m * range_m**3
     return _observations(range_m[:, None] * bearing, np.full(n, case.bearing_rad**2), claimed**2)
 
