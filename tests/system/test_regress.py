@@ -225,19 +225,19 @@ def _caught(name: str, seed: int, scene: Scene | None = None, fault: Light1 = la
 
 @pytest.mark.verify
 @pytest.mark.vectorised
-def test_thirty_clean_renders_raise_no_alarm() -> None:
-    """At the stated 0.1 % thirty whole suites give 0.03 alarms: none or one. At 20 % they give 6: 12 at most (3 σ).
+def test_twelve_clean_renders_raise_no_alarm() -> None:
+    """At the stated 0.1 % twelve whole suites give 0.01 alarms: none or one. At 20 % they give 2.4: 6 at most (3 σ).
 
     `benchmarks/regression.py` does it 200 times.
     """
     alarms = dict.fromkeys((FALSE_ALARM_RATE, 0.2), 0)
-    for seed in range(1000, 1030):
+    for seed in range(1000, 1012):
         parts = [one for name in _suite()[0] for one in _tests(name, seed)]
         for rate in alarms:
             alarms[rate] += not all(verdict.same for verdict in judge(parts, rate))
-    print(f"false alarms in 30 suites: {alarms}")  # noqa: T201
+    print(f"false alarms in 12 suites: {alarms}")  # noqa: T201
     assert alarms[FALSE_ALARM_RATE] <= 1
-    assert alarms[0.2] <= 12
+    assert alarms[0.2] <= 6
 
 
 @pytest.mark.verify
