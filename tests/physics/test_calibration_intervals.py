@@ -2,8 +2,7 @@
 
 A camera of 400 × 300 pixels behind a lens that vignettes is calibrated from 16 dark frames, 16 flat ones and 8 at
 each of 16 ranges, rendered with noise and a fixed pattern of their own for each seed. What must come out: of 100
-seeds 88 to 100 have the truth within 1.96 σ, and no σ is above 1.25 times Cramér–Rao's (`calibration_frames`). Of ten
-seeds the sum of squared errors in units of σ tells as much of a σ that is too small as counting does of twenty.
+seeds 88 to 100 have the truth within 1.96 σ, and no σ is above 1.25 times Cramér–Rao's (`calibration_frames`).
 """
 
 import math
@@ -14,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 import nir_render as nr
 from nir_render.simulation.calibration import calibration
@@ -33,8 +31,7 @@ from tests.calibration_frames import (
 )
 from tests.paths import SCENES
 
-AT_LENGTH = "AT_LENGTH" in os.environ
-SEEDS = 100 if AT_LENGTH else 10  # a hundred take ten times as long: AT_LENGTH=1 make verify
+SEEDS = 100 if "AT_LENGTH" in os.environ else 20  # a hundred take ten minutes: AT_LENGTH=1 make verify
 ANGLES = (8, 24, 40, 56, 64)  # of the 65 in the table: the last is the frame's corner
 LEFT_E = 2.19  # what 16 frames leave of offsets: √(1/(1/4² + 16/10²) + rounding)
 
@@ -70,11 +67,10 @@ class _Told:
     bound: float
 
     def check(self, what: str) -> None:
-        pulls, seeds = self.errors / self.sigmas, len(self.errors)
-        assert np.sum(pulls**2) <= chi2.isf(1e-3, seeds), f"{what}: pulls {pulls}"
-        if AT_LENGTH:
-            held = np.mean(np.abs(pulls) <= 1.96)
-            assert held >= 0.88, f"{what}: {held:.0%} of the intervals hold the truth"
+        held = np.mean(np.abs(self.errors) <= 1.96 * self.sigmas)
+        # For 95 % of so many, 88 of 100 are 3.2 σ off.
+        least = 0.95 - 3.2 * math.sqrt(0.95 * 0.05 / len(self.errors))
+        assert held >= least, f"{what}: {held:.0%} of the intervals hold the truth"
         assert np.median(self.sigmas) <= 1.25 * self.bound, f"{what}: σ over its bound {self.bound:g}"
 
 
@@ -131,13 +127,23 @@ def _told(
     return told
 
 
-@pytest.mark.verify
-def test_of_many_cameras_the_intervals_hold_the_truth() -> None:
+def _check(seeds: int) -> None:
     exact = _exact()
-    runs = [CalibrationRun(0.0, seed) for seed in range(SEEDS)]
+    runs = [CalibrationRun(0.0, seed) for seed in range(seeds)]
     found = [calibrate_camera(run.frames(_guess(exact)), _guess(exact)) for run in runs]
     for what, told in _told(found, runs, exact).items():
         told.check(what)
+
+
+@pytest.mark.verify
+def test_of_three_cameras_all_that_is_learned_is_true() -> None:
+    _check(3)
+
+
+@pytest.mark.verify
+def test_of_many_cameras_the_intervals_hold_the_truth() -> None:
+    """As above, of more seeds."""
+    _check(SEEDS)
 
 
 @pytest.mark.verify
