@@ -14,7 +14,7 @@ from nir_render.evaluate.metrics import Evaluation, Score, angle_deg, evaluate
 from nir_render.evaluate.sets import SetEvaluation
 from nir_render.report.wording import counted
 from nir_render.run import folder as run_folder
-from nir_render.run.evaluate import check_frames_known, sets_of
+from nir_render.run.evaluate import check_frames_known, rows_of, sets_of
 from nir_render.run.folder import parse_lines
 from nir_render.run.perceive import frame_keys
 from nir_render.truth.lamps import LampTruth, parse_lamp
@@ -171,10 +171,7 @@ def _around(
     if not any(folder.glob("measurements.*.jsonl")):
         return None
     recording = read_recording(folder).of_sources
-    judged = {(record.camera, record.index) for record in recording.records}
-    rows = [row for row in truth if (row.camera, row.index) in judged]
-    outlines = [row for row in lamps if (row.camera, row.index) in judged]
-    return sets_of(recording, rows, detections, outlines)
+    return sets_of(recording, rows_of(recording, truth), detections, rows_of(recording, lamps))
 
 
 def pair_runs(first: ScoredRun, second: ScoredRun) -> Pairing:

@@ -5,10 +5,10 @@ It reads files alone: a folder that another program wrote is scored like one tha
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from nir_render.errors import InputError
 from nir_render.evaluate.headings import heading_numbers, stands_of
@@ -41,6 +41,8 @@ from perception import (
 from perception.rig.frame_sets import robot_of
 from perception.types import FrameKey
 
+Row = TypeVar("Row", SourceTruth, LampTruth)
+
 
 def evaluate_run(folder: Path) -> Evaluation:
     """Score every `detections.*.jsonl` of a run against its truth; writes `summary.json`, `preview.png`.
@@ -71,9 +73,7 @@ def evaluate_run(folder: Path) -> Evaluation:
         check_frames_known(keys, truth, lamps, detections, calibrations, folder)
         recording = recording.of_sources
         keys = [(record.camera, record.index) for record in recording.records]
-        judged = set(keys)
-        truth = [row for row in truth if (row.camera, row.index) in judged]
-        lamps = [row for row in lamps if (row.camera, row.index) in judged]
+        truth, lamps = rows_of(recording, truth), rows_of(recording, lamps)
         result = evaluate(keys, truth, calibrations, detections, lamps)
         result = _with_sets(result, sets_of(recording, truth, detections, lamps))
         result = _with_tracks(recording, result, truth, list(detections))
@@ -113,6 +113,12 @@ def check_frames_known(
                     f"{folder / file}: speaks of frame {item.index} of {item.camera}, "
                     "which frames.jsonl does not name"
                 )
+
+
+def rows_of(recording: Recording, rows: Iterable[Row]) -> list[Row]:
+    """Return the rows of truth that are of a recording's frames."""
+    frames = {(record.camera, record.index) for record in recording.records}
+    return [row for row in rows if (row.camera, row.index) in frames]
 
 
 def sets_of(

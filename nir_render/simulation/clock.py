@@ -36,7 +36,7 @@ from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.frame_times import frame_times, last_of_first
 from nir_render.simulation.lamps import lamp_truth
-from nir_render.simulation.refresh import Refreshed, RefreshError
+from nir_render.simulation.refresh import Refreshed, RefreshError, built_at
 from nir_render.simulation.truth import truth_of
 from nir_render.spectra.nodes import BAND_M
 from nir_render.transport.cache import LightCache
@@ -274,7 +274,7 @@ def simulate(
     cache = LightCache() if cache is None else cache
     period_s = 1.0 / scene.document.clock.frame_rate_hz
     kept: dict[str, Rates] = {}
-    built: dict[float, dict[Hashable, Any]] = {}  # of the world at the last time
+    built: dict[float, dict[Hashable, Any]] = {}
     begun = Begun() if begun is None else begun
     states = dict(begun.exposures)
     cameras = scene.cameras()
@@ -288,9 +288,7 @@ def simulate(
         from nir_render.transport import render as transport
 
         snapshot = scene.at(time_s)
-        if time_s not in built:
-            built.clear()
-        light = transport.render(snapshot, name, run_seed, cache, built.setdefault(time_s, {}))
+        light = transport.render(snapshot, name, run_seed, cache, built_at(built, time_s))
         kept[name] = _reused_rates(light, snapshot, kept.get(name))
         return light, kept[name]
 

@@ -95,7 +95,7 @@ class Refreshed:
         self._known: dict[str, dict[float, Rates]] = {}
         self._kept: dict[tuple[str, float, float], bool] = {}
         self._measured: list[RefreshError] = []
-        self._built: dict[float, dict[Hashable, Any]] = {}  # of the world at the last time
+        self._built: dict[float, dict[Hashable, Any]] = {}
 
     def measured(self) -> list[RefreshError]:
         """Return the errors that were measured since this was last asked."""
@@ -169,9 +169,7 @@ class Refreshed:
             from nir_render.transport.render import render  # Mitsuba loads only where light is rendered
 
             snapshot = self._scene.at(time_s)
-            if time_s not in self._built:
-                self._built.clear()
-            light = render(snapshot, name, self._seed, self._cache, self._built.setdefault(time_s, {}))
+            light = render(snapshot, name, self._seed, self._cache, built_at(self._built, time_s))
             same = [
                 rates
                 for rates in known.values()
@@ -179,6 +177,13 @@ class Refreshed:
             ]
             known[time_s] = same[-1] if same else electron_rates(light, snapshot)
         return known[time_s]
+
+
+def built_at(built: dict[float, dict[Hashable, Any]], time_s: float) -> dict[Hashable, Any]:
+    """Return what is built of the world at a time, for all cameras; what is of another time goes."""
+    if time_s not in built:
+        built.clear()
+    return built.setdefault(time_s, {})
 
 
 def interpolation_error(

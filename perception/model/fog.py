@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from perception.model.ranging import constant_spread
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
@@ -147,9 +148,7 @@ def ranged_in_fog(
     # ln d moves by 1/(1 + σ d/2) of what ln D does.
     slope = 1.0 / (1.0 + 0.5 * calibration.extinction_per_m * range_m)
     noise = 0.5 * flux_share_sigma * slope
-    constant = (
-        calibration.sigma.get("range_constant_dn_m2_per_s", 0.0) / calibration.range_constant_dn_m2_per_s
-    )
+    constant = constant_spread(calibration)
     by_extinction = 0.5 * range_m * extinction_sigma_per_m(calibration)
     common = slope * np.hypot(0.5 * constant, by_extinction)
     radius = calibration.sigma.get("source_radius_m", 0.0) / max(calibration.source_radius_m, 1e-12)

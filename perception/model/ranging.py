@@ -66,6 +66,12 @@ def flux_e_of(exposed_s: Array, gain: float, calibration: Calibration) -> Array:
     return np.asarray(at_one_metre_dn / (calibration.system_gain_dn_per_e * gain))
 
 
+def constant_spread(calibration: Calibration) -> float:
+    """Return the standard deviation of the range constant, relatively."""
+    sigma = calibration.sigma.get("range_constant_dn_m2_per_s", 0.0)
+    return sigma / calibration.range_constant_dn_m2_per_s
+
+
 def range_from_flux(
     flux_dn: float,
     flux_sigma_dn: float,
@@ -112,9 +118,7 @@ def range_from_flux(
     hidden_sigma = behind * calibration.sigma.get("hidden_background", 0.0)
     at_one_metre_dn *= max(1.0 - behind * calibration.hidden_background, LEAST_LEFT)
     relative = flux_sigma_dn / flux_dn
-    constant_relative = (
-        calibration.sigma.get("range_constant_dn_m2_per_s", 0.0) / calibration.range_constant_dn_m2_per_s
-    )
+    constant_relative = constant_spread(calibration)
     range_m = math.sqrt(at_one_metre_dn / flux_dn)
     if math.isfinite(relative):
         range_m /= 1.0 + 0.375 * relative**2

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.fog import extinction_sigma_per_m, ranged_in_fog
-from perception.model.ranging import flux_at_one_metre_dn
+from perception.model.ranging import constant_spread, flux_at_one_metre_dn
 from perception.rig.frame_sets import Exposed
 from perception.types import Calibration, Detection
 
@@ -76,8 +76,7 @@ def estimated_extinction(
             continue
         if prior is None or sigma < prior.sigma_per_m:
             prior = Extinction(calibration.extinction_per_m, sigma)
-        share = calibration.sigma.get("range_constant_dn_m2_per_s", 0.0)
-        constant = 0.5 * share / calibration.range_constant_dn_m2_per_s
+        constant = 0.5 * constant_spread(calibration)
         by_flux_m = clear_air_ranges_m(found, frame, calibration)
         for number, (hit, flux_m) in enumerate(zip(found, by_flux_m.tolist(), strict=True)):
             sized = math.isfinite(hit.range_by_size_sigma_m) and math.isfinite(flux_m)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.fog import may_be_in_fog, size_alone
+from perception.model.ranging import constant_spread
 from perception.rig.extinction import clear_air_ranges_m
 from perception.rig.frame_sets import Exposed
 from perception.rig.moving import OneTime
@@ -131,7 +132,7 @@ def sights_of(
     sigmas = [calibrations[name].sigma for name in names]
     turned_rad = np.array([sigma.get("rotation_body_camera", 0.0) for sigma in sigmas])[camera]
     moved_m = np.array([sigma.get("position_body_m", 0.0) for sigma in sigmas])[camera]
-    constant = np.array([_relative_sigma_of_k(calibrations[name]) for name in names])[camera]
+    constant = np.array([constant_spread(calibrations[name]) for name in names])[camera]
     sigma_m, common_m = np.array([(hit.range_sigma_m, hit.range_sigma_common_m) for hit in hits]).T
     ranged = np.isfinite(rays.range_m)
     claimed = ranged & np.isfinite(sigma_m)
@@ -202,7 +203,7 @@ def _by_size(
         if not found:
             continue
         calibration, nothing = calibrations[frame.camera], np.full(len(found), np.nan)
-        if may_be_in_fog(calibration) or not _relative_sigma_of_k(calibration) > 0.0:
+        if may_be_in_fog(calibration) or not constant_spread(calibration) > 0.0:
             parts.append(np.array([nothing] * 4))
             continue
         told = [
@@ -212,7 +213,7 @@ def _by_size(
         by_flux_m = clear_air_ranges_m(found, frame, calibration)
         usable = np.isfinite(by_flux_m + sigma_m) & (sigma_m > 0.0) & (range_m > 0.0) & (saturated == 0.0)
         # Who has fluxes of a scale of their own says nothing by them.
-        constant = _relative_sigma_of_k(calibration)
+        constant = constant_spread(calibration)
         ratio = np.where(usable, by_flux_m, 1.0) / np.where(usable, range_m, 1.0)
         usable &= abs(np.log(ratio)) < MOST_SIGMAS * 0.5 * constant + MOST_FACTOR
         share = np.where(usable, flux_sigma_dn, 1.0) / np.where(usable, flux_dn, 1.0)
@@ -222,8 +223,3 @@ def _by_size(
         parts.append(np.array([np.log(by_flux_m), 0.5 * share, np.log(size_m), size_sigma_m / size_m]))
     log_flux, flux_noise, log_size, size_noise = np.concatenate([np.empty((4, 0)), *parts], axis=1)
     return _BySize(log_flux, flux_noise, np.where(np.isfinite(constant_sigma), log_size, np.nan), size_noise)
-
-
-def _relative_sigma_of_k(calibration: Calibration) -> float:
-    sigma = calibration.sigma.get("range_constant_dn_m2_per_s", 0.0)
-    return sigma / calibration.range_constant_dn_m2_per_s

@@ -17,7 +17,7 @@ from perception.model.flare import image_radius_px
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
-from perception.robust.goodness import MODEL_ERROR, drawn_out
+from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
 from perception.robust.overlap.hidden import expectation_of_two
@@ -29,6 +29,7 @@ from perception.robust.overlap.pairs import (
     is_of_a_layout,
     knows_layouts,
     least_radius_px,
+    longer_chi2,
     nearest_two,
     pair_of,
 )
@@ -85,7 +86,8 @@ def eclipses(
         guesses: list[list[Start]] = []
         if of_layouts and one is not None and one.count > 1 and asks_for_more(one):
             guesses = _guesses_beside(cluster, one, camera)
-        if one is None or (one.count == 1 and (may_be[index] or (of_layouts and _is_long(one)))):
+        is_long = of_layouts and one is not None and one.count == 1 and longer_chi2(one) > _DRAWN_OUT_CHI2
+        if one is None or is_long or (one.count == 1 and may_be[index]):
             guesses = _guesses(cluster, camera)
         of_two = [
             each.starts
@@ -138,15 +140,6 @@ def _may_be_other(pair: Solution, camera: Camera) -> bool:
         if farthest > OTHER_SIGMAS * float(pair.log_range_sigma[far]):
             return True
     return False
-
-
-def _is_long(one: Solution) -> bool:
-    """Tell whether an image is longer than wide, however well one flare explains it but for that."""
-    window = one.window
-    chi2, _, _ = drawn_out(
-        window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu
-    )
-    return chi2 > _DRAWN_OUT_CHI2
 
 
 def _is_pair(several: Solution, least_px: float) -> bool:

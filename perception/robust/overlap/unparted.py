@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from perception.model.window import Camera
-from perception.robust.goodness import drawn_out
 from perception.robust.overlap.deblend import gain, halves
+from perception.robust.overlap.pairs import longer_chi2
 from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import NEIGHBOURS_PER_PX2, Solution, solve
@@ -46,7 +46,7 @@ def doubted(
     for index, (one, lone) in enumerate(zip(chosen, at_rest, strict=True)):
         if one is None or lone is None or one.count != 1 or lone.count != 1 or one.is_eclipse:
             continue
-        if not lone.left_over.is_good or _longer_chi2(lone) > LONGER_CHI2:
+        if not lone.left_over.is_good or longer_chi2(lone) > LONGER_CHI2:
             for starts in (halves(lone, 0), halves(lone, 0, _NEAR_WIDTHS) or _beside(lone)):
                 if starts is not None:
                     tried.append(index)
@@ -84,12 +84,3 @@ def _beside(lone: Solution) -> tuple[Start, Start]:
     u_px, v_px, log_range = lone.starts[0]
     farther = log_range + 0.5 * math.log(2.0)
     return (u_px - _STEP_PX, v_px, farther), (u_px + _STEP_PX, v_px, farther)
-
-
-def _longer_chi2(lone: Solution) -> float:
-    """Return by how much an image is longer than wide, χ² of two degrees of freedom."""
-    window = lone.window
-    chi2, _, _ = drawn_out(
-        window.image_e, window.state, lone.expected_e, lone.flares_e, window.floor_e2, window.prnu
-    )
-    return chi2

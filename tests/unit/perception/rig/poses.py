@@ -1,7 +1,7 @@
 """Robots with two and three LEDs in a simulator of its own: numpy alone, bounds by numerical derivatives."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -57,13 +57,18 @@ def bound_rad(cameras: dict[str, Calibration], layout: Layout, pose: Array, nois
                     told += [hit[0] / noise.px, hit[1] / noise.px, logarithm]
         return np.array(told)
 
+    return heading_sigma_rad(seen, pose)
+
+
+def heading_sigma_rad(seen: Callable[[Array], Array], pose: Array) -> float:
+    """Return the σ of a heading by what is seen, over its σ, of x, y, z, heading and K's error, of σ 1."""
     at, step = np.append(pose, 0.0), 1e-5
     slopes = np.column_stack(
         [(seen(at + step * axis) - seen(at - step * axis)) / (2.0 * step) for axis in np.eye(5)]
     )
     information = slopes.T @ slopes
     information[4, 4] += 1.0
-    return math.sqrt(np.linalg.inv(information)[3, 3])
+    return math.sqrt(np.linalg.pinv(information)[3, 3])
 
 
 def sighted(

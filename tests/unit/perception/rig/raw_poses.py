@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from perception.model.fisher import flare_limits
 from perception.rig.measure_set import detect_set
 from perception.types import Calibration, Layout, RawFrame, RobotPose
-from tests.unit.perception.rig.poses import COMMON, turned
+from tests.unit.perception.rig.poses import COMMON, heading_sigma_rad, turned
 from tests.unit.perception.rig.world import seen_by
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, expose
 
@@ -149,10 +149,4 @@ def bound_of_frames_rad(cameras: dict[str, Calibration], layout: Layout, pose: A
 
     if not sigmas or not np.isfinite(list(sigmas.values())).all():
         return math.inf
-    here, step = np.append(pose, 0.0), 1e-5
-    slopes = np.column_stack(
-        [(seen(here + step * axis) - seen(here - step * axis)) / (2.0 * step) for axis in np.eye(5)]
-    )
-    information = slopes.T @ slopes
-    information[4, 4] += 1.0
-    return math.sqrt(np.linalg.pinv(information)[3, 3])
+    return heading_sigma_rad(seen, pose)
