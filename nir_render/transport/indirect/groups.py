@@ -27,9 +27,7 @@ from nir_render.spectra.skies import CieSky, cie_sky
 from nir_render.transport.backend.variant import dr, mi, shape_number
 from nir_render.transport.indirect.guide import guide
 from nir_render.transport.indirect.kernel.begin import Film
-from nir_render.transport.indirect.kernel.draws import lane_draws
 from nir_render.transport.indirect.kernel.nodes import NodeTable, upload_nodes
-from nir_render.transport.indirect.kernel.paths import walk
 from nir_render.transport.indirect.kernel.tables import (
     DeviceScene,
     upload_fog,
@@ -37,6 +35,7 @@ from nir_render.transport.indirect.kernel.tables import (
     upload_lights,
     upload_surfaces,
 )
+from nir_render.transport.indirect.sample_means import BATCHES, sample_means
 from nir_render.transport.indirect.walked import Walked, is_coated, is_glossy, walked
 from nir_render.transport.world import mitsuba_scene
 from nir_render.transport.world.emitters import emitters
@@ -44,7 +43,6 @@ from nir_render.transport.world.facets import PANE, Facets, facets
 from nir_render.transport.world.medium import Medium, medium
 from nir_render.transport.world.pattern import pattern_of
 
-BATCHES = 8
 _DEFAULT_SAMPLES = 16
 PILOT_SAMPLES = 16
 _PILOT_STEP = 4
@@ -52,7 +50,6 @@ _PILOT_PIXELS = 1200
 _MOST_DEPTH = 64
 _FOG_DEPTH, _OPEN_FOG_DEPTH = (12, 3.0), (24, 5.0)  # and for each optical depth; open under sun or sky
 _VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
-_NOTHING = 1e-28  # 1/(m² sr)²
 _MAPPED_FROM_BYTES = 2**30  # larger arrays lie in a file that the system may page out
 
 
@@ -213,35 +210,6 @@ def light_seed(*key: object) -> int:
     """Return a seed of 64 bits for a key."""
     text = "|".join(repr(part) for part in key)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
-
-
-def sample_means(
-    built: DeviceScene, film: Film, seed: int, groups: int, samples: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return radiance per unit of each group in some pixels, and its variance, (groups × nodes, pixels).
-
-    The samples make up to 8 batches, independent of each other; the variance is that of their mean.
-    """
-    batches = min(BATCHES, samples)
-    pixels, lanes = film.pixel_count, film.pixel_count * batches
-    lane = dr.arange(mi.UInt32, lanes)
-    pixel = dr.gather(mi.UInt32, film.index, lane % film.pixels)
-    draw = lane_draws(pixel, lane // film.pixels, seed, dr.opaque(mi.UInt32, samples // batches))
-    sums = walk(built, film, pixel, draw, lanes, groups, dr.opaque(mi.UInt32, built.max_depth))
-    layers = groups * built.node_count
-    place = dr.arange(mi.UInt32, layers * pixels)
-    layer = place // film.pixels
-    first = layer * dr.opaque(mi.UInt32, lanes) + (place - layer * film.pixels)
-    means = [
-        dr.gather(mi.Float, sums, first + batch * film.pixels) / mi.Float(draw.samples)
-        for batch in range(batches)
-    ]
-    mean = sum(means[1:], means[0]) / batches
-    square = sum((dr.square(batch_mean - mean) for batch_mean in means), mi.Float(0))
-    # Squares of rounding errors are nothing either (see `paths`).
-    variance = dr.select(square > _NOTHING, square, 0.0) / max(batches * (batches - 1), 1)
-    dr.eval(mean, variance)
-    return np.array(mean).reshape(layers, pixels), np.array(variance).reshape(layers, pixels)
 
 
 def film_on_device(rays: Rays, scale: int, pixels: NDArray[np.int64]) -> Film:

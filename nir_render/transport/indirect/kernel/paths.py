@@ -46,6 +46,8 @@ _FAR = 1e15
 _DIM = 0.1
 # Less than this, in 1/(m² sr), is nothing: near 1e-38 some threads round to zero and others do not.
 _NOTHING = 1e-15
+# And more is no light (the scenes of this repository bring 300 at most): its squares would leave float32.
+_TOO_MUCH = 1e12
 
 _Begin = tuple[Vector, UInt | None, Float | None]  # of a path: direction, tier, and one over its share
 
@@ -77,7 +79,8 @@ def walk(
         if scene.nodes is not None:
             group = group * scene.nodes.count
         for node, part in enumerate([value * share for share in shares] or [value]):
-            place, some = (group + node) * stride + lane, active & (part > _NOTHING)
+            place = (group + node) * stride + lane
+            some = active & (part > _NOTHING) & (part < _TOO_MUCH)
             dr.scatter_reduce(dr.ReduceOp.Add, out, part, place, some, dr.ReduceMode.NoConflicts)
 
     deal = deal_of(scene, film.origin, camera_direction(film, pixel, mi.Float(0.5), mi.Float(0.5)))

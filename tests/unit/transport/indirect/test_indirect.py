@@ -12,9 +12,10 @@ import pytest
 
 from nir_render import InputError, Scene, load_scene, render
 from nir_render.light.light import Indirect
-from nir_render.transport.backend.variant import backend
+from nir_render.transport.backend.variant import backend, dr, mi
 from nir_render.transport.direct.table import direct_table
 from nir_render.transport.indirect import stock
+from nir_render.transport.indirect.kernel import paths
 
 pytestmark = pytest.mark.mitsuba
 
@@ -297,3 +298,27 @@ def test_what_it_cannot_render_is_refused(scene: Scene, changes: dict[str, Any],
         InputError, match=f"{said} whose bodies reflect or scatter needs the light-group renderer"
     ):
         stock.indirect(changed.at(0.0), "r1.c", 1, table)
+
+
+def test_a_value_that_comes_back_not_finite_is_walked_again(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As it would be if memory had lost a bit on the way; where it does not heal, no light comes out."""
+    right = _by_groups(scene).radiance_per_w
+    walks: list[int] = []
+
+    def spoiled(*what: Any) -> Any:
+        sums = paths.walk(*what)
+        walks.append(1)
+        if len(walks) <= spoils:
+            dr.scatter(sums, mi.Float(math.inf), mi.UInt32(7))
+        return sums
+
+    monkeypatch.setattr("nir_render.transport.indirect.sample_means.walk", spoiled)
+    spoils = 1
+    assert np.array_equal(_by_groups(scene).radiance_per_w, right)
+    assert "indirect light came back not finite in 1 of its values" in caplog.text
+    assert len(walks) == 2
+    spoils = 9
+    with pytest.raises(InputError, match="not finite in 1 of its values, rendered twice"):
+        _by_groups(scene)
