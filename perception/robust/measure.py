@@ -16,8 +16,8 @@ from perception.robust.clusters import Candidate, Cluster, clusters, dilated, gu
 from perception.robust.explain import MOST_LEFT, best
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size
-from perception.robust.search.blobs import Blob, divide
 from perception.robust.problem import Problem
+from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
 from perception.robust.verdict import (
@@ -32,6 +32,8 @@ CLIPPED_RANGE_SIGMA = 0.125
 
 MOST_LEFT_ON_EDGES = 0.1
 
+_ODD_SIGMAS = 3.0
+
 _TIMES_LAID_OUT = 2  # large discs: a pixel elsewhere the lens stretches them otherwise
 
 
@@ -39,6 +41,7 @@ _TIMES_LAID_OUT = 2  # large discs: a pixel elsewhere the lens stretches them ot
 class MeasuredFlare:
     """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
 
+    `flux_noise_e` is the part of the σ of its flux that its light brings, not that it may be another's.
     `log_range_doubt` is the part of the relative σ of its range that comes of what sources hide, of each
     other and of the background, and of its being two perhaps; `log_range_doubt_common` that of the background
     alone.
@@ -50,6 +53,7 @@ class MeasuredFlare:
     v_sigma_px: float
     flux_e: float
     flux_sigma_e: float
+    flux_noise_e: float
     background_e: float
     range_m: float
     range_sigma_m: float
@@ -76,8 +80,8 @@ class MeasuredFlare:
         """
         least = 10.0 if self.misfit or self.on_edges else 8.0 if self.on_texture else 4.0
         if self.saturated:
-            return not (self.misfit and self.flux_sigma_e > self.flux_e)
-        return self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e
+            return not (self.misfit and self.flux_noise_e > self.flux_e)
+        return self.flux_e > 0.0 and not self.flux_e < least * self.flux_noise_e
 
 
 def measure(
@@ -195,6 +199,7 @@ def _measurement(
         v_sigma_px=math.nan if bound_only else float(solution.v_sigma_px[index]) * widening,
         flux_e=flux_e,
         flux_sigma_e=flux_sigma_e,
+        flux_noise_e=float(solution.flux_noise_e[index]) * widening,
         background_e=solution.background_e,
         range_m=range_m,
         range_sigma_m=math.nan if bound_only else range_m * math.hypot(of_one, solution.log_range_of_two),
@@ -265,12 +270,14 @@ def _by_disc(
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a fit of whole large discs into measurements, or sum apertures where there is none that is one.
 
-    A disc that is not all there, or not alone, leaves a share of its light over: of so much area its flux may
-    lack, at most, or have too much, and by so much of its radius it may be elsewhere.
+    A disc that is not all there, or not alone, leaves light over: about twice as much its flux may lack, or
+    have too much, as the fit has taken a part of it up; by such a share of its radius it may be elsewhere.
     """
     wanted = _large_discs(cluster, prepared)
     if solution is None or solution.left_over.share > MOST_LEFT or not bool(solution.ranged.all()):
-        return [(cluster.members[k].blob, _from_aperture(cluster.members[k], cluster, prepared)) for k in wanted]
+        return [
+            (cluster.members[k].blob, _from_aperture(cluster.members[k], cluster, prepared)) for k in wanted
+        ]
     left = solution.left_over
     misfit = not left.is_good or left.peak_sigmas > RESIDUAL_SIGMAS
     measured = []
@@ -278,24 +285,32 @@ def _by_disc(
         blob = cluster.members[k].blob
         one = _measurement(solution, k, blob, misfit, prepared)
         if misfit:
-            away_px = left.share * float(solution.image_radius_px[k])
+            share = 2.0 * _odd_share(solution)
+            away_px = share * float(solution.image_radius_px[k])
             one = replace(
                 one,
                 u_sigma_px=math.hypot(one.u_sigma_px, away_px),
                 v_sigma_px=math.hypot(one.v_sigma_px, away_px),
-                flux_sigma_e=math.hypot(one.flux_sigma_e, 2.0 * left.share * one.flux_e),
-                range_sigma_m=math.hypot(one.range_sigma_m, left.share * one.range_m),
-                log_range_doubt=math.hypot(one.log_range_doubt, left.share),
+                flux_sigma_e=math.hypot(one.flux_sigma_e, share * one.flux_e),
+                range_sigma_m=math.hypot(one.range_sigma_m, 0.5 * share * one.range_m),
+                log_range_doubt=math.hypot(one.log_range_doubt, 0.5 * share),
             )
         measured.append((blob, one))
     return measured
 
 
+def _odd_share(solution: Solution) -> float:
+    """Return how much light more or less is seen than chance explains, relative to the flares' light."""
+    away_e = np.abs(solution.residual_e)
+    odd_e = away_e[away_e > _ODD_SIGMAS * np.sqrt(solution.variance_e2(0.0))]
+    return float(odd_e.sum() / max(float(solution.flares_e.sum()), 1e-300))
+
+
 def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame) -> MeasuredFlare:
     """Sum what exceeds a ring around the blob, at its centroid.
 
-    Whether it is all of a source's light, and no other's, nothing tells: no σ of range is claimed, and none of
-    the place of what is large.
+    Whether it is all of a source's light, and no other's, nothing tells: no σ of range is claimed, and none
+    of the place of what is large.
     """
     blob, window = member.blob, cluster.window
     frame, calibration = prepared.frame, prepared.calibration
@@ -331,6 +346,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         v_sigma_px=v_sigma_px if has_place else math.nan,
         flux_e=aperture.flux,
         flux_sigma_e=aperture.flux_sigma,
+        flux_noise_e=aperture.flux_sigma,
         background_e=aperture.background,
         range_m=ranged.range_m,
         range_sigma_m=math.nan,

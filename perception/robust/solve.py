@@ -46,6 +46,8 @@ class Solution:
         Shape (flares,) each; the last is the range that the flux alone says.
     u_sigma_px, v_sigma_px, flux_sigma_e
         Standard deviations, same shape.
+    flux_noise_e
+        That of the flux were it certain what explains the window (`rivals.weighed`), same shape.
     log_range, log_range_sigma, log_range_common
         Range by flux and size together, its standard deviation, and the part of that which every measurement
         of the source shares (`Camera.log_range`), same shape.
@@ -87,6 +89,7 @@ class Solution:
     u_sigma_px: Array
     v_sigma_px: Array
     flux_sigma_e: Array
+    flux_noise_e: Array
     log_range: Array
     log_range_sigma: Array
     log_range_common: Array
@@ -381,6 +384,7 @@ def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
                 u_sigma_px=sigma[these, 0],
                 v_sigma_px=sigma[these, 1],
                 flux_sigma_e=flux_sigma_e[these],
+                flux_noise_e=flux_sigma_e[these],
                 log_range=log_range[these],
                 log_range_sigma=log_range_sigma[these],
                 log_range_common=log_range_common[these],
