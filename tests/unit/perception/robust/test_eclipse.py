@@ -153,9 +153,9 @@ def test_slopes_are_those_of_what_is_expected(monkeypatch: pytest.MonkeyPatch) -
     starts = [(u, v, math.log(range_m)) for u, v, range_m in places]
     seen: list[Cluster] = []
 
-    def look(found: list[Cluster], *_: object) -> dict[int, Solution]:
+    def look(found: list[Cluster], *_: object) -> tuple[dict[int, Solution], dict[int, Solution]]:
         seen.extend(found)
-        return {}
+        return {}, {}
 
     mean_e_per_s = union_e_per_s(places)
     exposure_s = 0.6 * 4000.0 / 0.74 / float(mean_e_per_s.max())
