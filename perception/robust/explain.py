@@ -1,7 +1,7 @@
 """What explains a cluster best: flares at rest or drawn out, one or several, a halo, uneven ground, spill."""
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -69,10 +69,8 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         parted = _parted(plain, prepared.shape, camera, cut_short)
         may_be = [one is None or may_be_other_shape(one, camera) for one in plain]
         pairs, rivals = eclipses(found, plain, parted, may_be, camera)
-        for more in (pairs, cut_discs(found, plain, parted | pairs, may_be, camera)):
-            for index, other in more.items():
-                if _explains_all(other, prepared.shape):
-                    parted[index] = _better(other, parted.get(index))
+        _take_up(pairs, parted, prepared.shape)
+        _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
         without = _without_spill(plain, prepared, camera)
         for index, line in moving(plain, camera).items():
@@ -131,8 +129,15 @@ def _likely(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple
     return chosen
 
 
+def _take_up(others: Mapping[int, Solution], parted: dict[int, Solution], shape: tuple[int, int]) -> None:
+    """Hold other explanations of windows against those so far, where they explain all that is seen."""
+    for index, other in others.items():
+        if _explains_all(other, shape):
+            parted[index] = _better(other, parted.get(index))
+
+
 def _better(pair: Solution, other: Solution | None) -> Solution:
-    """Return what explains a window better, weighed; of as many flares that which also says what is hidden."""
+    """Return what explains a window better, the other weighed in; of as many flares what knows of hiding."""
     if other is None:
         return pair
     alike = _ALIKE if pair.count == other.count else 0.0
