@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import direction_camera
+from perception.model.bearing import direction_camera, pixel_turn
 from perception.model.flare import PixelBox
 from perception.model.lens import stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
@@ -31,7 +31,10 @@ _TOUCHING_PX = 4
 _KEPT_PX = 2
 
 MAX_IMAGE_RADIUS_PX = 28.0
-"""Sources that look larger are measured by aperture: as good for them, and far cheaper than the fit."""
+"""Sources that look larger are fitted as they are, or not at all: looking for what may hide them is dear."""
+
+MOST_FITTED_RADIUS_PX = 130.0
+"""So far are images laid out exactly (`model.nodes`)."""
 
 # Few sizes of windows, as what texture looks like is reckoned once for each.
 _SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX)
@@ -81,7 +84,7 @@ class Candidate:
 
     @property
     def is_beyond_fit(self) -> bool:
-        """Whether it is measured by aperture: too large, or where no range can be had to say its size."""
+        """Whether it is too large to be looked at closely, or no range can be had to say its size."""
         return self.is_too_large or not self.at_one_metre_e > 0.0
 
     def log_range(self, flux_e: float) -> float:
@@ -242,6 +245,44 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
         if starts not in sets:
             sets.append(starts)
     return sets
+
+
+def guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> list[Start] | None:
+    """Return first guesses of large discs from what is seen of their outlines, which the frame may cut.
+
+    Of a sphere's image the half axes along columns and rows follow from its angular radius; the frame's edge
+    may cut one of them, hardly both. None where a member is clipped, has no range, or is larger than images
+    are laid out for.
+    """
+    calibration, (height, width) = prepared.calibration, prepared.shape
+    if not calibration.source_radius_m > 0.0:
+        return None
+    starts: list[Start] = []
+    for member in cluster.members:
+        box = member.blob.box
+        if member.is_clipped or not member.at_one_metre_e > 0.0:
+            return None
+        (turn,) = pixel_turn([[member.u_px, member.v_px]], calibration)
+        px_per_rad = np.sqrt(np.diagonal(np.linalg.inv(turn @ turn.T)))
+        lit_px = np.array([box.width, box.height], dtype=np.float64)
+        angle_rad = float((0.5 * lit_px / px_per_rad).max())
+        along_u_px, along_v_px = (angle_rad * px_per_rad).tolist()
+        if not max(along_u_px, along_v_px) < MOST_FITTED_RADIUS_PX:
+            return None
+        u_px = _middle(box.left, box.width, width, along_u_px)
+        v_px = _middle(box.top, box.height, height, along_v_px)
+        starts.append((u_px, v_px, math.log(calibration.source_radius_m / math.sin(min(angle_rad, 1.5)))))
+    return starts
+
+
+def _middle(first: int, lit: int, all_px: int, half_px: float) -> float:
+    """Return the middle of so many lit pixels along an axis; where one end of it is cut, by the other."""
+    ends = first - 0.5, first + lit - 0.5
+    if first == 0 and first + lit < all_px:
+        return ends[1] - half_px
+    if first + lit == all_px and first > 0:
+        return ends[0] + half_px
+    return 0.5 * (ends[0] + ends[1])
 
 
 def _window_box(members: Sequence[Candidate], prepared: PreparedFrame) -> PixelBox:

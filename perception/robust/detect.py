@@ -53,14 +53,15 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         search, and with the `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above
         the detection limit.
         `saturated`: a pixel is clipped, which counts as censored. Where that does not determine the range
-        `range_sigma_m` is NaN; of a disc too large to be fitted the flux is a lower bound, too, and the range
-        an upper one. Flares that overlap are fitted together (`deblend`), and their sigmas know of it; behind
-        a rolling shutter a blob stays one. One that moves is drawn out (`motion`): its place is that in the
-        middle of the exposure. `merged`: what is seen does not look like one source, nor like
-        several that can be told apart; its sigmas are then widened by √χ². So is called what may be one that
-        moves or two at rest; its sigmas cover both. `ghost` is never set: one frame cannot tell a mirror
-        image from a source. What is no source by shape, size or brightness is left out, and so is what does
-        not stand out from what lies right beside it, and all but the brightest thousand.
+        `range_sigma_m` is NaN; of a clipped disc of more than 28 px radius the flux is a lower bound, too,
+        and the range an upper one; of one not clipped, `merged`, no whole disc explains it. Flares that
+        overlap are fitted together (`deblend`), and their sigmas know of it; behind a rolling shutter a blob
+        stays one. One that moves is drawn out (`motion`): its place is that in the middle of the exposure.
+        `merged`: what is seen does not look like one source, nor like several that can be told apart; its
+        sigmas are then widened by √χ². So is called what may be one that moves or two at rest; its sigmas
+        cover both. `ghost` is never set: one frame cannot tell a mirror image from a source. What is no
+        source by shape, size or brightness is left out, and so is what does not stand out from what lies
+        right beside it, and all but the brightest thousand.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """What explains a cluster best: flares at rest or drawn out, one or several, a halo, uneven ground, spill."""
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,18 +61,16 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
     # flares would explain better.
     parted: dict[int, Solution] = {}
+    rivals: dict[int, Solution] = {}
     cut_short: set[int] = set()
     plain: list[Solution | None] = [None] * len(found)
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
         parted = _parted(plain, prepared.shape, camera, cut_short)
         may_be = [one is None or may_be_other_shape(one, camera) for one in plain]
-        for index, pair in eclipses(found, plain, parted, may_be, camera).items():
-            if _explains_all(pair, prepared.shape) and _is_better(pair, parted.get(index)):
-                parted[index] = pair
-        for index, piece in cut_discs(found, plain, parted, may_be, camera).items():
-            if _explains_all(piece, prepared.shape) and _is_better(piece, parted.get(index)):
-                parted[index] = piece
+        pairs, rivals = eclipses(found, plain, parted, may_be, camera)
+        _take_up(pairs, parted, prepared.shape)
+        _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
         without = _without_spill(plain, prepared, camera)
         for index, line in moving(plain, camera).items():
@@ -94,8 +92,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     _retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
-        if _is_better(more, chosen[index]):
-            chosen[index] = more
+        chosen[index] = _better(more, chosen[index])
+    for index, pair in rivals.items():
+        chosen[index] = _beside_rival(chosen[index], pair)
     if prepared.frame.line_time_s == 0.0:
         for index, one_or_two in doubted(chosen, plain, camera).items():
             chosen[index] = one_or_two
@@ -130,12 +129,32 @@ def _likely(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple
     return chosen
 
 
-def _is_better(pair: Solution, other: Solution | None) -> bool:
-    """Tell whether flares explain a window better; of as many that which also says what is hidden."""
+def _take_up(others: Mapping[int, Solution], parted: dict[int, Solution], shape: tuple[int, int]) -> None:
+    """Hold other explanations of windows against those so far, where they explain all that is seen."""
+    for index, other in others.items():
+        if _explains_all(other, shape):
+            parted[index] = _better(other, parted.get(index))
+
+
+def _better(pair: Solution, other: Solution | None) -> Solution:
+    """Return what explains a window better, the other weighed in; of as many flares what knows of hiding."""
     if other is None:
-        return True
+        return pair
     alike = _ALIKE if pair.count == other.count else 0.0
-    return pair.cost < other.cost + alike
+    return weighed(pair, other) if pair.cost < other.cost + alike else weighed(other, pair)
+
+
+def _beside_rival(one: Solution | None, pair: Solution) -> Solution | None:
+    """Weigh what explains a window with two spheres that do, too, but may be one that is not round.
+
+    One that is not round is told as one; several flares are no better a guess than the two where these
+    explain more.
+    """
+    if one is None:
+        return None
+    if one.count > 1 and pair.cost < one.cost:
+        return replace(weighed(pair, one), is_doubtful=True)
+    return weighed(one, pair)
 
 
 def _drop_beside_lines(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,14 @@ from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux
-from perception.robust.clusters import Candidate, Cluster, clusters, dilated
+from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guess_by_outline
 from perception.robust.explain import MOST_LEFT, best
+from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size
+from perception.robust.problem import Problem
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.solve import Solution
+from perception.robust.solve import Solution, solve
 from perception.robust.verdict import (
     LEAST_RANGE_M,
     is_border,
@@ -30,11 +32,16 @@ CLIPPED_RANGE_SIGMA = 0.125
 
 MOST_LEFT_ON_EDGES = 0.1
 
+_ODD_SIGMAS = 3.0
+
+_TIMES_LAID_OUT = 2  # large discs: a pixel elsewhere the lens stretches them otherwise
+
 
 @dataclass(frozen=True)
 class MeasuredFlare:
     """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
 
+    `flux_noise_e` is the part of the σ of its flux that its light brings, not that it may be another's.
     `log_range_doubt` is the part of the relative σ of its range that comes of what sources hide, of each
     other and of the background, and of its being two perhaps; `log_range_doubt_common` that of the background
     alone.
@@ -46,6 +53,7 @@ class MeasuredFlare:
     v_sigma_px: float
     flux_e: float
     flux_sigma_e: float
+    flux_noise_e: float
     background_e: float
     range_m: float
     range_sigma_m: float
@@ -72,8 +80,8 @@ class MeasuredFlare:
         """
         least = 10.0 if self.misfit or self.on_edges else 8.0 if self.on_texture else 4.0
         if self.saturated:
-            return not (self.misfit and self.flux_sigma_e > self.flux_e)
-        return self.flux_e > 0.0 and not self.flux_e < least * self.flux_sigma_e
+            return not (self.misfit and self.flux_noise_e > self.flux_e)
+        return self.flux_e > 0.0 and not self.flux_e < least * self.flux_noise_e
 
 
 def measure(
@@ -82,8 +90,9 @@ def measure(
     """Measure clusters, and leave out what is no source.
 
     Flares of known size and strength are fitted to each window. What a fit leaves over may be more flares
-    (`deblend`), or charge that clipped pixels spilled over their columns. Blobs that are too large to be
-    fitted, or have no range, are measured by aperture; the flux of a clipped one is then a lower bound.
+    (`deblend`), or charge that clipped pixels spilled over their columns. Blobs that are too large for that
+    are fitted as whole discs; what no such disc explains, what is clipped then, and what has no range is
+    measured by aperture, which claims no σ of range. The flux of a clipped one is a lower bound.
 
     Parameters
     ----------
@@ -118,7 +127,9 @@ def measure(
         # What spoils a cluster spoils it for all: each by itself, the others left out.
         measured += measure(clusters(again, prepared, apart=True), prepared, apart=True)
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
-    return measured + [each for cluster in others for each in _by_apertures(cluster, prepared)]
+    for cluster, solution in zip(others, _of_large_discs(others, prepared, camera), strict=True):
+        measured += _by_disc(cluster, solution, prepared)
+    return measured
 
 
 def _is_odd(solution: Solution) -> bool:
@@ -188,6 +199,7 @@ def _measurement(
         v_sigma_px=math.nan if bound_only else float(solution.v_sigma_px[index]) * widening,
         flux_e=flux_e,
         flux_sigma_e=flux_sigma_e,
+        flux_noise_e=float(solution.flux_noise_e[index]) * widening,
         background_e=solution.background_e,
         range_m=range_m,
         range_sigma_m=math.nan if bound_only else range_m * math.hypot(of_one, solution.log_range_of_two),
@@ -226,16 +238,80 @@ def _hidden_log_range(solution: Solution, index: int) -> float:
     return max(float(farther.max(initial=0.0)), 0.5 * float(cut.sum()))
 
 
-def _by_apertures(cluster: Cluster, prepared: PreparedFrame) -> list[tuple[Blob, MeasuredFlare]]:
-    return [
-        (member.blob, _from_aperture(member, cluster, prepared))
-        for member in (cluster.members[k] for k in cluster.wanted)
-        if not (member.is_too_large and is_no_large_disc(member, prepared))
-    ]
+def _of_large_discs(
+    found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera
+) -> list[Solution | None]:
+    """Fit whole discs to clusters of large ones; None where there are none, or the fit did not converge."""
+    solutions: list[Solution | None] = [None] * len(found)
+    tried: list[int] = []
+    problems = []
+    for index, cluster in enumerate(found):
+        starts = guess_by_outline(cluster, prepared)
+        if starts is not None and _large_discs(cluster, prepared):
+            tried.append(index)
+            problems.append(Problem(cluster.window, starts, cluster.background_e))
+    for _ in range(_TIMES_LAID_OUT):
+        for index, solution in zip(tried, solve(problems, camera), strict=True):
+            solutions[index] = solution
+        tried = [index for index in tried if solutions[index] is not None]
+        problems = [one.again() for one in solutions if one is not None]
+    fit_beside_forward_light(solutions, camera)
+    return solutions
+
+
+def _large_discs(cluster: Cluster, prepared: PreparedFrame) -> list[int]:
+    """Return which wanted members of a cluster are no lamps by their outlines and their brightness."""
+    members = ((k, cluster.members[k]) for k in cluster.wanted)
+    return [k for k, one in members if not (one.is_too_large and is_no_large_disc(one, prepared))]
+
+
+def _by_disc(
+    cluster: Cluster, solution: Solution | None, prepared: PreparedFrame
+) -> list[tuple[Blob, MeasuredFlare]]:
+    """Turn a fit of whole large discs into measurements, or sum apertures where there is none that is one.
+
+    A disc that is not all there, or not alone, leaves light over: about twice as much its flux may lack, or
+    have too much, as the fit has taken a part of it up; by such a share of its radius it may be elsewhere.
+    """
+    wanted = _large_discs(cluster, prepared)
+    if solution is None or solution.left_over.share > MOST_LEFT or not bool(solution.ranged.all()):
+        return [
+            (cluster.members[k].blob, _from_aperture(cluster.members[k], cluster, prepared)) for k in wanted
+        ]
+    left = solution.left_over
+    misfit = not left.is_good or left.peak_sigmas > RESIDUAL_SIGMAS
+    measured = []
+    for k in wanted:
+        blob = cluster.members[k].blob
+        one = _measurement(solution, k, blob, misfit, prepared)
+        if misfit:
+            share = 2.0 * _odd_share(solution)
+            away_px = share * float(solution.image_radius_px[k])
+            one = replace(
+                one,
+                u_sigma_px=math.hypot(one.u_sigma_px, away_px),
+                v_sigma_px=math.hypot(one.v_sigma_px, away_px),
+                flux_sigma_e=math.hypot(one.flux_sigma_e, share * one.flux_e),
+                range_sigma_m=math.hypot(one.range_sigma_m, 0.5 * share * one.range_m),
+                log_range_doubt=math.hypot(one.log_range_doubt, 0.5 * share),
+            )
+        measured.append((blob, one))
+    return measured
+
+
+def _odd_share(solution: Solution) -> float:
+    """Return how much light more or less is seen than chance explains, relative to the flares' light."""
+    away_e = np.abs(solution.residual_e)
+    odd_e = away_e[away_e > _ODD_SIGMAS * np.sqrt(solution.variance_e2(0.0))]
+    return float(odd_e.sum() / max(float(solution.flares_e.sum()), 1e-300))
 
 
 def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame) -> MeasuredFlare:
-    """Sum what exceeds a ring around the blob, at its centroid."""
+    """Sum what exceeds a ring around the blob, at its centroid.
+
+    Whether it is all of a source's light, and no other's, nothing tells: no σ of range is claimed, and none
+    of the place of what is large.
+    """
     blob, window = member.blob, cluster.window
     frame, calibration = prepared.frame, prepared.calibration
     reach_px = 0.5 * math.hypot(blob.box.height, blob.box.width) + 2.0
@@ -251,7 +327,6 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         window.usable & ~dilated(lit, 2),
     )
     gain = gain_dn_per_e(frame, calibration)
-    camera = Camera(calibration, frame.exposure_s, frame.gain)
     ranged = range_from_flux(
         aperture.flux * gain,
         aperture.flux_sigma * gain,
@@ -262,20 +337,21 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         calibration,
         aperture.background * gain,
     )
+    has_place = not (member.is_clipped or member.is_too_large)
     u_sigma_px, v_sigma_px = _centroid_sigmas(member, aperture.flux, prepared)
     return MeasuredFlare(
         u_px=member.u_px,
         v_px=member.v_px,
-        u_sigma_px=math.nan if member.is_clipped else u_sigma_px,
-        v_sigma_px=math.nan if member.is_clipped else v_sigma_px,
+        u_sigma_px=u_sigma_px if has_place else math.nan,
+        v_sigma_px=v_sigma_px if has_place else math.nan,
         flux_e=aperture.flux,
         flux_sigma_e=aperture.flux_sigma,
+        flux_noise_e=aperture.flux_sigma,
         background_e=aperture.background,
         range_m=ranged.range_m,
-        range_sigma_m=math.nan if member.is_clipped else ranged.range_sigma_m,
-        range_sigma_common_m=math.nan if member.is_clipped else 0.5 * ranged.range_m * camera.flux_spread,
+        range_sigma_m=math.nan,
         saturated=member.is_clipped,
-        misfit=not member.is_clipped and not member.is_beyond_fit,
+        misfit=member.is_too_large and not member.is_clipped,
     )
 
 

@@ -44,27 +44,25 @@ class Solution:
         What they explain.
     u_px, v_px, flux_e, log_photometric_range
         Shape (flares,) each; the last is the range that the flux alone says.
-    u_sigma_px, v_sigma_px, flux_sigma_e
-        Standard deviations, same shape.
+    u_sigma_px, v_sigma_px, flux_sigma_e, flux_noise_e
+        Standard deviations, same shape; the last were it certain what explains the window (`rivals.weighed`).
     log_range, log_range_sigma, log_range_common
         Range by flux and size together, its standard deviation, and the part of that which every measurement
         of the source shares (`Camera.log_range`), same shape.
     log_range_hidden
         Part of these that comes of the background hidden behind each, same shape.
-    ranged
-        Whether a range can be had there, same shape.
-    image_radius_px
-        Radius of each image before the point spread, half of its motion included, same shape.
+    ranged, image_radius_px
+        Whether a range can be had there, and the radius of each image before the point spread, half of its
+        motion included, same shape.
     background_e
         Of a pixel, beneath all of them.
     expected_e, flares_e
         λ in each pixel of the window, and the flares' part of it, shape (height, width).
     deviance
         −2 ln L but for a constant of the window.
-    psf_sigma_px
-        Width of the point spread as calibrated.
-    log_information
-        Logarithm of the determinant of the information, priors included, over that of the structure's prior.
+    psf_sigma_px, log_information
+        Width of the point spread as calibrated; logarithm of the determinant of the information, priors
+        included, over that of the structure's prior.
     motion_px, motion_cost
         How far each moves along u and v during the exposure, shape (flares, 2), None where none may; and what
         that costs a priori (`model.window`).
@@ -87,6 +85,7 @@ class Solution:
     u_sigma_px: Array
     v_sigma_px: Array
     flux_sigma_e: Array
+    flux_noise_e: Array
     log_range: Array
     log_range_sigma: Array
     log_range_common: Array
@@ -126,8 +125,8 @@ class Solution:
     @property
     def starts(self) -> list[Start]:
         """The flares as first guesses of another fit."""
-        rows = zip(self.u_px, self.v_px, self.log_photometric_range, strict=True)
-        return [(float(u), float(v), float(log_range)) for u, v, log_range in rows]
+        own = np.column_stack([self.u_px, self.v_px, self.log_photometric_range])
+        return [(u, v, log_range) for u, v, log_range in own.tolist()]
 
     def again(self, window: Window | None = None) -> Problem:
         """Return the problem of fitting these flares again, or to another view of their window."""
@@ -381,6 +380,7 @@ def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
                 u_sigma_px=sigma[these, 0],
                 v_sigma_px=sigma[these, 1],
                 flux_sigma_e=flux_sigma_e[these],
+                flux_noise_e=flux_sigma_e[these],
                 log_range=log_range[these],
                 log_range_sigma=log_range_sigma[these],
                 log_range_common=log_range_common[these],

@@ -22,6 +22,7 @@ from perception.robust.overlap.deblend import LEAST_GAIN, gain
 from perception.robust.overlap.eclipse import finer, is_as_bright, lit_pixels
 from perception.robust.overlap.hidden import RAMP_PX
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
+from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
 from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
 
@@ -71,7 +72,7 @@ def cut_discs(
         fits.sort(key=lambda fit: fit.objective)
         if fits and one is not None and one.count == 1:
             fits.insert(0, _Cut(cluster, _where_light_lacks(one), camera))
-        to_beat = parted[index].cost if index in parted else math.inf
+        to_beat = parted[index].cost + NO_RIVAL if index in parted else math.inf
         good: list[Solution] = []
         for fit in fits[:_TRIED]:
             cut = fit.solution(to_beat) if len(good) < _GOOD else None

@@ -58,7 +58,7 @@ def eclipses(
     parted: Mapping[int, Solution],
     may_be: Sequence[bool],
     camera: Camera,
-) -> dict[int, Solution]:
+) -> tuple[dict[int, Solution], dict[int, Solution]]:
     """Explain windows by two resolved spheres, one partly behind the other.
 
     Where robots are known to carry several sources, smaller ones too, others may be beside them, and two that
@@ -77,9 +77,11 @@ def eclipses(
 
     Returns
     -------
-    By index what explains a window well; nothing where nothing does.
+    By index what explains a window well, nothing where nothing does; and likewise what does, but for which a
+    globe that is not round would as well, or which is too small to be told.
     """
-    pairs, least_px, of_layouts = {}, least_radius_px(camera), knows_layouts(camera)
+    pairs, rivals = dict[int, Solution](), dict[int, Solution]()
+    least_px, of_layouts = least_radius_px(camera), knows_layouts(camera)
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd:
             continue
@@ -100,10 +102,12 @@ def eclipses(
         good: list[Solution] = []
         for fit in fits:
             pair = fit.solution() if len(good) < _TRIED else None
-            if pair is not None and _is_pair(pair, least_px) and are_apart(pair, camera):
+            if pair is not None and pair.left_over.is_good and are_apart(pair, camera):
                 good.append(pair)
-        likeliest = min(good, key=lambda pair: pair.cost, default=None)
-        if likeliest is None:
+        if not good:
+            continue
+        rivals[index] = likeliest = min(good, key=lambda pair: pair.cost)
+        if not is_near(likeliest, least_px):
             continue
         # Where robots are known to carry sources so far apart, globes that are not round are the odder guess.
         of_one_robot = is_of_a_layout(likeliest, camera)
@@ -111,8 +115,8 @@ def eclipses(
         # An oval explains no more than one of several flares.
         is_believed = of_one_robot if likeliest.count > 2 else gain_over_oval(likeliest, camera) >= least_gain
         if is_believed:
-            pairs[index] = replace(likeliest, is_eclipse=not _may_be_other(likeliest, camera))
-    return pairs
+            pairs[index] = replace(rivals.pop(index), is_eclipse=not _may_be_other(likeliest, camera))
+    return pairs, rivals
 
 
 def _may_be_other(pair: Solution, camera: Camera) -> bool:
@@ -140,11 +144,6 @@ def _may_be_other(pair: Solution, camera: Camera) -> bool:
         if farthest > OTHER_SIGMAS * float(pair.log_range_sigma[far]):
             return True
     return False
-
-
-def _is_pair(several: Solution, least_px: float) -> bool:
-    """Tell whether flares are two, well fitted, resolved, and one within two radii of the other."""
-    return several.left_over.is_good and is_near(several, least_px)
 
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:

@@ -1,0 +1,103 @@
+"""Globes so near that they are fitted as whole discs: cut by the frame's edge, hidden in part, two in one blob."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from perception import Detection, detect
+from perception.types import Calibration
+from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, expose, random
+
+Array = NDArray[np.float64]
+Place = tuple[float, float, float]
+
+CAMERA = calibration(sigma={})
+RADIUS_M = CAMERA.source_radius_m
+FINE, SIDE_PX = 8, 200
+SMALL = replace(CAMERA, width_px=SIDE_PX, height_px=SIDE_PX, cx_px=99.5, cy_px=99.5)
+
+
+def _pulls(place: Place, told: Detection) -> list[float]:
+    u, v, range_m = place
+    return [
+        (told.u_px - u) / told.u_sigma_px,
+        (told.v_px - v) / told.v_sigma_px,
+        (told.range_m - range_m) / told.range_sigma_m,
+    ]
+
+
+def _told(mean_e: Array, camera: Calibration = CAMERA, key: int = 0) -> list[Detection]:
+    """Return what is told of a frame, its peak at 60 % of full scale."""
+    exposure = 0.6 * 4000.0 / 0.74 / float(mean_e.max())
+    return list(detect(expose(mean_e * exposure + 5.0, camera, random(83, key), 1e-3 * exposure), camera))
+
+
+@pytest.mark.parametrize(
+    "place",
+    [(600.3, 420.6, 0.16), (23.0, 337.0, 0.24), (0.3, 420.6, 0.2), (-15.3, 420.6, 0.2), (300.0, 12.0, 0.13)],
+)
+def test_what_the_frame_s_edge_cuts_is_ranged(place: Place) -> None:
+    """By the sum of what is seen the second is 15 % too far, by 520 σ, and the fourth 66 %."""
+    (told,) = _told(expected_e(CAMERA, [place], 1e-3))
+    assert np.abs(_pulls(place, told)).max() < 4.5
+    assert told.range_sigma_m < 5e-4 * told.range_m
+    assert not told.merged
+
+
+def _seen_e(places: list[Place], shown: float = 1.0, turn_rad: float = 0.0) -> Array:
+    """Return the mean frame of 1 ms near the axis, of the first so much of its diameter left by an edge."""
+    at = (np.arange(SIDE_PX * FINE) + 0.5) / FINE - 0.5
+    x, y = np.meshgrid((at - SMALL.cx_px) / SMALL.fx_px, (at - SMALL.cy_px) / SMALL.fy_px)
+    cosine = 1.0 / np.sqrt(1.0 + x**2 + y**2)
+    lit = np.zeros(x.shape)
+    for k, (u, v, range_m) in enumerate(places):
+        middle = np.array([(u - SMALL.cx_px) / SMALL.fx_px, (v - SMALL.cy_px) / SMALL.fy_px, 1.0])
+        off_u, off_v = (x - middle[0]) * SMALL.fx_px, (y - middle[1]) * SMALL.fy_px
+        middle /= np.linalg.norm(middle)
+        away = np.sqrt(
+            (x * cosine - middle[0]) ** 2 + (y * cosine - middle[1]) ** 2 + (cosine - middle[2]) ** 2
+        )
+        radius_rad = math.asin(RADIUS_M / range_m)
+        disc = np.clip(0.5 + (2.0 * math.sin(0.5 * radius_rad) - away) * SMALL.fx_px * FINE, 0.0, 1.0)
+        if k == 0:
+            edge_px = SMALL.fx_px * math.tan(radius_rad) * (2.0 * shown - 1.0)
+            along = off_u * math.cos(turn_rad) + off_v * math.sin(turn_rad)
+            disc *= np.clip(0.5 + (edge_px - along) * FINE, 0.0, 1.0)
+        lit = np.maximum(lit, disc)
+    radiance = 1e-3 * FLUX_PER_S_AT_1_M / (math.pi * RADIUS_M**2)
+    light = lit * radiance * cosine**4 / (SMALL.fx_px * FINE) ** 2
+    light = gaussian_filter(light, SMALL.psf_sigma_px * FINE)
+    return np.asarray(light.reshape(SIDE_PX, FINE, SIDE_PX, FINE).sum(axis=(1, 3)))
+
+
+@pytest.mark.parametrize("shown", [0.9, 0.97])
+def test_what_a_body_hides_a_little_of_is_doubted(shown: float) -> None:
+    """By the sum 2.7 % and 0.4 % too far, by 110 and 18 σ."""
+    place = (90.3, 101.6, 0.14)
+    (told,) = _told(_seen_e([place], shown, 0.5), SMALL)
+    assert told.merged
+    assert np.abs(_pulls(place, told)).max() < 2.0
+    assert told.range_sigma_m < 0.1 * told.range_m
+
+
+@pytest.mark.parametrize("shown", [0.8, 1.0])
+def test_what_no_whole_disc_explains_claims_no_range(shown: float) -> None:
+    """A fifth of the diameter hidden: by the sum 8 % too far, by 310 σ."""
+    place = (90.3, 101.6, 0.14)
+    (told,) = _told(_seen_e([place], shown, 0.5), SMALL)
+    assert told.merged == (shown < 1.0)
+    assert math.isfinite(told.range_sigma_m + told.u_sigma_px) == (shown == 1.0)
+    if shown == 1.0:
+        assert np.abs(_pulls(place, told)).max() < 4.5
+
+
+def test_one_before_another_is_doubted() -> None:
+    """One at 30 cm stands out by half from behind one at 14 cm: by the sum one, 6 % too near, by 300 σ."""
+    places = [(85.3, 101.6, 0.14), (119.3, 110.0, 0.3)]
+    for told in _told(_seen_e(places), SMALL):
+        assert told.merged
+        assert math.isnan(told.range_sigma_m) or np.abs(_pulls(places[0], told)).max() < 3.0
