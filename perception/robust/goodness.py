@@ -127,7 +127,7 @@ def residual_e(image_e: Array, state: NDArray[np.uint8], expected_e: Array) -> A
 
 
 @compiled
-def _noise_e2(expected_e: float, floor_e2: float, prnu: float) -> float:
+def noise_e2(expected_e: float, floor_e2: float, prnu: float) -> float:
     """Return a pixel's variance, as `sensor.pixel_variance_e2`."""
     lit = max(expected_e, 0.0)
     return lit + (prnu * lit) ** 2 + floor_e2
@@ -146,7 +146,7 @@ def _reckoned(
     for row in range(rows):
         for column in range(columns):
             flare, left = flares_e[row, column], residual[row, column]
-            noise[row, column] = _noise_e2(expected_e[row, column], floor_e2, prnu)
+            noise[row, column] = noise_e2(expected_e[row, column], floor_e2, prnu)
             variance = noise[row, column] + (MODEL_ERROR * flare) ** 2
             if flare > REACHED_SIGMAS * math.sqrt(noise[row, column]):
                 for down in range(-DISC_PX, DISC_PX + 1):
@@ -238,7 +238,7 @@ def drawn_out(
         for column in range(1, columns - 1):
             if state[row, column] != SEEN:
                 continue
-            weight = 1.0 / math.sqrt(_noise_e2(expected_e[row, column], floor_e2, prnu))
+            weight = 1.0 / math.sqrt(noise_e2(expected_e[row, column], floor_e2, prnu))
             near = flares_e[row - 1 : row + 2, column - 1 : column + 2]
             by_uu = near[1, 2] - 2.0 * near[1, 1] + near[1, 0]
             by_vv = near[2, 1] - 2.0 * near[1, 1] + near[0, 1]
@@ -296,7 +296,7 @@ def halo_sigmas(
             for column in range(image_e.shape[1]):
                 if state[row, column] != SEEN:
                     continue
-                variance = _noise_e2(expected_e[row, column], floor_e2, prnu)
+                variance = noise_e2(expected_e[row, column], floor_e2, prnu)
                 spread = 1.0 + ((column - place[0]) ** 2 + (row - place[1]) ** 2) / width**2
                 profile = 1.0 / (spread * math.sqrt(spread))
                 score += profile * (image_e[row, column] - expected_e[row, column]) / variance
