@@ -221,7 +221,7 @@ def _matched_peak(weighted: Array, weight: Array, smooth_px: float) -> tuple[flo
 @compiled
 def drawn_out(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float, prnu: float
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, float]:
     """Tell by how much longer than wide an image is than its fit, as one does that moves while exposed.
 
     A motion m adds to a flare's light F S the part ∂ᵢ∂ⱼ(F S) mᵢ mⱼ / 24, to first order, of which what is the
@@ -230,10 +230,12 @@ def drawn_out(
 
     Returns
     -------
-    χ² of two degrees of freedom, and the motion along u and v in pixels that the residual asks for.
+    χ² of two degrees of freedom, the motion along u and v in pixels that the residual asks for, and what any
+    other explanation of the pixels that stand out can gain: χ² beyond n − 3 √(2n), which of the true one is
+    less once in a thousand.
     """
     rows, columns = image_e.shape
-    parts, count = np.empty((8, rows * columns)), 0
+    parts, count, stands_out, chi2 = np.empty((8, rows * columns)), 0, 0, 0.0
     for row in range(1, rows - 1):
         for column in range(1, columns - 1):
             if state[row, column] != SEEN:
@@ -250,14 +252,18 @@ def drawn_out(
             parts[5, count] = weight * (by_uu - by_vv)
             parts[6, count] = weight * 0.25 * (near[2, 2] + near[0, 0] - near[2, 0] - near[0, 2])
             parts[7, count] = weight * (image_e[row, column] - expected_e[row, column])
+            if parts[1, count] > 1.0:
+                stands_out += 1
+                chi2 += parts[7, count] ** 2
             count += 1
+    most_gain = chi2 - stands_out + 3.0 * math.sqrt(2.0 * stands_out)
     shown = np.zeros(7)
     for one in range(7):
         power = 0.0
         for pixel in range(count):
             power += parts[one, pixel] ** 2
         if not power > 0.0:
-            return 0.0, 0.0, 0.0
+            return 0.0, 0.0, 0.0, most_gain
         for other in range(one + 1, 8):
             share = 0.0
             for pixel in range(count):
@@ -276,7 +282,8 @@ def drawn_out(
     # Of m = |m| (cos φ, sin φ): along = |m|² cos 2φ / 48, across = |m|² sin 2φ / 24.
     turn, length2 = 0.5 * math.atan2(24.0 * across, 48.0 * along), math.hypot(48.0 * along, 24.0 * across)
     length = math.sqrt(length2)
-    return shown[5] ** 2 + shown[6] ** 2, length * math.cos(turn), length * math.sin(turn)
+    seen = shown[5] ** 2 + shown[6] ** 2
+    return seen, length * math.cos(turn), length * math.sin(turn), most_gain
 
 
 @compiled

@@ -13,6 +13,9 @@ Array = NDArray[np.float64]
 _LEAST_SHARE, _DOUBTFUL_SHARE = 1e-4, 0.01
 _MOST_COST = 40.0
 
+NOT_WEIGHED_COST = -2.0 * math.log(_LEAST_SHARE)
+"""What costs more than another explanation by so much is not weighed in: −2 ln of its share."""
+
 
 def weighed(solution: Solution, other: Solution) -> Solution:
     """Return a solution, its sigmas wider by what differs in another, weighted by how likely that one is.
