@@ -195,11 +195,17 @@ def motion_cost(motion_px: Array, log_range: Array, covariance_px2: Array, camer
     camera
         The camera, at the frame's exposure.
     """
+    price = motion_price(np.hypot(*motion_px.T), log_range, camera)
+    least = np.log(np.linalg.det(covariance_px2))
+    return float(np.maximum(price, least).sum())
+
+
+def motion_price(length_px: Array, log_range: Array, camera: Camera) -> Array:
+    """Return −2 ln (2π p) of motions so far, at such ranges, as for `motion_cost`; shape (flares,)."""
     calibration = camera.calibration
     turn_rad_per_s = np.hypot(TURN_RAD_PER_S, SPEED_M_PER_S * np.exp(-log_range))
     focal_px = math.sqrt(calibration.fx_px * calibration.fy_px)
     sigma2_px2 = (focal_px * camera.exposure_s * turn_rad_per_s) ** 2
-    usual = np.exp(-0.5 * (motion_px**2).sum(axis=1) / sigma2_px2) / (math.pi * sigma2_px2)
+    usual = np.exp(-0.5 * length_px**2 / sigma2_px2) / (math.pi * sigma2_px2)
     prior = (1.0 - _OTHERWISE) * usual + _OTHERWISE / (0.5 * math.pi * MOST_MOTION_PX**2)
-    least = np.log(np.linalg.det(covariance_px2))
-    return float(np.maximum(-2.0 * np.log(2.0 * math.pi * prior), least).sum())
+    return np.asarray(-2.0 * np.log(2.0 * math.pi * prior))

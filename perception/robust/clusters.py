@@ -98,11 +98,17 @@ def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate
     if not blobs:
         return []
     frame, calibration = prepared.frame, prepared.calibration
-    light = []
-    for blob in blobs:
-        places, width = blob.places(prepared.shape[1]), prepared.shape[1]
-        excess_e, counts_dn = excess_at(prepared.pixels, places), prepared.pixels.data_dn.ravel()[places]
-        light.append(light_of(excess_e, counts_dn, places, prepared.bad_at, width, prepared.clipped_dn))
+    width = prepared.shape[1]
+    of_blobs = [blob.places(width) for blob in blobs]
+    places, ends = np.concatenate(of_blobs), np.cumsum([len(each) for each in of_blobs]).tolist()
+    excess_e, counts_dn = excess_at(prepared.pixels, places), prepared.pixels.data_dn.ravel()[places]
+    light = [
+        light_of(
+            excess_e[first:end], counts_dn[first:end], places[first:end],
+            prepared.bad_at, width, prepared.clipped_dn,
+        )
+        for first, end in zip([0, *ends], ends, strict=False)
+    ]  # fmt: skip
     u_px, v_px, flux_e = np.array([each[:3] for each in light]).T
     direction = direction_camera(np.column_stack([u_px, v_px]), calibration)
     exposed_s = exposure_towards(direction, frame.exposure_s, frame.gain, calibration)
@@ -169,8 +175,10 @@ def clusters(members: Sequence[Candidate], prepared: PreparedFrame, apart: bool 
     blobs = [member.blob for member in members]
     chosen: list[tuple[list[int], list[int]]] = []
     for group in [[k] for k in range(len(blobs))] if apart else near_groups(blobs, NEAR_PX):
-        fits = _window_box([members[k] for k in group], prepared).height <= _SIDES_PX[-1]
-        if len(group) == 1 or (len(group) <= MOST_BLOBS and fits):
+        if len(group) == 1 or (
+            len(group) <= MOST_BLOBS
+            and _window_box([members[k] for k in group], prepared).height <= _SIDES_PX[-1]
+        ):
             chosen.append((group, list(range(len(group)))))
             continue
         places = np.array([(members[k].u_px, members[k].v_px) for k in group])
@@ -181,9 +189,17 @@ def clusters(members: Sequence[Candidate], prepared: PreparedFrame, apart: bool 
             within = [int(k) for k in nearest if apart_px[k] < 0.5 * box.height]
             chosen.append(([group[k] for k in within], [within.index(at)]))
     owner = np.full(len(prepared.lit_at), -1)
-    for index, blob in enumerate(blobs):
-        owner[np.searchsorted(prepared.lit_at, blob.places(prepared.calibration.width_px))] = index
-    return [_cluster([members[k] for k in group], group, wanted, owner, prepared) for group, wanted in chosen]
+    if blobs:
+        of_blobs = [blob.places(prepared.calibration.width_px) for blob in blobs]
+        of = np.repeat(np.arange(len(blobs)), [len(each) for each in of_blobs])
+        owner[np.searchsorted(prepared.lit_at, np.concatenate(of_blobs))] = of
+    grounds_e = prepared.backgrounds_e(
+        (members[group[0]].u_px, members[group[0]].v_px) for group, _ in chosen
+    )
+    return [
+        _cluster([members[k] for k in group], group, wanted, owner, ground_e, prepared)
+        for (group, wanted), ground_e in zip(chosen, grounds_e, strict=True)
+    ]
 
 
 def _cluster(
@@ -191,6 +207,7 @@ def _cluster(
     indices: Sequence[int],
     wanted: Sequence[int],
     owner: NDArray[np.int64],
+    background_e: float,
     prepared: PreparedFrame,
 ) -> Cluster:
     frame, calibration = prepared.frame, prepared.calibration
@@ -202,8 +219,7 @@ def _cluster(
         box.corner_and_size, np.array(indices), prepared.clipped_dn,
         _TOUCHING_PX, _KEPT_PX,
     )  # fmt: skip
-    u_px, v_px = members[0].u_px, members[0].v_px
-    structure, sigma_e = prepared.structure_at(u_px, v_px, box.height)
+    structure, sigma_e = prepared.structure_at(members[0].u_px, members[0].v_px, box.height)
     window = Window(
         box=box,
         image_e=image_e,
@@ -214,7 +230,7 @@ def _cluster(
         structure=structure,
         structure_e=sigma_e,
     )
-    return Cluster(members, wanted, window, prepared.background_e(u_px, v_px))
+    return Cluster(members, wanted, window, background_e)
 
 
 def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:

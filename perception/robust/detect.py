@@ -72,12 +72,16 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     check_frame(frame, calibration)
     in_fog = may_be_in_fog(calibration)
     prepared = prepare(frame, loosened(calibration) if in_fog else calibration)
+    found = blobs_at(prepared.lit_at, prepared.lit_e, calibration.width_px)
+    middles_e = _middles_e(found, prepared)
     blobs = [
         blob
-        for component in blobs_at(prepared.lit_at, prepared.lit_e, calibration.width_px)
-        for blob in _split(component, prepared)
+        for component, middle_e in zip(found, middles_e, strict=True)
+        for blob in _split(component, middle_e, prepared)
     ]
-    blobs = _above_surroundings(blobs, prepared)
+    if len(blobs) != len(found):
+        middles_e = _middles_e(blobs, prepared)
+    blobs = _above_surroundings(blobs, middles_e, prepared)
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
     groups = clusters(brightest(flares, MOST_FLARES), prepared)
     measured, late = _measured(groups, prepared, started + limit_s)
@@ -155,7 +159,9 @@ def _in_fog(
         )
 
 
-def _above_surroundings(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Blob]:
+def _above_surroundings(
+    blobs: Sequence[Blob], middles_e: Sequence[float], prepared: PreparedFrame
+) -> list[Blob]:
     """Return the blobs whose peak exceeds the level of a ring around them by more than noise does.
 
     The sheen of a lamp on metal, or a wall's lit corner, bends within a cell of the background mesh; on the
@@ -165,8 +171,8 @@ def _above_surroundings(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[
 
     Parameters
     ----------
-    blobs
-        What exceeds the detection limit.
+    blobs, middles_e
+        What exceeds the detection limit, and the background in the middle of each.
     prepared
         The frame it was found in.
     """
@@ -176,25 +182,23 @@ def _above_surroundings(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[
         prepared.pixels, prepared.kernel, prepared.bad_at, boxes, gap_px, _RING_PX
     )
     kept = []
-    for blob, level_e, count in zip(blobs, levels_e.tolist(), counts.tolist(), strict=True):
-        middle_e = _middle_e(blob, prepared)
+    rows = zip(blobs, middles_e, levels_e.tolist(), counts.tolist(), strict=True)
+    for blob, middle_e, level_e, count in rows:
         noise_e = prepared.filtered_noise * math.sqrt(max(level_e + middle_e, 0.0) + prepared.floor_e2)
         if count < _FEWEST_RING_PIXELS or blob.peak_e - level_e > CONTRAST_SIGMAS * noise_e:
             kept.append(blob)
     return kept
 
 
-def _middle_e(blob: Blob, prepared: PreparedFrame) -> float:
-    """Return the background in the middle of a blob's box."""
-    box = blob.box
-    return prepared.background_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
+def _middles_e(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[float]:
+    """Return the background in the middle of each blob's box."""
+    boxes = [blob.box for blob in blobs]
+    return prepared.backgrounds_e((b.left + 0.5 * b.width, b.top + 0.5 * b.height) for b in boxes)
 
 
-def _split(component: Blob, prepared: PreparedFrame) -> list[Blob]:
-    """Divide a component at maxima that differ by more than their noise."""
-    expected_e = np.maximum(
-        component.filtered_e + np.float32(_middle_e(component, prepared)), np.float32(0.0)
-    )
+def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Blob]:
+    """Divide a component, on such a background, at maxima that differ by more than their noise."""
+    expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
     return split_at_peaks(component, noise_e)
 

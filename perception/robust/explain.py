@@ -13,7 +13,13 @@ from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving
 from perception.robust.overlap.cut import cut_discs
-from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, deblend, of_free_width
+from perception.robust.overlap.deblend import (
+    LEAST_GAIN,
+    RESIDUAL_SIGMAS,
+    asks_for_more,
+    deblend,
+    of_free_width,
+)
 from perception.robust.overlap.eclipse import eclipses
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
@@ -66,8 +72,11 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     plain: list[Solution | None] = [None] * len(found)
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
-        parted = _parted(plain, prepared.shape, camera, cut_short)
         may_be = [one is None or may_be_other_shape(one, camera) for one in plain]
+        several = [
+            one if other or _leaves_a_peak(one) else None for one, other in zip(plain, may_be, strict=True)
+        ]
+        parted = _parted(several, prepared.shape, camera, cut_short)
         pairs, rivals = eclipses(found, plain, parted, may_be, camera)
         _take_up(pairs, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
@@ -186,6 +195,11 @@ def _drop_beside_lines(
     for index, several in _parted(poor, shape, camera, cut_short).items():
         if index not in parted or several.cost < parted[index].cost:
             parted[index] = several
+
+
+def _leaves_a_peak(one: Solution | None) -> bool:
+    """Tell whether a fit leaves over what may be another flare beside it."""
+    return one is not None and one.left_over.peak_sigmas > RESIDUAL_SIGMAS
 
 
 def _parted(

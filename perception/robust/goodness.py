@@ -127,7 +127,7 @@ def residual_e(image_e: Array, state: NDArray[np.uint8], expected_e: Array) -> A
 
 
 @compiled
-def _noise_e2(expected_e: float, floor_e2: float, prnu: float) -> float:
+def noise_e2(expected_e: float, floor_e2: float, prnu: float) -> float:
     """Return a pixel's variance, as `sensor.pixel_variance_e2`."""
     lit = max(expected_e, 0.0)
     return lit + (prnu * lit) ** 2 + floor_e2
@@ -146,7 +146,7 @@ def _reckoned(
     for row in range(rows):
         for column in range(columns):
             flare, left = flares_e[row, column], residual[row, column]
-            noise[row, column] = _noise_e2(expected_e[row, column], floor_e2, prnu)
+            noise[row, column] = noise_e2(expected_e[row, column], floor_e2, prnu)
             variance = noise[row, column] + (MODEL_ERROR * flare) ** 2
             if flare > REACHED_SIGMAS * math.sqrt(noise[row, column]):
                 for down in range(-DISC_PX, DISC_PX + 1):
@@ -221,7 +221,7 @@ def _matched_peak(weighted: Array, weight: Array, smooth_px: float) -> tuple[flo
 @compiled
 def drawn_out(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float, prnu: float
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, float]:
     """Tell by how much longer than wide an image is than its fit, as one does that moves while exposed.
 
     A motion m adds to a flare's light F S the part ∂ᵢ∂ⱼ(F S) mᵢ mⱼ / 24, to first order, of which what is the
@@ -230,15 +230,17 @@ def drawn_out(
 
     Returns
     -------
-    χ² of two degrees of freedom, and the motion along u and v in pixels that the residual asks for.
+    χ² of two degrees of freedom, the motion along u and v in pixels that the residual asks for, and what any
+    other explanation of the pixels that stand out can gain: χ² beyond n − 3 √(2n), which of the true one is
+    less once in a thousand.
     """
     rows, columns = image_e.shape
-    parts, count = np.empty((8, rows * columns)), 0
+    parts, count, stands_out, chi2 = np.empty((8, rows * columns)), 0, 0, 0.0
     for row in range(1, rows - 1):
         for column in range(1, columns - 1):
             if state[row, column] != SEEN:
                 continue
-            weight = 1.0 / math.sqrt(_noise_e2(expected_e[row, column], floor_e2, prnu))
+            weight = 1.0 / math.sqrt(noise_e2(expected_e[row, column], floor_e2, prnu))
             near = flares_e[row - 1 : row + 2, column - 1 : column + 2]
             by_uu = near[1, 2] - 2.0 * near[1, 1] + near[1, 0]
             by_vv = near[2, 1] - 2.0 * near[1, 1] + near[0, 1]
@@ -250,14 +252,18 @@ def drawn_out(
             parts[5, count] = weight * (by_uu - by_vv)
             parts[6, count] = weight * 0.25 * (near[2, 2] + near[0, 0] - near[2, 0] - near[0, 2])
             parts[7, count] = weight * (image_e[row, column] - expected_e[row, column])
+            if parts[1, count] > 1.0:
+                stands_out += 1
+                chi2 += parts[7, count] ** 2
             count += 1
+    most_gain = chi2 - stands_out + 3.0 * math.sqrt(2.0 * stands_out)
     shown = np.zeros(7)
     for one in range(7):
         power = 0.0
         for pixel in range(count):
             power += parts[one, pixel] ** 2
         if not power > 0.0:
-            return 0.0, 0.0, 0.0
+            return 0.0, 0.0, 0.0, most_gain
         for other in range(one + 1, 8):
             share = 0.0
             for pixel in range(count):
@@ -276,7 +282,8 @@ def drawn_out(
     # Of m = |m| (cos φ, sin φ): along = |m|² cos 2φ / 48, across = |m|² sin 2φ / 24.
     turn, length2 = 0.5 * math.atan2(24.0 * across, 48.0 * along), math.hypot(48.0 * along, 24.0 * across)
     length = math.sqrt(length2)
-    return shown[5] ** 2 + shown[6] ** 2, length * math.cos(turn), length * math.sin(turn)
+    seen = shown[5] ** 2 + shown[6] ** 2
+    return seen, length * math.cos(turn), length * math.sin(turn), most_gain
 
 
 @compiled
@@ -296,7 +303,7 @@ def halo_sigmas(
             for column in range(image_e.shape[1]):
                 if state[row, column] != SEEN:
                     continue
-                variance = _noise_e2(expected_e[row, column], floor_e2, prnu)
+                variance = noise_e2(expected_e[row, column], floor_e2, prnu)
                 spread = 1.0 + ((column - place[0]) ** 2 + (row - place[1]) ** 2) / width**2
                 profile = 1.0 / (spread * math.sqrt(spread))
                 score += profile * (image_e[row, column] - expected_e[row, column]) / variance

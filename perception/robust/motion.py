@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.window import MOST_MOTION_PX, Camera
+from perception.model.window import MOST_MOTION_PX, Camera, motion_price
 from perception.robust.goodness import drawn_out
 from perception.robust.overlap.deblend import asks_for_more
-from perception.robust.overlap.rivals import weighed
+from perception.robust.overlap.rivals import NO_RIVAL, weighed
 from perception.robust.problem import Motion, Problem
 from perception.robust.solve import Solution, solve
 
@@ -42,9 +42,11 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
         if solution is None or solution.count > MOST_TOGETHER:
             continue
         if solution.count == 1:
-            motions = [_seen(solution, solution.window.box)]
+            motions = [_seen(solution, solution.window.box, camera, 0)]
         elif asks_for_more(solution):
-            motions = [_seen(solution, _around(solution, flare)) for flare in range(solution.count)]
+            motions = [
+                _seen(solution, _around(solution, flare), camera, flare) for flare in range(solution.count)
+            ]
         else:
             continue
         if any(motion != AT_REST for motion in motions):
@@ -58,11 +60,14 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
     }
 
 
-def _seen(solution: Solution, box: PixelBox) -> Motion:
-    """Return the motion that the residual in a part of a window asks for, if it does."""
+def _seen(solution: Solution, box: PixelBox, camera: Camera, flare: int) -> Motion:
+    """Return the motion of a flare that the residual in a part of a window asks for, if it does.
+
+    A motion that costs more than it may gain there, by so much that it would not be weighed in, is none.
+    """
     window = solution.window
     part = box.seen_from(window.box).slices
-    chi2, along_u, along_v = drawn_out(
+    chi2, along_u, along_v, most_gain = drawn_out(
         np.ascontiguousarray(window.image_e[part]),
         np.ascontiguousarray(window.state[part]),
         np.ascontiguousarray(solution.expected_e[part]),
@@ -72,6 +77,10 @@ def _seen(solution: Solution, box: PixelBox) -> Motion:
     )
     length_px = math.hypot(along_u, along_v)
     if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
+        return AT_REST
+    # To first order a residual may ask for a motion that is too long, and longer ones cost more.
+    price = motion_price(np.array([0.5 * length_px]), solution.log_range[flare : flare + 1], camera)
+    if solution.count == 1 and most_gain < float(price[0]) - NO_RIVAL:
         return AT_REST
     shorter = min(1.0, 0.5 * MOST_MOTION_PX / length_px)
     return shorter * along_u, shorter * along_v

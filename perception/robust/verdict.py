@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.bearing import pixel_turn
-from perception.model.layout import UNUSABLE
+from perception.model.layout import CLIPPED, UNUSABLE
 from perception.robust.clusters import Candidate
-from perception.robust.goodness import MODEL_ERROR
+from perception.robust.goodness import MODEL_ERROR, noise_e2
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
 
@@ -34,14 +34,14 @@ def is_one_pixel(solution: Solution) -> bool:
     background with one pixel free, and of the flare. (Bright ones `bad_pixels` has found before.)
     """
     window = solution.window
-    chi2 = solution.residual_e**2 / solution.variance_e2(MODEL_ERROR)
-    ground_e = solution.expected_e - solution.flares_e
-    return _is_one_pixel(window.image_e, window.state, solution.flares_e, ground_e, chi2, window.floor_e2)
+    return _is_one_pixel(
+        window.image_e, window.state, solution.expected_e, solution.flares_e, window.floor_e2, window.prnu
+    )
 
 
 @compiled
 def _is_one_pixel(
-    image_e: Array, state: NDArray[np.uint8], flares_e: Array, ground_e: Array, chi2: Array, floor_e2: float
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float, prnu: float
 ) -> bool:
     """Compare a flare's χ² with that of the ground alone but for the brightest pixel."""
     rows, columns = image_e.shape
@@ -57,10 +57,13 @@ def _is_one_pixel(
         for column in range(max(0, at - REACH_PX), min(columns, at + REACH_PX + 1)):
             if state[row, column] == UNUSABLE:
                 continue
-            ground = ground_e[row, column]
+            expected, flare = expected_e[row, column], flares_e[row, column]
+            ground = expected - flare
             if row != at_row or column != at:
                 of_pixel += (image_e[row, column] - ground) ** 2 / (max(ground, 0.0) + floor_e2)
-            of_flare += chi2[row, column]
+            left = image_e[row, column] - expected
+            if not (state[row, column] == CLIPPED and left < 0.0):  # clipped, as is expected
+                of_flare += left**2 / (noise_e2(expected, floor_e2, prnu) + (MODEL_ERROR * flare) ** 2)
     return of_pixel < of_flare
 
 
@@ -77,39 +80,42 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
     one that is its brightest pixel: an edge may hide its middle. `shape` is the frame's: what a window shows
     beyond it does not count.
     """
-    window = solution.window
-    seen = window.box.inside(shape)
-    part = seen.seen_from(window.box).slices
-    reach_px = float(solution.image_radius_px[index])
-    inner_px = reach_px + 2.0 * solution.psf_sigma_px + 1.0
-    place = float(solution.u_px[index]) - seen.left, float(solution.v_px[index]) - seen.top
-    flares_e = np.ascontiguousarray(solution.flares_e[part])
-    row, column = (
-        min(max(round(at), 0), most - 1) for at, most in zip(place[::-1], flares_e.shape, strict=True)
-    )
+    window, place = solution.window, (float(solution.u_px[index]), float(solution.v_px[index]))
+    inner_px = float(solution.image_radius_px[index]) + 2.0 * solution.psf_sigma_px + 1.0
     share = _share_above(
-        np.ascontiguousarray(window.image_e[part]),
-        flares_e,
+        window.image_e,
+        solution.flares_e,
         solution.background_e,
-        float(flares_e.max() if solution.count == 1 else flares_e[row, column]),
+        (window.box.top, window.box.left),
+        shape,
         place,
-        inner_px,
-        inner_px + _FLANK_PX,
+        (inner_px, inner_px + _FLANK_PX),
+        solution.count == 1,
     )
     return share > _FLANK_SHARE
 
 
 @compiled
 def _share_above(
-    image_e: Array, flares_e: Array, background_e: float, peak_e: float, place: tuple[float, float],
-    inner_px: float, outer_px: float,
+    image_e: Array, flares_e: Array, background_e: float, corner: tuple[int, int], shape: tuple[int, int],
+    place: tuple[float, float], ring_px: tuple[float, float], is_lone: bool,
 ) -> float:  # fmt: skip
-    """Return the share of a ring where what is no flare exceeds half of a flare's peak."""
-    rows, columns = image_e.shape
+    """Return the share of a ring where what is no flare exceeds half of a flare's peak.
+
+    Of a window whose first pixel has that row and column of the frame; `place` is (u, v) in the frame.
+    """
+    top, left = max(-corner[0], 0), max(-corner[1], 0)
+    bottom = min(image_e.shape[0], shape[0] - corner[0])
+    right = min(image_e.shape[1], shape[1] - corner[1])
+    u, v = place[0] - corner[1], place[1] - corner[0]
+    if is_lone:
+        peak_e = flares_e[top:bottom, left:right].max()
+    else:
+        peak_e = flares_e[min(max(round(v), top), bottom - 1), min(max(round(u), left), right - 1)]
     half_peak, count, above = 0.5 * peak_e, 0, 0
-    for row in range(rows):
-        for column in range(columns):
-            if inner_px <= math.hypot(column - place[0], row - place[1]) <= outer_px:
+    for row in range(top, bottom):
+        for column in range(left, right):
+            if ring_px[0] <= math.hypot(column - u, row - v) <= ring_px[1]:
                 count += 1
                 above += image_e[row, column] - flares_e[row, column] - background_e > half_peak
     return above / max(count, 1)
@@ -142,13 +148,16 @@ def _seen(
     reach, seen, whole = math.ceil(3.0 * width_px), 0.0, 0.0
     off_u, off_v, whole_u, whole_v = 0.0, 0.0, 0.0, 0.0
     middle_row, middle = round(place[1]), round(place[0])
+    left_out = np.zeros(state.shape[1], dtype=np.bool_)  # columns, as a whole
+    for at in range(max(middle - reach - corner[1], 0), min(middle + reach + 1 - corner[1], state.shape[1])):
+        left_out[at] = not (state[:, at] != UNUSABLE).any()
     for row in range(max(middle_row - reach, 0), min(middle_row + reach + 1, shape[0])):
         for column in range(max(middle - reach, 0), min(middle + reach + 1, shape[1])):
             u, v = column - place[0], row - place[1]
             light = math.exp(-0.5 * (u**2 + v**2) / width_px**2)
             here, at = row - corner[1], column - corner[0]
             inside = 0 <= here < state.shape[0] and 0 <= at < state.shape[1]
-            if inside and not (state[:, at] != UNUSABLE).any():
+            if inside and left_out[at]:
                 continue
             whole += light
             whole_u += light * u

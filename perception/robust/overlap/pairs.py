@@ -39,7 +39,7 @@ def knows_layouts(camera: Camera) -> bool:
 def longer_chi2(one: Solution) -> float:
     """Return by how much an image is longer than wide than its fit, χ² of two degrees of freedom."""
     window = one.window
-    chi2, _, _ = drawn_out(
+    chi2, _, _, _ = drawn_out(
         window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu
     )
     return chi2

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE
+from perception.robust.search.frame import Pixels, ground_at
 
 Float32 = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -12,6 +13,15 @@ Places = NDArray[np.int64]
 
 OWN, OTHERS, STRAY = 1, 2, 3
 """Whose the light of a lit pixel is: that of a window's flares, of others, or of what is no flare."""
+
+
+@compiled
+def grounds_at(pixels: Pixels, rows: Places, columns: Places) -> Array:
+    """Return the background of some pixels."""
+    ground = np.empty(len(rows))
+    for index in range(len(rows)):
+        ground[index] = ground_at(pixels, rows[index], columns[index])
+    return ground
 
 
 @compiled

@@ -1,6 +1,7 @@
 """From a raw frame to what the robust detector looks at: background, filtered image, bad and lit pixels."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +19,7 @@ from perception.robust.search.background import (
     scatter_ratio,
     spread_mesh,
 )
+from perception.robust.search.cutout import grounds_at
 from perception.robust.search.frame import (
     Pixels,
     above,
@@ -109,6 +111,12 @@ class PreparedFrame:
     def background_e(self, u_px: float, v_px: float) -> float:
         """Return the background at the pixel nearest to a place."""
         return ground_at(self.pixels, *self._nearest(u_px, v_px))
+
+    def backgrounds_e(self, places_px: Iterable[tuple[float, float]]) -> list[float]:
+        """Return the background at the pixel nearest to each of some places (u, v)."""
+        nearest = [self._nearest(u_px, v_px) for u_px, v_px in places_px]
+        rows, columns = np.array(nearest, dtype=np.int64).reshape(-1, 2).T.copy()
+        return [float(each) for each in grounds_at(self.pixels, rows, columns)]
 
     def structure_at(self, u_px: float, v_px: float, side_px: int) -> tuple[Structure | None, float]:
         """Return what may lie on the background of a window around a place, and its standard deviation."""

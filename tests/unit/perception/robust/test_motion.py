@@ -89,10 +89,28 @@ def test_what_a_residual_asks_for_is_the_motion() -> None:
     way_px = (0.5 * math.cos(math.pi / 6.0), 0.5 * math.sin(math.pi / 6.0))
     moved_e, still_e = (drawn_out_e(CAMERA, *AT_PX, 3.0, way)[2] for way in (way_px, (0.0, 0.0)))
     state = np.ones(moved_e.shape, dtype=np.uint8)
-    chi2, along_u, along_v = drawn_out(moved_e + 5.0, state, still_e + 5.0, still_e, 100.0, 0.0)
+    chi2, along_u, along_v, _ = drawn_out(moved_e + 5.0, state, still_e + 5.0, still_e, 100.0, 0.0)
     assert math.degrees(math.atan2(along_v, along_u)) == pytest.approx(30.0, abs=2.0)
     assert math.hypot(along_u, along_v) == pytest.approx(0.5, rel=0.14)
     assert chi2 > 0.0
+
+
+def test_no_explanation_gains_more_than_a_residual_has_to_give() -> None:
+    """The truth's χ² is n ± √(2n) over the pixels that stand out: 3 √(2n) above it, 400 draws."""
+    moved_e, still_e = (drawn_out_e(CAMERA, *AT_PX, 3.0, way)[2] for way in ((1.2, 0.5), (0.0, 0.0)))
+    state, number, over = np.ones(moved_e.shape, dtype=np.uint8), random(23), []
+    stands_out = still_e[1:-1, 1:-1] > np.sqrt(still_e[1:-1, 1:-1] + 105.0)
+    count = int(stands_out.sum())
+    for _ in range(400):
+        image_e = number.normal(moved_e + 5.0, np.sqrt(still_e + 105.0))
+        left2 = [
+            ((image_e - 5.0 - each_e) ** 2 / (still_e + 105.0))[1:-1, 1:-1] for each_e in (still_e, moved_e)
+        ]
+        most_gain = drawn_out(image_e, state, still_e + 5.0, still_e, 100.0, 0.0)[3]
+        over.append(most_gain - float((left2[0] - left2[1])[stands_out].sum()))
+    spread = math.sqrt(2.0 * count)
+    assert np.mean(over) == pytest.approx(3.0 * spread, abs=4.0 * spread / math.sqrt(400.0))
+    assert np.std(over) == pytest.approx(spread, rel=0.2)
 
 
 def test_motions_cost_what_their_prior_says() -> None:
