@@ -84,7 +84,9 @@ def experiment(
     ] = Law.ROBUST,
     seeds: Annotated[
         int | None,
-        typer.Option("--seeds", min=1, help="How many runs, by seeds from 0 on: 20, of swarm 1 each, of limits 1 to 5."),
+        typer.Option(
+            "--seeds", min=1, help="How many runs, by seeds from 0 on: 20, of swarm 1 each, of limits 1 to 5."
+        ),
     ] = None,
     seconds: Annotated[
         float | None,
@@ -135,7 +137,7 @@ def experiment(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run an experiment of the paper: ranges, a source that turns, robots that move by what they see, limits."""
+    """Run an experiment: ranges, a source that turns, robots that move by what they see; limits of it all."""
     from nir_render.command.terminal.console import print_json
     from nir_render.experiments.communication.loop import Communication
     from nir_render.experiments.flocking.loop import Flocking
@@ -152,7 +154,9 @@ def experiment(
     folder = output if output is not None else Path("outputs") / name.value
     if name is Experiment.LIMITS:
         if scene is not None or settings:
-            raise InputError("--scene, --set: limits have scenes of their own; nir-render stress sweeps others")
+            raise InputError(
+                "--scene, --set: limits have scenes of their own; nir-render stress sweeps others"
+            )
         _limits(only, seeds, folder, workers, as_json)
         return
     by = level or (Level.FRAMES if name is Experiment.SWARM else Level.MEASUREMENTS)

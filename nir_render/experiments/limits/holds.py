@@ -51,14 +51,16 @@ class Hold:
             "limit_68": interval,
             "between": None if edge is None else _neighbours(threat, edge),
             "breaks": [bound.metric for bound in self.breaks],
-            "harmless": {name: value if math.isfinite(value) else None for name, value in self.values.items()},
+            "harmless": {
+                name: value if math.isfinite(value) else None for name, value in self.values.items()
+            },
         }
 
 
 def with_limit(sums: JobSums) -> JobSums:
     """Return sums in which the Cramér–Rao bound of the same sources is an estimator too.
 
-    It is that of the sources which the last estimator has ranged; figures without such a bound it has none of.
+    It is that of the sources which the last estimator has ranged; of other figures it has none.
     """
     name = sums.estimators[-1]
     limits = {}
@@ -108,8 +110,8 @@ def hold_text(threat: Axis, hold: Hold, *, worst_is_high: bool) -> str:
     if hold.edge is None:
         harmless = threat.labels[0 if worst_is_high else -1]
         said = ", ".join(
-            f"{METRICS[bound.metric].title} {metric_text(bound.metric, hold.values[bound.metric], bound.value)}"
-            for bound in hold.breaks
+            f"{METRICS[one.metric].title} {metric_text(one.metric, hold.values[one.metric], one.value)}"
+            for one in hold.breaks
         )
         return f"not even at {harmless}: {said}"
     way = "up to" if worst_is_high else "down to"
@@ -124,9 +126,7 @@ def order_of(hold: Hold, *, worst_is_high: bool) -> float:
     return hold.edge.value if worst_is_high else -hold.edge.value
 
 
-def _hold(
-    threat: Axis, reaches: Sequence[Reach], name: str, lever: int, *, worst_is_high: bool
-) -> Hold:
+def _hold(threat: Axis, reaches: Sequence[Reach], name: str, lever: int, *, worst_is_high: bool) -> Hold:
     harmless = 0 if worst_is_high else len(threat.labels) - 1
     judged = [reach for reach in reaches if any(point.asked for point in reach.points)]
     values = {reach.bound.metric: reach.points[harmless].value for reach in judged}

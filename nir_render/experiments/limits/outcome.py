@@ -3,20 +3,26 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
+import numpy as np
 
 from nir_render.experiments.limits.holds import Hold, holds_of, with_limit
-from nir_render.experiments.limits.studies import Study, crossings_of, study_campaign
+from nir_render.experiments.limits.studies import (
+    Study,
+    as_built,
+    levers_of,
+    points_of_study,
+    study_campaign,
+)
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.design.axes import Axis
-from nir_render.stress.jobs import Job, plan
+from nir_render.stress.jobs import plan
 from nir_render.stress.metrics import METRICS
 from nir_render.stress.sums import COUNT, TOTAL, JobSums, job_sums, pooled
-from nir_render.stress.sweep import Progress, Sweep, sweep, write_report
+from nir_render.stress.sweep import Progress, sweep
 
 LIGHT = "light"
 """Where all campaigns of an experiment keep their light, in its folder."""
@@ -28,54 +34,60 @@ Bar = Callable[[str], AbstractContextManager[Progress]]
 class Crossing:
     """A threat crossed with one lever.
 
-    `sums` has the Cramér–Rao bound among its estimators; `report` is the campaign's own page; `failed` how
-    many of its jobs are missing.
+    `axes` are the threat, the lever, and what is repeated; `built` is which of the lever's values robots have
+    as they are built. `sums` has the Cramér–Rao bound among its estimators.
     """
 
-    campaign: Campaign
+    axes: tuple[Axis, ...]
+    built: int
     sums: JobSums
     holds: tuple[Hold, ...]
-    report: Path
-    jobs: int
-    failed: int
-    warnings: tuple[str, ...]
 
     @property
     def threat(self) -> Axis:
         """The axis of the threat."""
-        return self.campaign.axes[0]
+        return self.axes[0]
 
     @property
     def lever(self) -> Axis:
         """The axis of the lever."""
-        return self.campaign.axes[1]
+        return self.axes[1]
 
     def of(self, estimator: str) -> tuple[Hold, ...]:
         """Return how far one estimator goes, by the lever's values."""
         return tuple(hold for hold in self.holds if hold.estimator == estimator)
 
-    def record(self) -> dict[str, Any]:
+    def record(self, metrics: Sequence[str]) -> dict[str, Any]:
         """Return it as plain data: how far bounds hold, and each figure by threat (rows) and lever."""
         return {
             "threat": list(self.threat.labels),
             "lever": list(self.lever.labels),
-            "jobs": self.jobs,
-            "failed": self.failed,
+            "as_built": self.lever.labels[self.built],
             "holds": [hold.record(self.threat, self.lever) for hold in self.holds],
             "maps": {
-                metric: {name: _cells(self.campaign, self.sums, name, metric) for name in self.sums.estimators}
-                for metric in self.campaign.metrics
+                metric: {name: self._cells(name, metric) for name in self.sums.estimators}
+                for metric in metrics
             },
         }
+
+    def _cells(self, name: str, metric: str) -> list[list[float | None]]:
+        rows, columns = (len(axis.labels) for axis in self.axes[:2])
+        index = self.sums.place[:, 0] * columns + self.sums.place[:, 1]
+        cells = pooled(self.sums.by_metric[name, metric], index, rows * columns)
+        values = METRICS[metric].value(cells[TOTAL], cells[COUNT]).reshape(rows, columns)
+        return [[float(value) if math.isfinite(value) else None for value in row] for row in values]
 
 
 @dataclass(frozen=True, eq=False)
 class StudyOutcome:
-    """What came of one study: its document, and a crossing for each lever."""
+    """What came of one study: its document, and a crossing for each lever; `failed` is how many jobs did."""
 
     study: Study
     campaign: Campaign
     crossings: Mapping[str, Crossing]
+    jobs: int
+    failed: int
+    warnings: tuple[str, ...] = ()
 
     def record(self) -> dict[str, Any]:
         """Return it as plain data."""
@@ -83,8 +95,11 @@ class StudyOutcome:
             "threat": self.study.threat,
             "ability": self.study.ability,
             "description": self.campaign.description,
+            "jobs": self.jobs,
+            "failed": self.failed,
+            "seeds": len(self.campaign.seeds),
             "bounds": {bound.metric: bound.value for bound in self.campaign.bounds},
-            "crossings": {name: one.record() for name, one in self.crossings.items()},
+            "crossings": {name: one.record(self.campaign.metrics) for name, one in self.crossings.items()},
         }
 
 
@@ -97,14 +112,13 @@ class Outcome:
     @property
     def failed(self) -> int:
         """How many jobs are missing."""
-        return sum(one.failed for of in self.studies for one in of.crossings.values())
+        return sum(of.failed for of in self.studies)
 
     def record(self) -> dict[str, Any]:
         """Return it as plain data."""
         return {
             "format": 1,
             "experiment": "limits",
-            "failed": self.failed,
             "studies": {of.study.name: of.record() for of in self.studies},
         }
 
@@ -112,7 +126,7 @@ class Outcome:
 def outcome_of(
     studies: Sequence[Study], seeds: int | None, folder: Path, workers: int | None, bar: Bar
 ) -> Outcome:
-    """Do what is missing of some studies, and judge them; each crossing is a campaign in `folder/STUDY/LEVER`.
+    """Do what is missing of some studies, and judge them; each is a campaign in `folder/STUDY`.
 
     Parameters
     ----------
@@ -126,59 +140,38 @@ def outcome_of(
     InputError, StoppedError
         As `sweep`.
     """
-    planned = []
+    found = []
     for study in studies:
         campaign = study_campaign(study, seeds)
-        crossed = crossings_of(campaign, study.repeated)
         with bar("check") as progress:
-            # All are checked before the first begins.
-            jobs = {name: plan(one, progress) for name, one in crossed.items()}
-        planned.append((study, campaign, crossed, jobs))
-    found = []
-    for study, campaign, crossed, jobs in planned:
-        crossings = {}
-        for name, one in crossed.items():
-            with bar(f"{study.name}, {name.replace('_', ' ')}") as progress:
-                crossings[name] = _crossing(study, one, jobs[name], folder, name, workers, progress)
-        found.append(StudyOutcome(study, campaign, crossings))
+            jobs = plan(campaign, progress, points=points_of_study(campaign, study.repeated))
+        with bar(study.name) as progress:
+            done = sweep(
+                campaign,
+                jobs,
+                folder / study.name,
+                workers=workers,
+                progress=progress,
+                light=folder / LIGHT,
+            )
+        crossings = crossings_of(study, campaign, job_sums(campaign.axes, done.table))
+        found.append(StudyOutcome(study, campaign, crossings, len(jobs), len(done.failed), done.warnings))
     return Outcome(tuple(found))
 
 
-def _crossing(
-    study: Study,
-    campaign: Campaign,
-    jobs: Sequence[Job],
-    folder: Path,
-    name: str,
-    workers: int | None,
-    progress: Progress,
-) -> Crossing:
-    done: Sweep = sweep(
-        campaign, jobs, folder / study.name / name, workers=workers, progress=progress, light=folder / LIGHT
-    )
-    return judged(study, campaign, done.table, write_report(done), len(jobs), len(done.failed), done.warnings)
-
-
-def judged(
-    study: Study,
-    campaign: Campaign,
-    table: pa.Table,
-    report: Path,
-    jobs: int,
-    failed: int = 0,
-    warnings: Sequence[str] = (),
-) -> Crossing:
-    """Judge a crossing by its table."""
-    sums = with_limit(job_sums(campaign.axes, table))
-    holds = holds_of(
-        campaign.axes, campaign.bounds, sums, campaign.seeds[0], worst_is_high=study.worst_is_high
-    )
-    return Crossing(campaign, sums, holds, report, jobs, failed, tuple(warnings))
-
-
-def _cells(campaign: Campaign, sums: JobSums, name: str, metric: str) -> list[list[float | None]]:
-    rows, columns = (len(axis.labels) for axis in campaign.axes[:2])
-    index = sums.place[:, 0] * columns + sums.place[:, 1]
-    cells = pooled(sums.by_metric[name, metric], index, rows * columns)
-    values = METRICS[metric].value(cells[TOTAL], cells[COUNT]).reshape(rows, columns)
-    return [[float(value) if math.isfinite(value) else None for value in row] for row in values]
+def crossings_of(study: Study, campaign: Campaign, sums: JobSums) -> dict[str, Crossing]:
+    """Judge a study by the sums of its table, lever by lever: all others as built."""
+    levers = levers_of(campaign, study.repeated)
+    built = {index: as_built(campaign, campaign.axes[index]) for index in levers}
+    known = with_limit(sums)
+    crossings = {}
+    for lever in levers:
+        others = [index for index in levers if index != lever]
+        kept = np.all([known.place[:, index] == built[index] for index in others], axis=0)
+        order = [0, lever, *(index for index in range(1, len(campaign.axes)) if index not in levers)]
+        axes = tuple(campaign.axes[index] for index in order)
+        own = known.subset(np.broadcast_to(kept, len(known.jobs)))
+        own = replace(own, place=own.place[:, order])
+        holds = holds_of(axes, campaign.bounds, own, campaign.seeds[0], worst_is_high=study.worst_is_high)
+        crossings[campaign.axes[lever].name] = Crossing(axes, built[lever], own, holds)
+    return crossings

@@ -1,6 +1,5 @@
 """`index.html` of the limits: for each threat how far it is borne, what would win more, and maps."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 from nir_render.experiments.limits.holds import LIMIT_NAME, hold_text
 from nir_render.experiments.limits.outcome import Crossing, Outcome, StudyOutcome
 from nir_render.experiments.limits.words import (
-    as_built,
     best_levers,
     built_hold,
     estimators_of,
@@ -31,15 +29,16 @@ RULES = {
         "what 68 of 100 repetitions with other seeds, or with other places of the crowd, would give; without "
         "them, the two values between which the limit lies."
     ),
-    LIMIT_NAME: "the Cramér–Rao bound of the same sources, those that the last estimator ranges; it keeps recall.",
+    LIMIT_NAME: "the Cramér–Rao bound of the same sources, of those that the last estimator ranges.",
     "as built": "the value that the paper's rig has, or that the study takes for it.",
     "maps": (
-        "the figure over threat × lever; dark is good. A red corner: beyond the bound. Hatched: nothing counts "
-        "there; “none”: no such figure."
+        "the figure over threat × lever; dark is good. A red corner: beyond the bound. Hatched: nothing "
+        "counts there; “none”: no such figure."
     ),
     "paper": (
-        "the paper's mean grey value over its mask, with the constant that its own regression over 1 to 10 m "
-        "gives without any threat. Where it breaks its bound at the harmless end, it is not the threat that does it."
+        "the paper's mean grey value over its mask, with the constant that its own regression over 1 to 10 "
+        "m gives without any threat. Where it breaks its bound at the harmless end, it is not the threat "
+        "that does it."
     ),
 }
 
@@ -53,7 +52,6 @@ class LeverPart:
     table: Table
     maps: Sequence[Drawing]
     more_maps: Sequence[Drawing]
-    report: str
 
 
 @dataclass(frozen=True)
@@ -69,12 +67,11 @@ class StudyPart:
 
 def write_outcome(outcome: Outcome, folder: Path) -> Path:
     """Write the page and `outcome.json`; return the page's path."""
-    jobs = sum(one.jobs for of in outcome.studies for one in of.crossings.values())
+    jobs = sum(of.jobs for of in outcome.studies)
     warnings = [
-        f"{of.study.name}, {name.replace('_', ' ')}: {line}"
+        f"{of.study.title}: {line}"
         for of in outcome.studies
-        for name, one in of.crossings.items()
-        for line in ((f"{counted(one.failed, 'job')} failed",) if one.failed else ()) + one.warnings
+        for line in (*((f"{counted(of.failed, 'job')} failed",) if of.failed else ()), *of.warnings)
     ]
     names = estimators_of([one for of in outcome.studies for one in of.crossings.values()])
     html = render_page(
@@ -84,7 +81,7 @@ def write_outcome(outcome: Outcome, folder: Path) -> Path:
         names=names,
         warnings=warnings,
         summary=_summary(outcome, names),
-        studies=[_study(of, folder) for of in outcome.studies],
+        studies=[_study(of) for of in outcome.studies],
         rules=RULES,
     )
     return write_ending(folder, html, outcome.record())
@@ -96,9 +93,8 @@ def sentence(outcome: Outcome) -> str:
     for of in outcome.studies:
         said = []
         for name in estimators_of(list(of.crossings.values())):
-            hold = built_hold(of, name)
-            if hold is not None:
-                said.append(f"{name} {hold_text(of.campaign.axes[0], hold, worst_is_high=of.study.worst_is_high)}")
+            held = hold_text(of.campaign.axes[0], built_hold(of, name), worst_is_high=of.study.worst_is_high)
+            said.append(f"{name} {held}")
         lines.append(f"{of.study.title}: {'; '.join(said)}")
     return "\n".join(lines)
 
@@ -111,29 +107,41 @@ def _summary(outcome: Outcome, names: Sequence[str]) -> Table:
             hold = built_hold(of, name)
             cells.append(
                 "–"
-                if hold is None or hold.status == "nothing to judge"
+                if hold.status == "nothing to judge"
                 else hold_text(of.campaign.axes[0], hold, worst_is_high=of.study.worst_is_high)
             )
         wins = best_levers(of, names[-1])
-        rows.append([of.study.title, of.campaign.axes[0].title, *cells, "; ".join(wins) or "nothing that was tried"])
-    headings = ["", "threat", *(f"{name}, as built" for name in names), LIMIT_NAME, f"what wins more for {names[-1]}"]
+        rows.append(
+            [of.study.title, of.campaign.axes[0].title, *cells, "; ".join(wins) or "nothing that was tried"]
+        )
+    headings = [
+        "",
+        "threat",
+        *(f"{name}, as built" for name in names),
+        LIMIT_NAME,
+        f"what wins more for {names[-1]}",
+    ]
     return Table(headings, rows)
 
 
-def _study(of: StudyOutcome, folder: Path) -> StudyPart:
+def _study(of: StudyOutcome) -> StudyPart:
     return StudyPart(
         title=of.study.title,
         description=of.campaign.description,
         bounds=" and ".join(bound_text(bound) for bound in of.campaign.bounds),
         expected=of.study.expected,
-        levers=[_lever(of, crossing, folder) for crossing in of.crossings.values()],
+        levers=[_lever(of, crossing) for crossing in of.crossings.values()],
     )
 
 
-def _lever(of: StudyOutcome, crossing: Crossing, folder: Path) -> LeverPart:
+def _lever(of: StudyOutcome, crossing: Crossing) -> LeverPart:
     names = estimators_of([crossing])
     first, *others = of.campaign.bounds
-    more = [metric for metric in of.campaign.metrics if metric not in {bound.metric for bound in of.campaign.bounds}]
+    more = [
+        metric
+        for metric in of.campaign.metrics
+        if metric not in {bound.metric for bound in of.campaign.bounds}
+    ]
     return LeverPart(
         title=crossing.lever.title,
         verdicts=Table((), [(name, verdict(of, crossing, name)) for name in names]),
@@ -141,7 +149,6 @@ def _lever(of: StudyOutcome, crossing: Crossing, folder: Path) -> LeverPart:
         maps=[_map(crossing, first.metric, first)],
         more_maps=[_map(crossing, bound.metric, bound) for bound in others]
         + [_map(crossing, metric, None) for metric in more],
-        report=os.path.relpath(crossing.report, folder),
     )
 
 
@@ -151,10 +158,9 @@ def _table(of: StudyOutcome, crossing: Crossing) -> Table:
         for name in crossing.sums.estimators
         if any(hold.status != "nothing to judge" for hold in crossing.of(name))
     ]
-    built = as_built(of.campaign, crossing.lever)
     rows = [
         [
-            f"{label} (as built)" if index == built else label,
+            f"{label} (as built)" if index == crossing.built else label,
             *(
                 hold_text(crossing.threat, crossing.of(name)[index], worst_is_high=of.study.worst_is_high)
                 for name in shown
@@ -171,5 +177,5 @@ def _map(crossing: Crossing, metric: str, bound: Bound | None) -> Drawing:
     if known.limit is None or metric == "range_pull":
         names = tuple(estimators_of([crossing]))
         sums = type(sums)(sums.jobs, sums.seeds, sums.place, sums.written, names, sums.by_metric)
-    svg = heat_maps(known, crossing.campaign.axes, [(0, 1)], sums, None if bound is None else bound.value)
+    svg = heat_maps(known, crossing.axes, [(0, 1)], sums, None if bound is None else bound.value)
     return Drawing(svg, f"{known.title} over {crossing.threat.title} and {crossing.lever.title}")

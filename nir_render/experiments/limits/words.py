@@ -5,35 +5,21 @@ from collections.abc import Sequence
 
 from nir_render.experiments.limits.holds import LIMIT_NAME, Hold, hold_text, order_of
 from nir_render.experiments.limits.outcome import Crossing, StudyOutcome
-from nir_render.stress.campaign import Campaign
-from nir_render.stress.design.axes import Axis
 
 
-def as_built(campaign: Campaign, lever: Axis) -> int | None:
-    """Return which of a lever's values the document's own scene has; None where it has none of them."""
-    for index in range(len(lever.labels)):
-        if campaign.scene.with_(lever.settings(index)).document == campaign.scene.document:
-            return index
-    return None
-
-
-def built_hold(outcome: StudyOutcome, estimator: str) -> Hold | None:
-    """Return how far an estimator goes as robots are built; None where no lever has that value."""
-    for crossing in outcome.crossings.values():
-        index = as_built(outcome.campaign, crossing.lever)
-        if index is not None:
-            return crossing.of(estimator)[index]
-    return None
+def built_hold(outcome: StudyOutcome, estimator: str) -> Hold:
+    """Return how far an estimator goes as robots are built."""
+    crossing = next(iter(outcome.crossings.values()))
+    return crossing.of(estimator)[crossing.built]
 
 
 def verdict(outcome: StudyOutcome, crossing: Crossing, estimator: str) -> str:
     """Say what a lever wins back, of what an estimator does as built."""
     high, holds, lever = outcome.study.worst_is_high, crossing.of(estimator), crossing.lever
     judged = [hold for hold in holds if hold.status != "nothing to judge"]
-    index = as_built(outcome.campaign, lever)
-    if not judged or index is None or holds[index] not in judged:
+    built = holds[crossing.built]
+    if built not in judged:
         return "nothing to compare"
-    built = holds[index]
     reach = [order_of(hold, worst_is_high=high) for hold in judged]
     best, own = judged[reach.index(max(reach))], order_of(built, worst_is_high=high)
     if max(reach) == min(reach):
