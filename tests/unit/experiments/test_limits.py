@@ -23,8 +23,8 @@ from nir_render.experiments.limits.studies import (
 from nir_render.experiments.limits.words import best_levers, verdict
 from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import parse_bound
-from nir_render.stress.sweep import Progress
 from nir_render.stress.sums import job_sums
+from nir_render.stress.sweep import Progress
 from tests.unit.stress.synthetic import FOG, Row, campaign, frame, source, table
 
 POWER = Axis(
