@@ -30,6 +30,10 @@ RULES = {
         "them, the two values between which the limit lies."
     ),
     LIMIT_NAME: "the Cramér–Rao bound of the same sources, of those that the last estimator ranges.",
+    "received": (
+        "of the packets of robots that are in view, those that the robot's own track says: one that is where "
+        "the robot is. What ranges claim wrongly loses words too."
+    ),
     "as built": "the value that the paper's rig has, or that the study takes for it.",
     "maps": (
         "the figure over threat × lever; dark is good. A red corner: beyond the bound. Hatched: nothing "

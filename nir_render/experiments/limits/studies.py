@@ -100,9 +100,9 @@ STUDIES = (
         "messages",
         worst_is_high=True,
         expected=(
-            "a word decoded whole, all five repeats at once, needs 1.4 σ a sample, but to be followed a "
-            "robot must be found in single frames, which takes 5 σ or more: it is the tracker that gives up "
-            "first, and frames more often do not help it."
+            "a word decoded whole, all five repeats at once, needs 1.4 σ a sample; to be followed, and to "
+            "count as in view, a robot must stand out by 5 σ in single frames: what ends words is that "
+            "nobody is seen, at 40 m in full sun, and frames more often do not help that."
         ),
     ),
     Study(
@@ -111,8 +111,9 @@ STUDIES = (
         "messages",
         worst_is_high=False,
         expected=(
-            "light falls by exp(−σd)/d²: four times the power is worth ln 4 = 1.39 of σd, wherever it "
-            "stands; half the range halves the visibility that is borne, and better."
+            "light falls by exp(−σd)/d²: four times the power is worth ln 4 = 1.39 of σd. A word is received "
+            "where the track that says it is where its sender is: a range that fog has spoilt loses words of "
+            "which every bit was read."
         ),
     ),
     Study(
@@ -121,8 +122,9 @@ STUDIES = (
         "messages",
         worst_is_high=False,
         expected=(
-            "1.1 cm at 5.5 m are a pixel. Within about one and a half two flares are one, of levels none, "
-            "one, the other, both; beyond, each has a track of its own."
+            "1.1 cm at 5.5 m are a pixel. Within about two, flares are one, of levels none, one, the other, "
+            "both; beyond, each has a track of its own. Below 1 cm the shade of the nearer hides the other, "
+            "whose words are then out of view and count for nothing."
         ),
     ),
 )
