@@ -184,7 +184,7 @@ def test_a_wall_close_behind_takes_a_range_as_far_as_the_closed_form_says(
         "gap": gap,
     }
     monkeypatch.setattr(studies, "DOCUMENTS", tmp_path)
-    multipath.document.write_text(yaml.safe_dump(document), encoding="utf-8")
+    multipath.document.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
     outcome = outcome_of([multipath], 1, tmp_path / "limits", 1, _no_bar)
     (of,) = outcome.studies
     assert (of.jobs, of.failed) == (4, 0)
