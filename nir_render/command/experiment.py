@@ -1,6 +1,7 @@
 """The command of closed loops: experiment, the paper's own over seeds."""
 
 import math
+import signal
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +25,16 @@ class Experiment(StrEnum):
     FLOCKING = "flocking"
     COMMUNICATION = "communication"
     SWARM = "swarm"
+    LIMITS = "limits"
+
+
+class Threat(StrEnum):
+    """Of the limits: what the paper's conclusion leaves open."""
+
+    MULTIPATH = "multipath"
+    SUN = "sun"
+    FOG = "fog"
+    CROWDING = "crowding"
 
 
 class Law(StrEnum):
@@ -52,7 +63,8 @@ def experiment(
     name: Annotated[
         Experiment,
         typer.Argument(
-            metavar="NAME", help="Which: calibration, diffuser, flocking, communication or swarm."
+            metavar="NAME",
+            help="Which: calibration, diffuser, flocking, communication, swarm or limits.",
         ),
     ],
     output: Output = None,
@@ -72,7 +84,9 @@ def experiment(
     ] = Law.ROBUST,
     seeds: Annotated[
         int | None,
-        typer.Option("--seeds", min=1, help="How many runs, by seeds from 0 on: 20, of swarm 1 each."),
+        typer.Option(
+            "--seeds", min=1, help="How many runs, by seeds from 0 on: 20, of swarm 1 each, of limits 1 to 5."
+        ),
     ] = None,
     seconds: Annotated[
         float | None,
@@ -98,6 +112,10 @@ def experiment(
         Bodies | None,
         typer.Option("--bodies", help="Swarm: masts, which hide nothing, or columns, which do; or both."),
     ] = None,
+    only: Annotated[
+        list[Threat] | None,
+        typer.Option("--only", help="Limits: this threat; again for more. All by default."),
+    ] = None,
     keep_frames: Annotated[
         str | None,
         typer.Option(
@@ -119,7 +137,7 @@ def experiment(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run an experiment of the paper: ranges, a source that turns, robots that move by what they see."""
+    """Run an experiment: ranges, a source that turns, robots that move by what they see; limits of it all."""
     from nir_render.command.terminal.console import print_json
     from nir_render.experiments.communication.loop import Communication
     from nir_render.experiments.flocking.loop import Flocking
@@ -134,6 +152,13 @@ def experiment(
     if name is Experiment.COMMUNICATION and not 3 <= (robots or 3) <= 7:
         raise InputError(f"--robots {robots}: communication wants 3 to 7, the leader among them")
     folder = output if output is not None else Path("outputs") / name.value
+    if name is Experiment.LIMITS:
+        if scene is not None or settings:
+            raise InputError(
+                "--scene, --set: limits have scenes of their own; nir-render stress sweeps others"
+            )
+        _limits(only, seeds, folder, workers, as_json)
+        return
     by = level or (Level.FRAMES if name is Experiment.SWARM else Level.MEASUREMENTS)
     every = _kept_every(keep_frames, by)
     arenas = {Experiment.CALIBRATION: RAIL, Experiment.DIFFUSER: TURNTABLE, Experiment.SWARM: HALL}
@@ -168,6 +193,34 @@ def experiment(
         return
     typer.echo(said)
     typer.echo(f"open {page}")
+
+
+def _limits(
+    only: list[Threat] | None, seeds: int | None, folder: Path, workers: int | None, as_json: bool
+) -> None:
+    from nir_render.command.terminal.console import note, print_json, warn
+    from nir_render.command.terminal.progress import progress_bar
+    from nir_render.experiments.limits.outcome import outcome_of
+    from nir_render.experiments.limits.page import sentence, write_outcome
+    from nir_render.experiments.limits.studies import STUDIES
+    from nir_render.report.wording import counted
+    from nir_render.stress.sweep import StoppedError
+
+    studies = [study for study in STUDIES if not only or study.threat in only]
+    try:
+        outcome = outcome_of(studies, seeds, folder, workers, progress_bar)
+    except StoppedError as stopped:
+        note(f"{stopped} of this campaign; the same command goes on")
+        raise typer.Exit(128 + signal.SIGINT) from None
+    page = write_outcome(outcome, folder)
+    if as_json:
+        print_json({**outcome.record(), "page": str(page)})
+    else:
+        typer.echo(sentence(outcome))
+        typer.echo(f"open {page}")
+    if outcome.failed:
+        warn(f"{counted(outcome.failed, 'job')} failed; the same command tries these again")
+        raise typer.Exit(1)
 
 
 def _kept_every(text: str | None, level: Level) -> int:

@@ -17,7 +17,7 @@ from nir_render.scene.documents.camera import Rig
 from nir_render.scene.documents.document import SceneDocument
 from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
-from nir_render.stress.design.points import Point, number_of_points, points_of
+from nir_render.stress.design.points import Point, points_of
 from nir_render.transport.backend.cores import usual_workers
 from nir_render.transport.backend.llvm.choice import cpu_name
 from nir_render.transport.fingerprint import code_hash
@@ -26,7 +26,7 @@ from perception.own_code import files_of
 
 # What shows results, and what is asked for, do not change them.
 _NOT_IN_A_RESULT = (
-    *("command/", "stress/", "regress/", "report/"),
+    *("command/", "experiments/", "data/experiments/", "export/", "stress/", "regress/", "report/"),
     *("run/calibrate.py", "run/doctor.py", "run/examples.py", "run/time_estimate.py"),
 )
 _OF_STRESS = ("stress/job/", "stress/table.py")
@@ -62,18 +62,22 @@ def plan(
     campaign: Campaign,
     progress: Callable[[int, int], None] = lambda *_: None,
     planned: Sequence[Job] = (),
+    points: Sequence[Point] | None = None,
 ) -> list[Job]:
     """Return the jobs of a campaign, in the order of its points and seeds.
 
     Every scene is built, so that nothing that the input does wrong is found after hours. `progress` is told
-    how many are, of all; `planned` are jobs of the same campaign with fewer points, whose scenes were built.
+    how many are, of all; `planned` are jobs of the same campaign with fewer points, whose scenes were built;
+    `points` stand in place of all that the campaign has (`points_of`).
 
     Raises
     ------
     InputError
         A point that makes no scene, or one whose camera cannot see.
     """
-    number = number_of_points(campaign.axes, campaign.sample)
+    if points is None:
+        points = list(points_of(campaign.axes, campaign.sample))
+    number = len(points)
     made_by = made_by_of(campaign.estimators)
     known: dict[tuple[float | str, ...], list[Job]] = {}
     for job in planned:
@@ -81,7 +85,6 @@ def plan(
     jobs: list[Job] = []
     problems: list[str] = []
     place_of_scene: dict[str, str] = {}
-    points = list(points_of(campaign.axes, campaign.sample))
     hashes = _hashes(campaign.scene, [point.settings for point in points if point.written not in known])
     for built, point in enumerate(points):
         progress(built, number)

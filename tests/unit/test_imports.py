@@ -14,7 +14,7 @@ from tests.paths import ROOT
 # own, these stand behind it in their order. Files that lie loose in a room are held by having no circle.
 FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.command": ("terminal",),
-    "nir_render.experiments": ("communication", "flocking", "swarm", "standing", "loop"),
+    "nir_render.experiments": ("limits", "communication", "flocking", "swarm", "standing", "loop"),
     "nir_render.export": (),
     "nir_render.stress": ("page", "workers", "job", "design"),
     "nir_render.regress": ("stages",),

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -86,7 +86,12 @@ def points_of(axes: Sequence[Axis], sample: SampleDocument | None) -> Iterator[P
         for shares in sample.shares(len(axes)):
             yield _joined([_at_share(axis, float(share)) for axis, share in zip(axes, shares, strict=True)])
         return
-    for values in combinations_of(axes):
+    yield from points_at(axes, combinations_of(axes))
+
+
+def points_at(axes: Sequence[Axis], combinations: Iterable[Sequence[int]]) -> Iterator[Point]:
+    """Yield the points at combinations of values, each an index into every axis's values."""
+    for values in combinations:
         yield _joined([_at_index(axis, index) for axis, index in zip(axes, values, strict=True)])
 
 
