@@ -149,7 +149,7 @@ def _seen(
     off_u, off_v, whole_u, whole_v = 0.0, 0.0, 0.0, 0.0
     middle_row, middle = round(place[1]), round(place[0])
     left_out = np.zeros(state.shape[1], dtype=np.bool_)  # columns, as a whole
-    for at in range(max(middle - reach - corner[1], 0), min(middle + reach + 1 - corner[1], state.shape[1])):
+    for at in range(max(middle - reach - corner[0], 0), min(middle + reach + 1 - corner[0], state.shape[1])):
         left_out[at] = not (state[:, at] != UNUSABLE).any()
     for row in range(max(middle_row - reach, 0), min(middle_row + reach + 1, shape[0])):
         for column in range(max(middle - reach, 0), min(middle + reach + 1, shape[1])):
