@@ -42,11 +42,9 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
         if solution is None or solution.count > MOST_TOGETHER:
             continue
         if solution.count == 1:
-            motions = [_seen(solution, solution.window.box, camera, 0)]
+            motions = [_seen(solution, solution.window.box, camera)]
         elif asks_for_more(solution):
-            motions = [
-                _seen(solution, _around(solution, flare), camera, flare) for flare in range(solution.count)
-            ]
+            motions = [_seen(solution, _around(solution, flare), camera) for flare in range(solution.count)]
         else:
             continue
         if any(motion != AT_REST for motion in motions):
@@ -60,10 +58,10 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
     }
 
 
-def _seen(solution: Solution, box: PixelBox, camera: Camera, flare: int) -> Motion:
-    """Return the motion of a flare that the residual in a part of a window asks for, if it does.
+def _seen(solution: Solution, box: PixelBox, camera: Camera) -> Motion:
+    """Return the motion that the residual in a part of a window asks for, if it does.
 
-    A motion that costs more than it may gain there, by so much that it would not be weighed in, is none.
+    One of a lone flare that costs more than it may gain, by so much that it would not be weighed in, is none.
     """
     window = solution.window
     part = box.seen_from(window.box).slices
@@ -78,10 +76,11 @@ def _seen(solution: Solution, box: PixelBox, camera: Camera, flare: int) -> Moti
     length_px = math.hypot(along_u, along_v)
     if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
         return AT_REST
-    # To first order a residual may ask for a motion that is too long, and longer ones cost more.
-    price = motion_price(np.array([0.5 * length_px]), solution.log_range[flare : flare + 1], camera)
-    if solution.count == 1 and most_gain < float(price[0]) - NO_RIVAL:
-        return AT_REST
+    if solution.count == 1:
+        # To first order a residual may ask for a motion that is too long, and longer ones cost more.
+        price = motion_price(np.array([0.5 * length_px]), solution.log_range, camera)
+        if most_gain < float(price[0]) - NO_RIVAL:
+            return AT_REST
     shorter = min(1.0, 0.5 * MOST_MOTION_PX / length_px)
     return shorter * along_u, shorter * along_v
 

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from perception import Detection, detect
 from perception.types import Calibration
+from tests.unit.perception.robust.test_eclipse import _pulls
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, expose, random
 
 Array = NDArray[np.float64]
@@ -19,15 +20,6 @@ CAMERA = calibration(sigma={})
 RADIUS_M = CAMERA.source_radius_m
 FINE, SIDE_PX = 8, 200
 SMALL = replace(CAMERA, width_px=SIDE_PX, height_px=SIDE_PX, cx_px=99.5, cy_px=99.5)
-
-
-def _pulls(place: Place, told: Detection) -> list[float]:
-    u, v, range_m = place
-    return [
-        (told.u_px - u) / told.u_sigma_px,
-        (told.v_px - v) / told.v_sigma_px,
-        (told.range_m - range_m) / told.range_sigma_m,
-    ]
 
 
 def _told(mean_e: Array, camera: Calibration = CAMERA, key: int = 0) -> list[Detection]:
