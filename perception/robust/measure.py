@@ -15,7 +15,7 @@ from perception.robust.aperture import aperture_flux
 from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guess_by_outline
 from perception.robust.explain import MOST_LEFT, best
 from perception.robust.forward_light import fit_beside_forward_light
-from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size
+from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size, of_free_width
 from perception.robust.problem import Problem
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
@@ -91,7 +91,8 @@ def measure(
 
     Flares of known size and strength are fitted to each window. What a fit leaves over may be more flares
     (`deblend`), or charge that clipped pixels spilled over their columns. Blobs that are too large for that
-    are fitted as whole discs; what no such disc explains, what is clipped then, and what has no range is
+    are fitted as whole discs, through a point spread of any width where the calibration's is wrong there (a
+    near source out of focus); what no such disc explains, what is clipped then, and what has no range is
     measured by aperture, which claims no σ of range. The flux of a clipped one is a lower bound.
 
     Parameters
@@ -256,6 +257,12 @@ def _of_large_discs(
         tried = [index for index in tried if solutions[index] is not None]
         problems = [one.again() for one in solutions if one is not None]
     fit_beside_forward_light(solutions, camera)
+    blurred = [index for index, one in enumerate(solutions) if one is not None and _is_misfit(one)]
+    wider = of_free_width([one for k in blurred if (one := solutions[k]) is not None], camera)
+    for index, free in zip(blurred, wider, strict=True):
+        held = solutions[index]
+        if free is not None and held is not None and free.cost < held.cost:
+            solutions[index] = free
     return solutions
 
 
@@ -278,8 +285,7 @@ def _by_disc(
         return [
             (cluster.members[k].blob, _from_aperture(cluster.members[k], cluster, prepared)) for k in wanted
         ]
-    left = solution.left_over
-    misfit = not left.is_good or left.peak_sigmas > RESIDUAL_SIGMAS
+    misfit = _is_misfit(solution)
     measured = []
     for k in wanted:
         blob = cluster.members[k].blob
@@ -297,6 +303,12 @@ def _by_disc(
             )
         measured.append((blob, one))
     return measured
+
+
+def _is_misfit(solution: Solution) -> bool:
+    """Tell whether what whole discs leave over is more than noise."""
+    left = solution.left_over
+    return not left.is_good or left.peak_sigmas > RESIDUAL_SIGMAS
 
 
 def _odd_share(solution: Solution) -> float:
