@@ -1,12 +1,18 @@
 """What all tests share."""
 
 import importlib.util
+import os
 
 import pytest
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip, by name, what needs Mitsuba where it has no wheel, or a vectorised variant where there is none."""
+    """Skip, by name, what needs Mitsuba where it has no wheel, or a vectorised variant where there is none.
+
+    And what is long, and says again what others say, unless it is asked for.
+    """
+    if "AT_LENGTH" not in os.environ:
+        _skip(items, "at_length", "minutes: AT_LENGTH=1 make verify runs it too")
     if importlib.util.find_spec("mitsuba") is None:
         _skip(items, "mitsuba", "needs Mitsuba, which is not installed")
         return

@@ -35,8 +35,37 @@ class Comparison:
     tile_drift: float
 
 
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Tiles and, last, the frame of independent estimates of an image: all that a comparison takes of them.
+
+    Attributes
+    ----------
+    mean, variance
+        Of each part's mean over the estimates, shape (tiles + 1,).
+    count
+        Of estimates, two or more.
+    """
+
+    mean: Array
+    variance: Array
+    count: int
+
+
+def parts_of(stack: Array, tile_px: int = 16) -> Parts:
+    """Return the tiles and the frame of estimates, shape (batches, rows, columns); edge tiles may be smaller."""
+    tiles = (tile_sums(stack, tile_px) / tile_sums(np.ones(stack.shape[1:]), tile_px)).reshape(len(stack), -1)
+    means = np.concatenate([tiles, stack.mean(axis=(1, 2))[:, None]], axis=1)
+    return Parts(means.mean(axis=0), means.var(axis=0, ddof=1), len(stack))
+
+
 def compare_batches(one: Array, other: Array, tile_px: int = 16, significance: float = 1e-3) -> Comparison:
-    """Compare two stacks of independent estimates of an image.
+    """Compare two stacks of independent estimates of an image, shape (batches, rows, columns), as below."""
+    return compare_parts(parts_of(one, tile_px), parts_of(other, tile_px), significance)
+
+
+def compare_parts(one: Parts, other: Parts, significance: float = 1e-3) -> Comparison:
+    """Compare independent estimates of an image by those of another.
 
     Each tile and the whole frame are tested by Welch's t over the batches, all together with Holm's
     correction. Where neither stack varies there is no light, or no Monte Carlo: there they must agree to
@@ -45,34 +74,27 @@ def compare_batches(one: Array, other: Array, tile_px: int = 16, significance: f
     Parameters
     ----------
     one, other
-        Estimates, shape (batches, rows, columns), at least two batches each; edge tiles may be smaller.
-    tile_px
-        Side of a tile.
+        The parts of both.
     significance
         Chance that two equal renders are called different.
     """
-    parts = [_part_means(stack, tile_px) for stack in (one, other)]
-    means = [part.mean(axis=0) for part in parts]
-    error2 = sum(part.var(axis=0, ddof=1) / len(part) for part in parts)
-    floor2 = (_ROUNDING * np.maximum(np.abs(means[0]), np.abs(means[1]))) ** 2
-    p = 2.0 * stats.norm.sf(np.abs(means[0] - means[1]) / np.sqrt(floor2 + 1e-300))
+    error2 = one.variance / one.count + other.variance / other.count
+    floor2 = (_ROUNDING * np.maximum(np.abs(one.mean), np.abs(other.mean))) ** 2
+    p = 2.0 * stats.norm.sf(np.abs(one.mean - other.mean) / np.sqrt(floor2 + 1e-300))
     varies = error2 > floor2
     if varies.any():
-        welch = stats.ttest_ind(parts[0][:, varies], parts[1][:, varies], equal_var=False, axis=0)
-        p[varies] = welch.pvalue
+        p[varies] = stats.ttest_ind_from_stats(
+            one.mean[varies], np.sqrt(one.variance[varies]), one.count,
+            other.mean[varies], np.sqrt(other.variance[varies]), other.count,
+            equal_var=False,
+        ).pvalue  # fmt: skip
     smallest = float(np.min(holm(p)))
-    relative = np.sqrt(error2) / np.maximum(np.abs(means[1]), 1e-300)
-    lit = np.abs(means[1][:-1]) > 0.0
+    relative = np.sqrt(error2) / np.maximum(np.abs(other.mean), 1e-300)
+    lit = np.abs(other.mean[:-1]) > 0.0
     return Comparison(
         same=smallest > significance,
         smallest_p=smallest,
-        frame_ratio=float(means[0][-1] / means[1][-1]) if means[1][-1] else 1.0,
+        frame_ratio=float(one.mean[-1] / other.mean[-1]) if other.mean[-1] else 1.0,
         frame_drift=3.0 * float(relative[-1]),
         tile_drift=3.0 * float(np.median(relative[:-1][lit])) if lit.any() else 0.0,
     )
-
-
-def _part_means(stack: Array, tile_px: int) -> Array:
-    """Return the means of each tile and, last, of the frame, shape (batches, tiles + 1)."""
-    tiles = (tile_sums(stack, tile_px) / tile_sums(np.ones(stack.shape[1:]), tile_px)).reshape(len(stack), -1)
-    return np.concatenate([tiles, stack.mean(axis=(1, 2))[:, None]], axis=1)

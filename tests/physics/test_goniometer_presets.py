@@ -1,7 +1,6 @@
 """The presets of the paper's source, bare and diffused: its two figures, and the same light in a scene."""
 
 import math
-import os
 
 import numpy as np
 import pytest
@@ -87,12 +86,7 @@ def test_a_scene_lights_as_the_goniometer_measured(name: str) -> None:
     "polar_deg",
     [
         85.0,
-        pytest.param(
-            45.0,
-            marks=pytest.mark.skipif(
-                "AT_LENGTH" not in os.environ, reason="two minutes: AT_LENGTH=1 make verify runs it too"
-            ),
-        ),
+        pytest.param(45.0, marks=pytest.mark.at_length),
     ],
 )
 def test_a_path_tracer_sees_the_same_source(polar_deg: float) -> None:

@@ -16,7 +16,6 @@ nodes are said to make, plus noise.
 
 import json
 import logging
-import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -216,21 +215,16 @@ def test_nodes_agree_with_a_full_spectral_render_of_fewer_bounces() -> None:
     held_against_mitsuba(parse_scene(document("led", 4.0, 256, depth=3, error=2e-3)), 1024, 0.005)
 
 
-at_length = pytest.mark.skipif(
-    "AT_LENGTH" not in os.environ, reason="a minute and a half each: AT_LENGTH=1 make verify runs them too"
-)
-
-
 @pytest.mark.verify
 @pytest.mark.parametrize(
     ("spectrum", "blocking_od", "most_off"),
     [
         ("led", 4.0, 0.005),
-        ("lamp", 4.0, 0.005),
+        pytest.param("lamp", 4.0, 0.005, marks=pytest.mark.at_length),
         ("sun", 2.0, 0.01),
-        pytest.param("led", 2.0, 0.01, marks=at_length),
-        pytest.param("lamp", 2.0, 0.01, marks=at_length),
-        pytest.param("sun", 4.0, 0.005, marks=at_length),
+        pytest.param("led", 2.0, 0.01, marks=pytest.mark.at_length),
+        pytest.param("lamp", 2.0, 0.01, marks=pytest.mark.at_length),
+        pytest.param("sun", 4.0, 0.005, marks=pytest.mark.at_length),
     ],
 )
 def test_nodes_agree_with_a_full_spectral_render(spectrum: str, blocking_od: float, most_off: float) -> None:

@@ -95,6 +95,11 @@ def _choose() -> tuple[str, str]:
     return LLVM_VARIANT, f"LLVM {choice.version} works"
 
 
+def traces_one_scene() -> bool:
+    """Tell whether a kernel can trace rays in one scene alone, as on a GPU: a second one seems empty."""
+    return backend().variant.startswith("cuda")
+
+
 def set_threads(count: int) -> None:
     """Let rendering use `count` threads."""
     dr.set_thread_count(count)

@@ -24,7 +24,7 @@ from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
 from nir_render.spectra.skies import CieSky, cie_sky
-from nir_render.transport.backend.variant import dr, mi, shape_number
+from nir_render.transport.backend.variant import dr, mi, shape_number, traces_one_scene
 from nir_render.transport.indirect.guide import guide
 from nir_render.transport.indirect.kernel.begin import Film
 from nir_render.transport.indirect.kernel.nodes import NodeTable, upload_nodes
@@ -244,10 +244,12 @@ def world_on_device(
         patterns.append(None if placed is None else pattern_of(placed.source))
         axes.append(np.eye(3) if placed is None else placed.pose.rotation)
     fog = medium(snapshot)
-    opaque = mitsuba_scene.build(snapshot, panes=False) if panes else bodies
+    opaque = bodies
+    if panes:
+        opaque = None if traces_one_scene() else mitsuba_scene.build(snapshot, panes=False)
     extinction_per_m = 0.0 if fog is None else fog.extinction_per_m
     choice = guide(shining, flat, power, low_m, high_m, extinction_per_m)
-    columns = _shape_columns(snapshot, (bodies, opaque), flat)
+    columns = _shape_columns(snapshot, (bodies,) if opaque is None else (bodies, opaque), flat)
     return DeviceScene(
         bodies=bodies,
         opaque=opaque,

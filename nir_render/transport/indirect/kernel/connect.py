@@ -10,14 +10,16 @@ from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import nodes as of_nodes
 from nir_render.transport.indirect.kernel.fog import transmittance
 from nir_render.transport.indirect.kernel.nodes import NodeTable
-from nir_render.transport.indirect.kernel.rectangle import RectangleInView
+from nir_render.transport.indirect.kernel.rectangle import RectangleInView, aim_at_rectangle
 from nir_render.transport.indirect.kernel.tables import Choice, DeviceScene, Lights, Surfaces, along_table
-from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, Shares, UInt, Vector
+from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, Ray, Shares, UInt, Vector
 from nir_render.transport.world.emitters import RECTANGLE, SKY, SUN
 from nir_render.transport.world.facets import MIRROR, PANE
 
 # Shadow rays to facets and lamps end this share of their way before it: what float32 rounds, with room.
 SHORTER = 1e-4
+# So far behind a pane, relatively and in metres, a ray goes on that passes it.
+_PAST = 1e-6
 _ENDLESS = 1e15
 
 
@@ -71,7 +73,7 @@ def aim_at_light(lights: Lights, row: UInt, place: Point, u: Float, v: Float, ac
     if lights.has_spheres:
         direction, reach, density = _aim_at_sphere(lights, row, place, u, v, active)
     if lights.has_rectangles:
-        sampled = _aim_at_rectangle(lights, row, place, u, v, active & (kind == RECTANGLE))
+        sampled = aim_at_rectangle(lights, row, place, u, v, active & (kind == RECTANGLE))
         direction, reach, density = (
             dr.select(kind == RECTANGLE, new, old)
             for new, old in zip(sampled, (direction, reach, density), strict=True)
@@ -273,18 +275,6 @@ def _around(axis: Vector, sine: Float, versine: Float, turn: Float) -> Vector:
     return mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, 1.0 - versine))
 
 
-def _aim_at_rectangle(
-    lights: Lights, row: UInt, place: Point, u: Float, v: Float, active: Mask
-) -> tuple[Vector, Float, Float]:
-    flat = RectangleInView(lights, row, place, active)
-    to = flat.point(u, v)
-    distance = dr.norm(to)
-    direction = to / distance
-    # Zero from behind: a density beyond all bounds.
-    density = dr.select(dr.dot(direction, flat.normal) < 0.0, flat.density(direction), 1e30)
-    return direction, distance, density
-
-
 def arriving_share(
     scene: DeviceScene, row: UInt, origin: Point, aim: Aim, depth: UInt, max_depth: UInt, active: Mask
 ) -> tuple[Float, Shares]:
@@ -361,13 +351,50 @@ def _reaches(
     radius = dr.gather(mi.Float, scene.lights.radius, row, active)
     ray = mi.Ray3f(origin, direction)
     ray.maxt = dr.select(radius > 0.0, reach + 2.0 * radius, reach * (1.0 - SHORTER))
-    met = scene.opaque.ray_intersect_preliminary(ray, coherent=False, active=active)
-    shape = dr.reinterpret_array(mi.UInt32, met.shape)
-    hit_light = dr.gather(mi.Int32, scene.surfaces.light_of_shape, shape, active & met.is_valid())
-    return ~met.is_valid() | (hit_light == mi.Int32(light))
+    shape, met = _first_opaque(scene, ray, active)
+    hit_light = dr.gather(mi.Int32, scene.surfaces.light_of_shape, shape, met)
+    return ~met | (hit_light == mi.Int32(light))
 
 
 def _hidden(scene: DeviceScene, origin: Point, direction: Vector, reach: Float, active: Mask) -> Mask:
     ray = mi.Ray3f(origin, direction)
     ray.maxt = reach
+    if scene.opaque is None:
+        return _first_opaque(scene, ray, active)[1]
     return scene.opaque.ray_test(ray, coherent=mi.Bool(False), active=active)
+
+
+def _first_opaque(scene: DeviceScene, ray: Ray, active: Mask) -> tuple[UInt, Mask]:
+    """Return the number of the first shape but panes that a ray meets, and whether it meets one."""
+    if scene.opaque is not None:
+        met = scene.opaque.ray_intersect_preliminary(ray, coherent=False, active=active)
+        return dr.reinterpret_array(mi.UInt32, met.shape), active & met.is_valid()
+
+    def step(
+        origin: Point, rest: Float, shape: UInt, looking: Mask, met: Mask
+    ) -> tuple[Point, Float, UInt, Mask, Mask]:
+        onward = mi.Ray3f(origin, ray.d)
+        onward.maxt = rest
+        here = scene.bodies.ray_intersect_preliminary(onward, coherent=False, active=looking)
+        number, hit = dr.reinterpret_array(mi.UInt32, here.shape), looking & here.is_valid()
+        is_pane = dr.gather(mi.Bool, scene.surfaces.pane_of_shape, number, hit)
+        past = here.t * (1.0 + _PAST) + _PAST
+        passes = hit & is_pane & (past < rest)
+        return (
+            dr.select(passes, origin + ray.d * past, origin),
+            dr.select(passes, rest - past, rest),
+            dr.select(hit, number, shape),
+            passes,
+            met | (hit & ~is_pane),
+        )
+
+    nothing = dr.zeros(mi.UInt32, dr.width(ray.d))
+    start = (
+        mi.Point3f(ray.o),
+        mi.Float(ray.maxt),
+        nothing,
+        mi.Bool(active),
+        dr.zeros(mi.Bool, dr.width(ray.d)),
+    )
+    _, _, shape, _, met = dr.while_loop(start, lambda *state: state[3], step)
+    return shape, met

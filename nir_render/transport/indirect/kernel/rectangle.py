@@ -78,3 +78,16 @@ class RectangleInView:
         y = dr.clip(height * dr.sqrt(flat2) / dr.safe_sqrt(1.0 - height * height), self.y0, self.y1)
         onto = self.across * x + self.up * y + self.axis * self.z
         return dr.select(self.by_area, even, onto)
+
+
+def aim_at_rectangle(
+    lights: Lights, row: UInt, place: Point, u: Float, v: Float, active: Mask
+) -> tuple[Vector, Float, Float]:
+    """Return a unit direction to a point of a lamp, its distance and the density per sr of being drawn."""
+    flat = RectangleInView(lights, row, place, active)
+    to = flat.point(u, v)
+    distance = dr.norm(to)
+    direction = to / distance
+    # Zero from behind: a density beyond all bounds.
+    density = dr.select(dr.dot(direction, flat.normal) < 0.0, flat.density(direction), 1e30)
+    return direction, distance, density

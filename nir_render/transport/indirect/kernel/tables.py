@@ -113,12 +113,14 @@ class FogTable:
 class DeviceScene:
     """All that a walk reads. `bodies` is Mitsuba's scene, `opaque` the same without panes.
 
+    `opaque` is None where panes are passed one by one, in `bodies`: Dr.Jit traces one scene alone in a kernel
+    on a GPU, and takes all rays into another as unhindered.
     `max_depth` is the longest path, in stretches, as Mitsuba counts; `nodes` is None where light of one
     wavelength alone is carried. `pictures` tells whether any surface has a picture laid on it.
     """
 
     bodies: MitsubaScene
-    opaque: MitsubaScene
+    opaque: MitsubaScene | None
     lights: Lights
     surfaces: Surfaces
     choice: Choice

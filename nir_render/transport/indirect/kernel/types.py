@@ -16,6 +16,7 @@ Vector = Any  # a unit direction, or an offset in metres; tables hold their vect
 Point = Any  # in metres
 Interaction = Any  # where rays meet surfaces: mi.SurfaceInteraction3f
 MitsubaScene = Any
+Ray = Any  # mi.Ray3f
 
 Random = Callable[[Any], Float]  # a number in [0, 1) for a path's vertex, by what it is for (see `draws`)
 Shares = tuple[Float, ...]  # what each node keeps of a path's light (see `nodes`); of one node alone none
