@@ -3,8 +3,9 @@
 
 PYTHON ?= python3
 ARGS ?=
-# Files of tests side by side, on all cores up to four: each process loads Mitsuba.
-SIDE_BY_SIDE := -n auto --maxprocesses 4 --dist loadfile
+# Files of tests side by side, on all cores up to four: each process loads Mitsuba. In the order of folders: the
+# longest first.
+SIDE_BY_SIDE := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 ifeq ($(OS),Windows_NT)
 BIN := .venv/Scripts
