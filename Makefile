@@ -19,7 +19,7 @@ help:
 	@echo "make setup   make .venv, install the pinned packages, find a usable LLVM"
 	@echo "make demo    render and evaluate scenes/arena.yaml into outputs/arena"
 	@echo "make test    the tests, without the long statistical checks"
-	@echo "make verify  the long statistical checks"
+	@echo "make verify  the long statistical checks; with AT_LENGTH=1 also those that say the same again"
 	@echo "make lint    ruff, mypy, and the site: warnings are errors"
 	@echo "make docs    the site, in docs/_build/html/index.html; it opens offline"
 	@echo "make bench   every benchmark, one JSON object each"
