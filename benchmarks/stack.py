@@ -3,7 +3,7 @@
 Robots stand about a rig of four cameras and repeat a word each at 10 Hz; the frames, 30 sets a second, are
 drawn before anything is timed (`tests/unit/perception/simulation.py`) and each is read once, so that it comes
 from memory as a camera leaves it there. Figures are of the sets after the first second: how long a set takes,
-and of that detection by itself; how many tracks there are at the end, and how many messages were read.
+and of that detection by itself, in threads and in processes; how many tracks there are at the end, and how many messages were read.
 `--seconds 7` and more lets whole packets be heard.
 """
 
@@ -12,6 +12,7 @@ import json
 import statistics
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,7 @@ FPS, BITS_PER_S, WARM_S = 30.0, 10.0, 1.0
 EXPOSURE_S = 2e-4
 NEAREST_M, FARTHEST_M, APART_RAD = 1.5, 6.0, 0.12
 CAMERAS = rig(own_source=True)
+Detector = Callable[[Sequence[RawFrame]], Sequence[Sequence[Detection]]]
 
 
 def sets_of(robots: int, seconds: float) -> list[list[RawFrame]]:
@@ -72,14 +74,14 @@ def _parts(
     return parts
 
 
-def timed(robots: int, seconds: float) -> dict[str, float | int]:
+def timed(robots: int, seconds: float, find: Detector) -> dict[str, float | int]:
     """Time the whole stack on sets of so many robots, and its parts."""
     pipeline = perception.Pipeline(CAMERAS)
     spent: list[tuple[float, float]] = []
     messages, tracks = 0, 0
     for frames in sets_of(robots, seconds):
         started = time.perf_counter()
-        found: list[list[Detection]] = detect_frames(frames, CAMERAS)
+        found = find(frames)
         detected = time.perf_counter()
         heard = pipeline.follow(frames, found)
         spent.append((detected - started, time.perf_counter() - detected))
@@ -104,7 +106,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.5)
     chosen = parser.parse_args()
     perception.warm_up()
-    figures = {str(robots): timed(robots, chosen.seconds) for robots in chosen.robots}
+    with perception.DetectorProcesses(CAMERAS) as beside:
+        ways: dict[str, Detector] = {
+            "threads": lambda frames: detect_frames(frames, CAMERAS),
+            "processes": beside.detect_frames,
+        }
+        figures = {
+            str(robots): {way: timed(robots, chosen.seconds, find) for way, find in ways.items()}
+            for robots in chosen.robots
+        }
     print(json.dumps({"benchmark": "stack", "cameras": len(CAMERAS), "robots": figures}))
 
 

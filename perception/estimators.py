@@ -126,11 +126,7 @@ def detect_frames(
     ValueError
         As for `detect`, or if a frame's camera has no calibration.
     """
-    unknown = sorted({frame.camera for frame in frames} - set(calibrations))
-    if unknown:
-        raise ValueError(
-            f"no calibration for {', '.join(unknown)}; there are some for {', '.join(calibrations) or 'none'}"
-        )
+    require_calibrations(frames, calibrations)
 
     def found(frame: RawFrame) -> Detections:
         return detect(frame, calibrations[frame.camera], estimator, limit_s=limit_s)
@@ -139,6 +135,15 @@ def detect_frames(
         return [found(frame) for frame in frames]
     with ThreadPoolExecutor(min(len(frames), os.cpu_count() or 1)) as threads:
         return list(threads.map(found, frames))
+
+
+def require_calibrations(frames: Sequence[RawFrame], calibrations: Mapping[str, Calibration]) -> None:
+    """Raise `ValueError` if the camera of a frame has no calibration."""
+    unknown = sorted({frame.camera for frame in frames} - set(calibrations))
+    if unknown:
+        raise ValueError(
+            f"no calibration for {', '.join(unknown)}; there are some for {', '.join(calibrations) or 'none'}"
+        )
 
 
 class EstimatorError(ValueError):

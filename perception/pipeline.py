@@ -104,6 +104,9 @@ class Pipeline:
         Whether `signals` is to know them all: a robot that runs for days has no use for that.
     limit_s
         As for `detect`, of each frame.
+    detector
+        What finds the flares of a set's frames, in place of `estimator` and `limit_s`, such as
+        `DetectorProcesses.detect_frames`.
     """
 
     def __init__(
@@ -114,10 +117,12 @@ class Pipeline:
         decoder: Callable[[str, int], Reads] = Decoder,
         keep_signals: bool = False,
         limit_s: float = math.inf,
+        detector: Callable[[Sequence[RawFrame]], Sequence[Sequence[Detection]]] | None = None,
     ) -> None:
         self._calibrations = calibrations
         self._limit_s = limit_s
         self._estimator = estimator
+        self._detector = detector
         self._tracker: Follows = Tracker() if tracker is None else tracker
         self._decoder = decoder
         self._readers: dict[int, Reads] = {}
@@ -166,6 +171,8 @@ class Pipeline:
         ValueError
             There are no frames, or those of another robot than before; as for `detect`.
         """
+        if self._detector is not None:
+            return self.follow(frames, self._detector(frames), odometry)
         found = detect_frames(frames, self._calibrations, self._estimator, limit_s=self._limit_s)
         return self.follow(frames, found, odometry)
 

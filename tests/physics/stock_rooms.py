@@ -12,6 +12,7 @@ import json
 import sys
 import tempfile
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from scipy.ndimage import gaussian_filter, label
 
 from nir_render import Light, Scene, expected_electrons, load_scene, render
 from nir_render.transport.backend.variant import backend
+from tests.physics import stock
 from tests.physics.rooms import FOCAL_PX, HEIGHT_PX, ROOMS, SIGMA_PX, WIDTH_PX, groups, plain
 from tests.physics.stock import stock_radiance
 from tests.statistics import Parts, parts_of
@@ -127,7 +129,7 @@ def stock_room(room: str) -> StockRoom:
     Raises
     ------
     AssertionError
-        The room or its sampling is another than that which was rendered.
+        The room, how it is rendered, or Mitsuba is another than that of the file.
     """
     with np.load(FILE) as kept:
         known = str(kept[f"{room}/key"])
@@ -171,9 +173,9 @@ def _aside(room: str) -> NDArray[np.bool_]:
 
 
 def _key(room: str) -> str:
-    """Return what a room is known by: its document and how it is sampled."""
-    told = json.dumps([plain(room), asdict(SAMPLING[room])], sort_keys=True)
-    return hashlib.sha256(told.encode()).hexdigest()
+    """Return what a room is known by: its document, how it is sampled and blurred, and by what it is rendered."""
+    how = [asdict(SAMPLING[room]), SIGMA_PX, FOCAL_PX, version("mitsuba"), Path(stock.__file__).read_text()]
+    return hashlib.sha256(json.dumps([plain(room), how], sort_keys=True).encode()).hexdigest()
 
 
 def _write(rooms: dict[str, StockRoom]) -> None:

@@ -11,7 +11,6 @@ from nir_render.scene.documents.sensor import Compression, Sensor
 from tests.physics.emva import LEVELS, Frame, Sheet, bench_scene, measure
 
 SEEDS = 5
-EVERY_TIME = ("mt9m031", "imx273")  # the rig's, and one of another make
 # Of the sheet's figures: relative, or absolute where the unit is named.
 TOLERANCES = {
     "system_gain_dn_per_e": 0.003,
@@ -62,13 +61,7 @@ def test_a_camera_measures_as_its_preset_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.verify
-@pytest.mark.parametrize(
-    "preset",
-    [
-        pytest.param(name, marks=() if name in EVERY_TIME else pytest.mark.at_length)
-        for name in preset_names("sensors")
-    ],
-)
+@pytest.mark.parametrize("preset", preset_names("sensors"))
 def test_every_preset_measures_as_it_says(tmp_path: Path, preset: str) -> None:
     """Five cameras of each preset: gain 0.3 %, quantum efficiency 0.5 %, read noise 1 %, PRNU 2 %, DSNU 3 %,
     dark current 2 %, linearity 0.2 %, saturation capacity 1 %, black level 0.2 DN.

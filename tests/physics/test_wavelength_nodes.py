@@ -219,8 +219,8 @@ def test_nodes_agree_with_a_full_spectral_render_of_fewer_bounces() -> None:
 @pytest.mark.parametrize(
     ("spectrum", "blocking_od", "most_off"),
     [
-        ("led", 4.0, 0.005),
-        pytest.param("lamp", 4.0, 0.005, marks=pytest.mark.at_length),
+        pytest.param("led", 4.0, 0.005, marks=pytest.mark.at_length),  # as above, of fewer bounces
+        ("lamp", 4.0, 0.005),
         ("sun", 2.0, 0.01),
         pytest.param("led", 2.0, 0.01, marks=pytest.mark.at_length),
         pytest.param("lamp", 2.0, 0.01, marks=pytest.mark.at_length),

@@ -40,6 +40,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.errors": (),
     "perception.warm_up": (),
     "perception.pipeline": (),
+    "perception.processes": (),
     "perception.pairs": (),
     "perception.photometry": (),
     "perception.track": (),

@@ -14,8 +14,7 @@ import numpy as np
 
 from perception.model.window import Camera
 from perception.robust.overlap.deblend import gain, halves
-from perception.robust.overlap.limb import may_be_other_shape
-from perception.robust.overlap.pairs import LEAST_RADIUS_PX, longer_chi2
+from perception.robust.overlap.pairs import longer_chi2
 from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import NEIGHBOURS_PER_PX2, Solution, solve
@@ -46,8 +45,6 @@ def doubted(
     problems = []
     for index, (one, lone) in enumerate(zip(chosen, at_rest, strict=True)):
         if one is None or lone is None or one.count != 1 or lone.count != 1 or one.is_eclipse:
-            continue
-        if _is_whole(lone, camera):
             continue
         if not lone.left_over.is_good or longer_chi2(lone) > LONGER_CHI2:
             for starts in (halves(lone, 0), halves(lone, 0, _NEAR_WIDTHS) or _beside(lone)):
@@ -80,11 +77,6 @@ def doubted(
             log_range_of_two=math.sqrt(float(both.log_range_sigma[0] ** 2 - one.log_range_sigma[0] ** 2)),
         )
     return wider
-
-
-def _is_whole(lone: Solution, camera: Camera) -> bool:
-    """Tell whether a lone flare is resolved, and its limb that of one disc: two would show."""
-    return float(lone.image_radius_px[0]) >= LEAST_RADIUS_PX and not may_be_other_shape(lone, camera)
 
 
 def _beside(lone: Solution) -> tuple[Start, Start]:

@@ -18,8 +18,9 @@ from nir_render.transport.world.facets import MIRROR, PANE
 
 # Shadow rays to facets and lamps end this share of their way before it: what float32 rounds, with room.
 SHORTER = 1e-4
-# So far behind a pane, relatively and in metres, a ray goes on that passes it.
-_PAST = 1e-6
+# So far behind a pane, in metres and relative to lengths at hand, a ray goes on that passes it: what float32
+# rounds, with room. What lies nearer behind it hides nothing.
+_PAST = 1e-5
 _ENDLESS = 1e15
 
 
@@ -370,31 +371,30 @@ def _first_opaque(scene: DeviceScene, ray: Ray, active: Mask) -> tuple[UInt, Mas
         met = scene.opaque.ray_intersect_preliminary(ray, coherent=False, active=active)
         return dr.reinterpret_array(mi.UInt32, met.shape), active & met.is_valid()
 
+    most = 2 * scene.surfaces.pane_count  # of panes, flat as they are, a ray meets each once
+
     def step(
-        origin: Point, rest: Float, shape: UInt, looking: Mask, met: Mask
-    ) -> tuple[Point, Float, UInt, Mask, Mask]:
+        origin: Point, rest: Float, shape: UInt, looking: Mask, met: Mask, passed: UInt
+    ) -> tuple[Point, Float, UInt, Mask, Mask, UInt]:
         onward = mi.Ray3f(origin, ray.d)
         onward.maxt = rest
         here = scene.bodies.ray_intersect_preliminary(onward, coherent=False, active=looking)
         number, hit = dr.reinterpret_array(mi.UInt32, here.shape), looking & here.is_valid()
         is_pane = dr.gather(mi.Bool, scene.surfaces.pane_of_shape, number, hit)
-        past = here.t * (1.0 + _PAST) + _PAST
-        passes = hit & is_pane & (past < rest)
+        past = here.t + _PAST * (1.0 + here.t + dr.max(dr.abs(origin)))
+        passes = hit & is_pane & (past < rest) & (passed < most)
         return (
             dr.select(passes, origin + ray.d * past, origin),
             dr.select(passes, rest - past, rest),
             dr.select(hit, number, shape),
             passes,
             met | (hit & ~is_pane),
+            passed + 1,
         )
 
-    nothing = dr.zeros(mi.UInt32, dr.width(ray.d))
+    none, width = mi.Bool(False), dr.width(ray.d)
     start = (
-        mi.Point3f(ray.o),
-        mi.Float(ray.maxt),
-        nothing,
-        mi.Bool(active),
-        dr.zeros(mi.Bool, dr.width(ray.d)),
-    )
-    _, _, shape, _, met = dr.while_loop(start, lambda *state: state[3], step)
+        mi.Point3f(ray.o), mi.Float(ray.maxt), dr.zeros(mi.UInt32, width), mi.Bool(active), none, mi.UInt32(0)
+    )  # fmt: skip
+    _, _, shape, _, met, _ = dr.while_loop(start, lambda *state: state[3], step)
     return shape, met

@@ -1,0 +1,83 @@
+"""Frames side by side in processes: what they find is what one finds by itself, and nothing hangs or is left."""
+
+import os
+import signal
+from dataclasses import replace
+from multiprocessing.shared_memory import SharedMemory
+
+import numpy as np
+import pytest
+
+import perception
+from perception import Calibration, DetectorProcesses, Pipeline, RawFrame
+from tests.unit.perception.simulation import calibration, expected_e, expose, random
+
+NAMES = ("r1.front", "r1.back", "r1.left")
+CAMERAS: dict[str, Calibration] = {name: replace(calibration(), camera=name) for name in NAMES}
+PLACES = [(200.3, 150.6, 2.0), (420.8, 310.2, 4.0), (900.4, 505.7, 3.0)]
+
+
+def _frames(number: int) -> list[RawFrame]:
+    """Return a set of three frames; one sees nothing."""
+    frames = []
+    for index, (name, known) in enumerate(CAMERAS.items()):
+        mean_e = expected_e(known, PLACES[: 2 * index], 3e-4, 3.0)
+        frame = expose(mean_e, known, random(51, number, index), 3e-4)
+        frames.append(replace(frame, camera=name, time_s=number / 30.0, index=number))
+    return frames
+
+
+def _told(found: list[perception.Detections]) -> list[object]:
+    return [(one.reason, one.truncated, [repr(flare) for flare in one]) for one in found]
+
+
+def test_processes_find_what_one_finds_and_leave_nothing() -> None:
+    sets = [_frames(number) for number in range(3)]
+    with DetectorProcesses(CAMERAS, count=2) as detectors:
+        found = [detectors.detect_frames(frames) for frames in sets]
+        memory = [held.name for held in detectors._memory.values()]
+        assert detectors.detect_frames([]) == []
+        pipeline, alone = Pipeline(CAMERAS, detector=detectors.detect_frames), Pipeline(CAMERAS)
+        for frames in sets:
+            one, other = (each.push(frames) for each in (pipeline, alone))
+            assert repr(one.measurements.measurements) == repr(other.measurements.measurements)
+    for frames, several in zip(sets, found, strict=True):
+        assert [len(one) for one in several] == [0, 2, 3]
+        assert _told(several) == _told(perception.detect_frames(frames, CAMERAS))
+    assert len(memory) == 3
+    for name in memory:
+        with pytest.raises(FileNotFoundError):
+            SharedMemory(name)
+    with pytest.raises(RuntimeError, match="were ended"):
+        detectors.detect_frames(sets[0])
+
+
+def test_what_is_wrong_with_a_frame_is_told_and_the_next_is_read() -> None:
+    frames = _frames(0)
+    with DetectorProcesses(CAMERAS, count=1) as detectors:
+        with pytest.raises(ValueError, match=r"no calibration for r9\.up"):
+            detectors.detect_frames([replace(frames[0], camera="r9.up")])
+        for wrong in (frames[0].data_dn[:5], np.empty((0, 0), np.uint16), frames[0].data_dn.astype(object)):
+            broken = replace(frames[1], data_dn=wrong)
+            with pytest.raises(ValueError) as here:
+                perception.detect(broken, CAMERAS[broken.camera])
+            with pytest.raises(ValueError) as there:
+                detectors.detect_frames([frames[0], broken])
+            assert str(there.value) == str(here.value)
+        turned = replace(frames[2], data_dn=np.asfortranarray(frames[2].data_dn))
+        assert len(detectors.detect_frames([turned])[0]) == 3
+    with pytest.raises(ValueError, match="is not known here"):
+        DetectorProcesses(CAMERAS, "robbust")
+    with pytest.raises(ValueError, match="give 1 or more"):
+        DetectorProcesses(CAMERAS, count=0)
+
+
+def test_a_process_that_is_killed_ends_all_and_says_so() -> None:
+    with DetectorProcesses(CAMERAS, "paper", count=2) as detectors:
+        process, _ = detectors._workers[1]
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        with pytest.raises(RuntimeError, match=r"has ended \(status -9\)"):
+            detectors.detect_frames(_frames(0))
+        with pytest.raises(RuntimeError, match="were ended"):
+            detectors.detect_frames(_frames(0))
