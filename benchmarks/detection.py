@@ -1,11 +1,11 @@
 """How long perception takes for sets of four frames, and how exact it is: one JSON object.
 
 Sets of four frames of 1280 × 960 with 0, 4, 20, 80 and 400 spheres at 1.5 to 9 m among them; milliseconds for
-a set (`detect_frames`, on as many threads as it takes by itself, and `DetectorProcesses`), each read several times, once all that is
-compiled is loaded (`perception.warm_up`, where a robot starts: `first_frame_s`); errors of place over the
-Cramér–Rao limit (1 is all that light allows); and what the import and the first frame take in a process of
-its own. Beside it, where they are installed, `sep` (Source Extractor as a library) and `photutils`, on the
-same frames, in the same process.
+a set (`detect_frames`, on as many threads as it takes by itself, and `DetectorProcesses`), each read several
+times, once all that is compiled is loaded (`perception.warm_up`, where a robot starts: `first_frame_s`);
+errors of place over the Cramér–Rao limit (1 is all that light allows); and what the import and the first frame
+take in a process of its own. Beside it, where they are installed, `sep` (Source Extractor as a library) and
+`photutils`, on the same frames, in the same process.
 """
 
 import importlib.util
@@ -122,7 +122,7 @@ def main() -> None:
 
 
 def _time(beside: perception.DetectorProcesses) -> None:
-    def by_processes(frames: Sequence[RawFrame], known: Calibration) -> list[Places]:
+    def by_processes(frames: Sequence[RawFrame], _known: Calibration) -> list[Places]:
         return [[(hit.u_px, hit.v_px) for hit in hits] for hits in beside.detect_frames(frames)]
 
     finders = {n: f for n, f in PEERS.items() if n == "robust" or importlib.util.find_spec(n) is not None}

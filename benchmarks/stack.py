@@ -3,7 +3,8 @@
 Robots stand about a rig of four cameras and repeat a word each at 10 Hz; the frames, 30 sets a second, are
 drawn before anything is timed (`tests/unit/perception/simulation.py`) and each is read once, so that it comes
 from memory as a camera leaves it there. Figures are of the sets after the first second: how long a set takes,
-and of that detection by itself, in threads and in processes; how many tracks there are at the end, and how many messages were read.
+and of that detection by itself, in threads and in processes; how many tracks there are at the end, and how
+many messages were read.
 `--seconds 7` and more lets whole packets be heard.
 """
 

@@ -79,9 +79,9 @@ def test_each_of_many_sources_shines_in_fog_as_if_alone(make: Loader, number: in
     ("samples", "renders", "asymmetry", "albedo"),
     [
         (64, 8, 0.5, 0.9),
-        pytest.param(256, 24, 0.5, 0.9, marks=pytest.mark.verify),
-        pytest.param(256, 24, 0.0, 0.9, marks=(pytest.mark.verify, pytest.mark.at_length)),
-        pytest.param(256, 24, 0.5, 0.05, marks=pytest.mark.verify),
+        pytest.param(256, 12, 0.5, 0.9, marks=pytest.mark.verify),
+        pytest.param(256, 12, 0.0, 0.9, marks=(pytest.mark.verify, pytest.mark.at_length)),
+        pytest.param(256, 12, 0.5, 0.05, marks=pytest.mark.verify),
     ],
 )
 def test_a_mirror_in_fog_doubles_the_world(
@@ -93,7 +93,7 @@ def test_a_mirror_in_fog_doubles_the_world(
     mirror image in endless fog without a mirror, summed up. (On one of 2 km a GPU places hits worse than shadow
     rays are shortened, and loses 0.5 %.) Light that goes to and fro must be found once: by the
     source, by its image, or by a path that turns in fog and then meets the mirror. Expected: both halves within
-    4 standard errors of the difference, which are 0.3 % at most of 8 renders and 0.1 % of 24.
+    4 standard errors of the difference, which are 0.3 % at most of 8 renders and 0.1 % of 12.
     """
     fog = {
         "extinction": "0.3 /m",
