@@ -3,8 +3,8 @@
 Sets of four frames of 1280 × 960 with 0, 4, 20, 80 and 400 spheres at 1.5 to 9 m among them; milliseconds for
 a set (`detect_frames`, on as many threads as it takes by itself, and `DetectorProcesses`), each read several
 times, once all that is compiled is loaded (`perception.warm_up`, where a robot starts: `first_frame_s`);
-errors of place over the Cramér–Rao limit (1 is all that light allows); and what the import and the first frame
-take in a process of its own. Beside it, where they are installed, `sep` (Source Extractor as a library) and
+errors of place over the Cramér–Rao limit (1 is all that light allows); and what import and first frame take
+in a process of its own. Beside it, where they are installed, `sep` (Source Extractor as a library) and
 `photutils`, on the same frames, in the same process.
 """
 

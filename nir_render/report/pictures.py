@@ -16,8 +16,8 @@ from nir_render.evaluate.metrics import Evaluation, Score
 from nir_render.report.parts import data_uri
 from nir_render.report.style import TRUTH, look
 from nir_render.report.wording import counted, metres
-from perception.picture import tone_map
 from perception.types import Calibration, Detection, FrameKey, RawFrame
+from perception.types.picture import tone_map
 
 Item = TypeVar("Item")
 

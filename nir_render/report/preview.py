@@ -14,8 +14,8 @@ from nir_render.evaluate.match import image_radius_px
 from nir_render.evaluate.metrics import Score
 from nir_render.report.pictures import key_of, spread, whole_picture
 from nir_render.report.style import GROUND, LINE, MATPLOTLIB, TRUTH, look
-from perception.picture import tone_map
 from perception.types import Calibration, FrameKey, RawFrame
+from perception.types.picture import tone_map
 
 _WHOLE_IN, _CLOSE_IN = 5.0, 2.3
 _WHOLE_CAMERAS = 4

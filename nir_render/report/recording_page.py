@@ -26,9 +26,9 @@ from nir_render.report.recording_checks import ShapesSeen, darkness_warnings, sh
 from nir_render.report.style import MATPLOTLIB, look
 from nir_render.report.wording import counted, metres, share
 from perception.causes import DetectionCauses
-from perception.picture import tone_map
 from perception.rig.overlap import finest, overlap_warnings
 from perception.types import Calibration, Detection, FrameKey, RawFrame
+from perception.types.picture import tone_map
 
 _WHOLES = 4
 _CHECKED = 8  # frames of a camera that are held against its calibration

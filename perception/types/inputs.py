@@ -35,7 +35,7 @@ class RawFrame:
 
     def _repr_png_(self) -> bytes:
         """Show the frame as a picture in a notebook, tone-mapped."""
-        from perception.picture import frame_png
+        from perception.types.picture import frame_png
 
         return frame_png(self.data_dn, self.black_level_dn)
 

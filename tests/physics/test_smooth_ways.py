@@ -241,3 +241,30 @@ def test_panes_are_passed_one_by_one_where_a_kernel_knows_one_scene(
     assert (np.abs(one_scene - two_scenes) < 1e-4 * two_scenes.max()).mean() > 0.999
     monkeypatch.setattr(connect, "_PAST", 1e3)  # control: whatever stands behind a pane hides nothing
     assert abs(group_radiance(scene, 1).sum() / two_scenes.sum() - 1.0) > 1e-4
+
+
+@pytest.mark.vectorised
+def test_rays_to_the_sun_pass_panes_far_from_the_middle_of_the_world(
+    make: Loader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """200 m away float32 places a pane by 15 um, and a ray to the sun has no end: none may stay at a pane."""
+    if traces_one_scene():
+        pytest.skip("panes are passed one by one here, whatever is asked for")
+    shapes = {
+        f"pane{k}": rectangle_document((203, 150, 0.5 + 0.2 * k), (3, 3), (0.3 * k, 0.2, 1), "pane")
+        for k in range(3)
+    }
+    shapes["floor"] = rectangle_document((203, 150, 0), (4, 4), (0, 0, 1), "paint")
+    shapes["screen"] = rectangle_document((203, 150, 2), (1, 1), (0, 0, 1), "paint")
+    data = scene_document(
+        {"c": camera_document(64, 48, FOCAL_PX)}, {}, samples=64, max_depth=6, shapes=shapes,
+        sun={"azimuth": "40 deg", "elevation": "50 deg", "irradiance": "0.4 W/m^2/nm"},
+        materials={"pane": {"type": "pane"}, "paint": {"type": "diffuse", "reflectance": 0.6}},
+    )  # fmt: skip
+    data["robots"]["eye"]["position"] = "[200, 150, 0.3] m"
+    scene = make(data)
+    two_scenes = group_radiance(scene, 1)
+    monkeypatch.setattr(groups, "traces_one_scene", lambda: True)
+    one_scene = group_radiance(scene, 1)
+    assert two_scenes.sum() > 0.0
+    assert one_scene.sum() == pytest.approx(two_scenes.sum(), rel=1e-3)

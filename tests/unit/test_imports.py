@@ -38,9 +38,9 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "nir_render.randomness": (),
     "nir_render.geometry": (),
     "nir_render.errors": (),
+    "perception.processes": (),
     "perception.warm_up": (),
     "perception.pipeline": (),
-    "perception.processes": (),
     "perception.pairs": (),
     "perception.photometry": (),
     "perception.track": (),
@@ -59,7 +59,6 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.own_code": (),
     "perception.compiled": (),
     "perception.types": (),
-    "perception.picture": (),
 }
 GROUND = ("errors.py", "geometry.py", "randomness.py")
 MOST_FILES = 12

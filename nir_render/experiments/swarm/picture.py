@@ -26,7 +26,7 @@ from nir_render.report.time.film import places_px
 from nir_render.scene.pose import Pose
 from perception import Calibration, Message, RawFrame, Track
 from perception.model.bearing import bearing_body
-from perception.picture import tone_map
+from perception.types.picture import tone_map
 
 Array = NDArray[np.float64]
 

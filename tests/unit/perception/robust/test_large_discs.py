@@ -66,7 +66,7 @@ def _seen_e(places: list[Place], shown: float = 1.0, turn_rad: float = 0.0) -> A
     return np.asarray(light.reshape(SIDE_PX, FINE, SIDE_PX, FINE).sum(axis=(1, 3)))
 
 
-@pytest.mark.parametrize("shown", [0.9, 0.97, 0.99, 0.995])
+@pytest.mark.parametrize("shown", [0.9, 0.97, 0.98])
 def test_what_a_body_hides_a_little_of_is_doubted(shown: float) -> None:
     """By the sum 2.7 % and 0.4 % too far, by 110 and 18 σ."""
     place = (90.3, 101.6, 0.14)
