@@ -83,16 +83,18 @@ def test_a_scene_lights_as_the_goniometer_measured(name: str) -> None:
 @pytest.mark.verify
 @pytest.mark.vectorised
 @pytest.mark.parametrize(
-    "polar_deg",
+    ("polar_deg", "samples", "most_off"),
     [
-        85.0,
-        pytest.param(45.0, marks=pytest.mark.at_length),
+        (85.0, 192, 0.02),
+        pytest.param(85.0, 768, 0.01, marks=pytest.mark.at_length),
+        pytest.param(45.0, 768, 0.01, marks=pytest.mark.at_length),
     ],
 )
-def test_a_path_tracer_sees_the_same_source(polar_deg: float) -> None:
+def test_a_path_tracer_sees_the_same_source(polar_deg: float, samples: int, most_off: float) -> None:
     """Mitsuba's volumetric path tracer from a camera at 1 m, on meshes, in float32, against counted photons.
 
-    The die is 4 mm in radius, as paths from a camera seldom find one of 1.2 mm: within 1 %.
+    The die is 4 mm in radius, as paths from a camera seldom find one of 1.2 mm: within 1 % at length, else within
+    the 2 % that a quarter of the samples tells.
     """
     preset = load_built("diffused")
     wide = preset.model_copy(update={"dies": (preset.dies[0].model_copy(update={"radius_m": 4e-3}),)})
@@ -100,11 +102,11 @@ def test_a_path_tracer_sees_the_same_source(polar_deg: float) -> None:
     row = round(polar_deg / 5.0)
     scene = mitsuba_scene(wide)
     angle_rad = math.radians(polar_deg)
-    parts = [intensity_at(scene, wide, angle_rad, 768, seed) for seed in range(8)]
+    parts = [intensity_at(scene, wide, angle_rad, samples, seed) for seed in range(8)]
     sigma = float(np.hypot(np.std(parts, ddof=1) / math.sqrt(8), gram.sigma_per_sr[row, 0]))
     expected = float(gram.intensity_per_sr[row, 0])
-    assert sigma < 0.006 * expected
-    assert np.mean(parts) == pytest.approx(expected, rel=0.01)
+    assert sigma < 0.6 * most_off * expected
+    assert np.mean(parts) == pytest.approx(expected, rel=most_off)
 
 
 @pytest.mark.verify
