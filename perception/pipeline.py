@@ -169,7 +169,7 @@ class Pipeline:
         Raises
         ------
         ValueError
-            There are no frames, or those of another robot than before; as for `detect`.
+            There are no frames, or those of another robot than before; as for `detect`, or its own detector.
         """
         if self._detector is not None:
             return self.follow(frames, self._detector(frames), odometry)

@@ -8,12 +8,14 @@ import contextlib
 import math
 import os
 import signal
+import threading
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing import connection, get_context
 from multiprocessing.shared_memory import SharedMemory
 from types import TracebackType
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -31,6 +33,7 @@ class DetectorProcesses:
             pipeline = perception.Pipeline(calibrations, detector=detectors.detect_frames)
 
     They load the package anew: where a script makes it, that must stand below ``if __name__ == "__main__":``.
+    It is made once they are ready: a second or two, minutes where the package's loops were never compiled.
 
     Parameters
     ----------
@@ -41,7 +44,7 @@ class DetectorProcesses:
     limit_s
         As for `detect`, of each frame.
     count
-        How many; by default as many as there are cores, and cameras.
+        How many; by default as many as there are cores, or cameras if these are fewer.
 
     Raises
     ------
@@ -66,20 +69,19 @@ class DetectorProcesses:
         if count < 1:
             raise ValueError(f"{count} processes detect nothing: give 1 or more")
         self._calibrations = dict(calibrations)
-        self._memory: dict[int, SharedMemory] = {}
-        self._estimator, self._limit_s = estimator, limit_s
-        self._workers: list[tuple[Any, connection.Connection]] = []
-        context = get_context("spawn")
-        for _ in range(count):
-            mine, its = context.Pipe()
-            process = context.Process(
-                target=_serve, args=(its, self._calibrations, estimator, limit_s), daemon=True
-            )
-            process.start()
-            its.close()
-            self._workers.append((process, mine))
-        for process, mine in self._workers:
-            self._receive(process, mine)
+        self._one_at_a_time = threading.RLock()
+        self._workers: list[_Worker] = []
+        self._finalizer = weakref.finalize(self, _end, self._workers)
+        try:
+            for _ in range(count):
+                self._workers.append(_Worker(self._calibrations, estimator, limit_s))
+            for worker in self._workers:
+                worker.answer(
+                    'does not start; in a script it must be made below `if __name__ == "__main__":`'
+                )
+        except BaseException:
+            self.close()
+            raise
 
     def detect_frames(self, frames: Sequence[RawFrame]) -> list[Detections]:
         """Find the flares of several frames, as `perception.detect_frames` does: to the bit the same.
@@ -89,46 +91,28 @@ class DetectorProcesses:
         ValueError
             As for `detect`, or if a frame's camera has no calibration.
         RuntimeError
-            A process has ended, or all were ended before.
+            A process has ended, which ends the others too, or they were ended before.
         """
         require_calibrations(frames, self._calibrations)
-        if not self._workers:
-            raise RuntimeError("the detector's processes were ended: make others")
-        results: dict[int, Detections | Exception] = {}
-        waiting = list(range(len(frames)))[::-1]
-        busy: dict[connection.Connection, tuple[Any, int]] = {}
-        for process, mine in self._workers:
-            self._hand_over(frames, waiting, results, busy, process, mine)
-        while busy:
-            for ready in connection.wait(list(busy)):
-                assert isinstance(ready, connection.Connection)
-                process, index = busy.pop(ready)
-                results[index] = self._receive(process, ready)
-                self._hand_over(frames, waiting, results, busy, process, ready)
+        with self._one_at_a_time:
+            if not self._workers:
+                raise RuntimeError("the detector's processes were ended: make others")
+            try:
+                answers = self._answers(frames)
+            except BaseException:  # an answer that nobody waits for would be taken for the next frame's
+                self.close()
+                raise
         found = []
-        for index in range(len(frames)):
-            result = results[index]
-            if isinstance(result, Exception):
-                raise result
-            found.append(result)
+        for answer in answers:
+            if isinstance(answer, Exception):
+                raise answer
+            found.append(answer)
         return found
 
     def close(self) -> None:
         """End the processes, and give their memory back."""
-        for _, mine in self._workers:
-            with contextlib.suppress(OSError):
-                mine.send(None)
-        for process, mine in self._workers:
-            process.join(_ENDS_WITHIN_S)
-            if process.is_alive():
-                process.kill()
-                process.join()
-            mine.close()
-        self._workers = []
-        for memory in self._memory.values():
-            memory.close()
-            memory.unlink()
-        self._memory = {}
+        with self._one_at_a_time:
+            _end(self._workers)
 
     def __enter__(self) -> "DetectorProcesses":
         return self
@@ -138,98 +122,117 @@ class DetectorProcesses:
     ) -> None:
         self.close()
 
-    def _hand_over(
-        self,
-        frames: Sequence[RawFrame],
-        waiting: list[int],
-        results: dict[int, Detections | Exception],
-        busy: dict[connection.Connection, tuple[Any, int]],
-        process: Any,
-        mine: connection.Connection,
-    ) -> None:
-        """Give a process the next frame that waits, if one does. What is no picture is told at once."""
-        while waiting:
-            index = waiting.pop()
-            frame = frames[index]
-            pixels = frame.data_dn
-            if not isinstance(pixels, np.ndarray) or pixels.dtype.kind not in "iuf" or pixels.size == 0:
-                try:
-                    results[index] = detect(
-                        frame, self._calibrations[frame.camera], self._estimator, limit_s=self._limit_s
-                    )
-                except ValueError as error:
-                    results[index] = error
-                continue
-            memory = self._memory_of(index, pixels.nbytes)
-            np.copyto(np.ndarray(pixels.shape, pixels.dtype, memory.buf), pixels)
-            empty = replace(frame, data_dn=np.empty((0, 0), dtype=np.uint16))
-            try:
-                mine.send(_Handed(index, memory.name, pixels.shape, pixels.dtype.str, empty))
-            except OSError:
-                self._fail(process)
-            busy[mine] = (process, index)
-            return
+    def _answers(self, frames: Sequence[RawFrame]) -> list[Detections | Exception]:
+        """Give each process a frame, and the next one when it answers."""
+        answers: dict[int, Detections | Exception] = {}
+        waiting = iter(enumerate(frames))
+        busy: dict[Any, tuple[_Worker, int]] = {}
+        idle = list(self._workers)
+        while True:
+            for worker in idle:
+                handed = next(waiting, None)
+                if handed is not None:
+                    worker.hand_over(handed[1])
+                    busy[worker.pipe] = (worker, handed[0])
+            if not busy:
+                return [answers[index] for index in range(len(frames))]
+            idle = []
+            for ready in connection.wait(list(busy)):
+                worker, index = busy.pop(ready)
+                answers[index] = worker.answer("has ended, and the others with it: make others")
+                idle.append(worker)
 
-    def _memory_of(self, index: int, least_bytes: int) -> SharedMemory:
-        held = self._memory.get(index)
-        if held is None or held.size < least_bytes:
-            if held is not None:
-                held.close()
-                held.unlink()
-            self._memory[index] = held = SharedMemory(create=True, size=least_bytes)
-        return held
 
-    def _receive(self, process: Any, mine: connection.Connection) -> Any:
-        try:
-            return mine.recv()
-        except (EOFError, OSError):
-            self._fail(process)
+class _Worker:
+    """A process, the pipe to it, and the memory in which it finds its frame."""
 
-    def _fail(self, process: Any) -> None:
-        process.join(_ENDS_WITHIN_S)
-        status = process.exitcode
-        self.close()
-        raise RuntimeError(
-            f"a process of the detector has ended (status {status}), the others with it: make others, in a "
-            'script below `if __name__ == "__main__":`'
+    def __init__(self, calibrations: Mapping[str, Calibration], estimator: str, limit_s: float) -> None:
+        context = get_context("spawn")
+        self.pipe, its = context.Pipe()
+        self._memory: SharedMemory | None = None
+        self.process = context.Process(
+            target=_serve, args=(its, calibrations, estimator, limit_s), daemon=True
         )
+        self.process.start()
+        its.close()
+
+    def hand_over(self, frame: RawFrame) -> None:
+        """Give it a frame. What is no array of numbers goes as it is."""
+        pixels, place = frame.data_dn, None
+        if isinstance(pixels, np.ndarray) and pixels.dtype.kind in "iuf" and pixels.size:
+            if self._memory is None or self._memory.size < pixels.nbytes:
+                self._forget()
+                self._memory = SharedMemory(create=True, size=pixels.nbytes)
+            np.copyto(np.ndarray(pixels.shape, pixels.dtype, self._memory.buf), pixels)
+            place = _Place(self._memory.name, pixels.shape, pixels.dtype.str)
+            frame = replace(frame, data_dn=np.empty((0, 0), dtype=np.uint16))
+        with contextlib.suppress(OSError):  # one that has ended is told where its answer is waited for
+            self.pipe.send((frame, place))
+
+    def answer(self, otherwise: str) -> Any:
+        """Wait for its answer; raise RuntimeError where it ends without one."""
+        try:
+            return self.pipe.recv()
+        except (EOFError, OSError):
+            self._fail(otherwise)
+
+    def end(self) -> None:
+        """End it, within seconds."""
+        with contextlib.suppress(OSError):
+            self.pipe.send(None)
+        self.process.join(_ENDS_WITHIN_S)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+        self.pipe.close()
+        self._forget()
+
+    def _fail(self, how: str) -> NoReturn:
+        self.process.join(_ENDS_WITHIN_S)
+        raise RuntimeError(f"a process of the detector (status {self.process.exitcode}) {how}")
+
+    def _forget(self) -> None:
+        if self._memory is not None:
+            self._memory.close()
+            with contextlib.suppress(FileNotFoundError):
+                self._memory.unlink()
+            self._memory = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Handed:
-    """A frame on its way: which of the set, where its pixels lie, and the rest of it."""
+def _end(workers: "list[_Worker]") -> None:
+    while workers:
+        workers.pop().end()
 
-    index: int
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the pixels of a frame lie."""
+
     memory: str
     shape: tuple[int, ...]
     dtype: str
-    frame: RawFrame
 
 
 def _serve(
-    mine: connection.Connection, calibrations: Mapping[str, Calibration], estimator: str, limit_s: float
+    pipe: connection.Connection, calibrations: Mapping[str, Calibration], estimator: str, limit_s: float
 ) -> None:
     """Find flares in frames until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for who started it
     warm_up_frames()
-    mine.send("ready")
-    held: dict[int, SharedMemory] = {}
-    with contextlib.suppress(EOFError, OSError):
-        while isinstance(handed := mine.recv(), _Handed):
-            memory = held.get(handed.index)
-            if memory is None or memory.name != handed.memory:
-                if memory is not None:
-                    memory.close()
-                held[handed.index] = memory = SharedMemory(handed.memory)
-            pixels: Any = np.ndarray(handed.shape, handed.dtype, memory.buf)
-            frame = replace(handed.frame, data_dn=pixels)
+    with contextlib.suppress(EOFError, OSError):  # nobody is there any more
+        pipe.send("ready")
+        held: SharedMemory | None = None
+        while (handed := pipe.recv()) is not None:
             answer: Detections | Exception
             try:
+                frame, place = handed
+                if place is not None:
+                    if held is None or held.name != place.memory:
+                        held = SharedMemory(place.memory)
+                    frame = replace(frame, data_dn=np.ndarray(place.shape, place.dtype, held.buf))
                 answer = detect(frame, calibrations[frame.camera], estimator, limit_s=limit_s)
             except ValueError as error:
                 answer = error
-            del frame, pixels  # a memory that something looks at cannot be given back
-            mine.send(answer)
-    for memory in held.values():
-        with contextlib.suppress(BufferError):
-            memory.close()
+            except Exception as error:  # whatever it is, it is told where it is waited for
+                answer = RuntimeError(f"{type(error).__name__}: {error}")
+            pipe.send(answer)

@@ -1,15 +1,15 @@
 """Frames side by side in processes: what they find is what one finds by itself, and nothing hangs or is left."""
 
-import os
-import signal
 from dataclasses import replace
 from multiprocessing.shared_memory import SharedMemory
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import perception
-from perception import Calibration, DetectorProcesses, Pipeline, RawFrame
+from perception import Calibration, DetectorProcesses, Pipeline, RawFrame, processes
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 NAMES = ("r1.front", "r1.back", "r1.left")
@@ -35,7 +35,7 @@ def test_processes_find_what_one_finds_and_leave_nothing() -> None:
     sets = [_frames(number) for number in range(3)]
     with DetectorProcesses(CAMERAS, count=2) as detectors:
         found = [detectors.detect_frames(frames) for frames in sets]
-        memory = [held.name for held in detectors._memory.values()]
+        memory = [worker._memory.name for worker in detectors._workers if worker._memory]
         assert detectors.detect_frames([]) == []
         pipeline, alone = Pipeline(CAMERAS, detector=detectors.detect_frames), Pipeline(CAMERAS)
         for frames in sets:
@@ -44,7 +44,7 @@ def test_processes_find_what_one_finds_and_leave_nothing() -> None:
     for frames, several in zip(sets, found, strict=True):
         assert [len(one) for one in several] == [0, 2, 3]
         assert _told(several) == _told(perception.detect_frames(frames, CAMERAS))
-    assert len(memory) == 3
+    assert len(memory) == 2
     for name in memory:
         with pytest.raises(FileNotFoundError):
             SharedMemory(name)
@@ -57,7 +57,13 @@ def test_what_is_wrong_with_a_frame_is_told_and_the_next_is_read() -> None:
     with DetectorProcesses(CAMERAS, count=1) as detectors:
         with pytest.raises(ValueError, match=r"no calibration for r9\.up"):
             detectors.detect_frames([replace(frames[0], camera="r9.up")])
-        for wrong in (frames[0].data_dn[:5], np.empty((0, 0), np.uint16), frames[0].data_dn.astype(object)):
+        of_wrong: tuple[Any, ...] = (
+            frames[0].data_dn[:5],
+            np.empty((0, 0), np.uint16),
+            frames[0].data_dn.astype(object),
+            np.ones((2, 2)),
+        )
+        for wrong in of_wrong:
             broken = replace(frames[1], data_dn=wrong)
             with pytest.raises(ValueError) as here:
                 perception.detect(broken, CAMERAS[broken.camera])
@@ -72,12 +78,27 @@ def test_what_is_wrong_with_a_frame_is_told_and_the_next_is_read() -> None:
         DetectorProcesses(CAMERAS, count=0)
 
 
+def test_an_answer_that_nobody_waited_for_is_no_other_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while frames are away: all is ended, so that no later call takes their flares for its own."""
+    with DetectorProcesses(CAMERAS, "paper", count=2) as detectors:
+
+        def interrupted(_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(processes, "connection", SimpleNamespace(wait=interrupted))
+        with pytest.raises(KeyboardInterrupt):
+            detectors.detect_frames(_frames(0))
+        monkeypatch.undo()
+        with pytest.raises(RuntimeError, match="were ended"):
+            detectors.detect_frames(_frames(0))
+
+
 def test_a_process_that_is_killed_ends_all_and_says_so() -> None:
     with DetectorProcesses(CAMERAS, "paper", count=2) as detectors:
-        process, _ = detectors._workers[1]
-        os.kill(process.pid, signal.SIGKILL)
+        process = detectors._workers[1].process
+        process.kill()
         process.join()
-        with pytest.raises(RuntimeError, match=r"has ended \(status -9\)"):
+        with pytest.raises(RuntimeError, match=r"\(status .+\) has ended, and the others with it"):
             detectors.detect_frames(_frames(0))
         with pytest.raises(RuntimeError, match="were ended"):
             detectors.detect_frames(_frames(0))

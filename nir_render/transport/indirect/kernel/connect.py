@@ -388,7 +388,7 @@ def _first_opaque(scene: DeviceScene, ray: Ray, active: Mask) -> tuple[UInt, Mas
             dr.select(passes, rest - past, rest),
             dr.select(hit, number, shape),
             passes,
-            met | (hit & ~is_pane),
+            met | (hit & ~(is_pane & ((past >= rest) | passes))),
             passed + 1,
         )
 
