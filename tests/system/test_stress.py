@@ -106,7 +106,7 @@ def left_over(folder: Path) -> list[str]:
 
 def test_a_campaign_runs_stops_and_goes_on(tmp_path: Path) -> None:
     """Ctrl-C after the first jobs: exit 130, and how to go on; then the rest, and then nothing more to do."""
-    file, output = campaign(tmp_path, ranges=2, exposures=10), tmp_path / "out"
+    file, output = campaign(tmp_path, ranges=2, exposures=20), tmp_path / "out"
     process = start(file, output)
     while process.poll() is None and len(list(output.glob("jobs/*.parquet"))) < 3:
         time.sleep(0.05)
@@ -116,26 +116,26 @@ def test_a_campaign_runs_stops_and_goes_on(tmp_path: Path) -> None:
         os.kill(one, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert "of 20 jobs done; the same command goes on: " in err.replace("\n", " ")
+    assert "of 40 jobs done; the same command goes on: " in err.replace("\n", " ")
     assert "Traceback" not in err
     assert not any(worker.is_running() for worker in workers)
     assert not (output / "table.parquet").exists()
     parts = times_of(output)
-    assert 3 <= len(parts) < 20
+    assert 3 <= len(parts) < 40
 
     summary = json.loads(finished(file, output, "--json"))
-    assert (summary["jobs"], summary["done_before"], summary["failed"]) == (20, len(parts), 0)
+    assert (summary["jobs"], summary["done_before"], summary["failed"]) == (40, len(parts), 0)
     assert set(summary["estimators"]) == {"paper", "robust"}
     told = json.loads(finished(file, output, "--status", "--json"))
-    assert told == {"campaign": "tiny", "jobs": 20, "done": 20, "others": 0}
+    assert told == {"campaign": "tiny", "jobs": 40, "done": 40, "others": 0}
     kept = times_of(output)
-    assert len(kept) == 20
+    assert len(kept) == 40
     assert kept.items() >= parts.items()
     assert left_over(output) == []
     assert "range" in (output / "report.html").read_text()
 
     before = contents(output)
-    assert json.loads(finished(file, output, "--json"))["done_before"] == 20
+    assert json.loads(finished(file, output, "--json"))["done_before"] == 40
     assert contents(output) == before
 
 
