@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import connection, get_context
 from multiprocessing.shared_memory import SharedMemory
 from types import TracebackType
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class DetectorProcesses:
         self._calibrations = dict(calibrations)
         self._one_at_a_time = threading.RLock()
         self._workers: list[_Worker] = []
-        self._finalizer = weakref.finalize(self, _end, self._workers)
+        weakref.finalize(self, _end, self._workers)  # where nobody closes it
         try:
             for _ in range(count):
                 self._workers.append(_Worker(self._calibrations, estimator, limit_s))
@@ -174,7 +174,9 @@ class _Worker:
         try:
             return self.pipe.recv()
         except (EOFError, OSError):
-            self._fail(otherwise)
+            self.process.join(_ENDS_WITHIN_S)
+            status = self.process.exitcode
+            raise RuntimeError(f"a process of the detector (status {status}) {otherwise}") from None
 
     def end(self) -> None:
         """End it, within seconds."""
@@ -186,10 +188,6 @@ class _Worker:
             self.process.join()
         self.pipe.close()
         self._forget()
-
-    def _fail(self, how: str) -> NoReturn:
-        self.process.join(_ENDS_WITHIN_S)
-        raise RuntimeError(f"a process of the detector (status {self.process.exitcode}) {how}")
 
     def _forget(self) -> None:
         if self._memory is not None:

@@ -5,9 +5,12 @@ them are either wholly in the camera's view or wholly out of it: the share that 
 partly hidden one is sampled by rays, and would be seen here.
 """
 
+from pathlib import Path
 from typing import Any
 
 import yaml
+
+from nir_render import Scene, load_scene
 
 WIDTH_PX, HEIGHT_PX = 160, 120
 FOCAL_PX, SIGMA_PX = 80.0, 0.7
@@ -160,6 +163,13 @@ def plain(room: str) -> dict[str, Any]:
     """Return a room as plain data."""
     document: dict[str, Any] = yaml.safe_load(ROOMS[room])
     return document
+
+
+def load_room(room: str, folder: Path, samples: int) -> Scene:
+    """Write a room to `room.yaml` in a folder, and load it with so many samples a pixel."""
+    path = folder / "room.yaml"
+    path.write_text(yaml.safe_dump(plain(room), sort_keys=False))
+    return load_scene(path, {"render.indirect.samples": samples})
 
 
 def groups(document: dict[str, Any]) -> list[str]:

@@ -7,7 +7,6 @@ each source spread evenly over it, and once without these surroundings.
 """
 
 import hashlib
-import io
 import json
 import sys
 import tempfile
@@ -17,14 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
 
-from nir_render import Light, Scene, expected_electrons, load_scene, render
+from nir_render import Light, Scene, expected_electrons, render
 from nir_render.transport.backend.variant import backend
 from tests.physics import stock
-from tests.physics.rooms import FOCAL_PX, HEIGHT_PX, ROOMS, SIGMA_PX, WIDTH_PX, groups, plain
+from tests.physics.rooms import FOCAL_PX, HEIGHT_PX, ROOMS, SIGMA_PX, WIDTH_PX, groups, load_room, plain
 from tests.physics.stock import stock_radiance
 from tests.statistics import Parts, parts_of
 
@@ -150,7 +148,7 @@ def render_room(room: str, seed: int = 1) -> StockRoom:
     names, sampling = groups(plain(room)), SAMPLING[room]
     aside = _aside(room)
 
-    def stacks(emitting: list[list[str]], batches: int, seed: int) -> Array:
+    def stacks(emitting: list[list[str]], batches: int) -> Array:
         return weighted(
             stock_radiance(
                 plain(room), emitting, samples=sampling.samples, batches=batches, variant=backend().variant,
@@ -158,17 +156,15 @@ def render_room(room: str, seed: int = 1) -> StockRoom:
             )
         )  # fmt: skip
 
-    (together,) = stacks([names], sampling.batches // 2, seed)
-    alone = stacks([[name] for name in names], sampling.batches, seed)
+    (together,) = stacks([names], sampling.batches // 2)
+    alone = stacks([[name] for name in names], sampling.batches)
     return StockRoom(aside, both_parts(together, aside), tuple(both_parts(stack, aside) for stack in alone))
 
 
 def _aside(room: str) -> NDArray[np.bool_]:
     """Return which pixels no straight light, nor any by way of one mirror, falls on."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "room.yaml"
-        path.write_text(yaml.safe_dump(plain(room), sort_keys=False))
-        scene = load_scene(path, {"render.indirect.samples": 16})
+        scene = load_room(room, Path(folder), 16)
         return np.asarray(~(straight(scene, render(scene, CAMERA, seed=0)) > 0.0).any(axis=0))
 
 
@@ -178,23 +174,22 @@ def _key(room: str) -> str:
     return hashlib.sha256(json.dumps([plain(room), how], sort_keys=True).encode()).hexdigest()
 
 
-def _write(rooms: dict[str, StockRoom]) -> None:
+def _write(room: str, one: StockRoom) -> None:
     arrays: dict[str, Any] = {}
     if FILE.exists():
         with np.load(FILE) as kept:
             arrays = dict(kept)
-    for room, one in rooms.items():
-        numbers = [[(part.mean, part.variance) for part in both] for both in (one.together, *one.alone)]
-        arrays[f"{room}/key"] = np.array(_key(room))
-        arrays[f"{room}/aside"] = np.packbits(one.aside)
-        arrays[f"{room}/parts"] = np.array(numbers)
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **dict(sorted(arrays.items())))
-    FILE.with_suffix(".tmp").write_bytes(buffer.getvalue())
-    FILE.with_suffix(".tmp").replace(FILE)
+    numbers = [[(part.mean, part.variance) for part in both] for both in (one.together, *one.alone)]
+    arrays[f"{room}/key"] = np.array(_key(room))
+    arrays[f"{room}/aside"] = np.packbits(one.aside)
+    arrays[f"{room}/parts"] = np.array(numbers)
+    aside = FILE.with_suffix(".tmp")
+    with aside.open("wb") as file:
+        np.savez_compressed(file, **dict(sorted(arrays.items())))
+    aside.replace(FILE)
 
 
 if __name__ == "__main__":
     for asked in sys.argv[1:] or ROOMS:
-        _write({asked: render_room(asked)})
+        _write(asked, render_room(asked))
         sys.stdout.write(f"{asked}: rendered\n")

@@ -18,12 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import yaml
 from numpy.typing import NDArray
 
-from nir_render import load_scene, render
+from nir_render import render
 from nir_render.transport.backend.variant import backend
-from tests.physics.rooms import ROOMS, groups, plain
+from tests.physics.rooms import ROOMS, groups, load_room, plain
 from tests.physics.stock_rooms import (
     CAMERA,
     StockRoom,
@@ -67,9 +66,7 @@ def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     if not backend().vectorised:
         pytest.skip("without LLVM light groups are rendered by Mitsuba's own path tracer")
     room = request.param
-    path = tmp_path_factory.mktemp("groups") / "room.yaml"
-    path.write_text(yaml.safe_dump(plain(room), sort_keys=False))
-    scene = load_scene(path, {"render.indirect.samples": SAMPLES[room]})
+    scene = load_room(room, tmp_path_factory.mktemp("groups"), SAMPLES[room])
     lights = [render(scene, CAMERA, seed=seed) for seed in range(SEEDS)]
     assert list(lights[0].groups) == groups(plain(room))
     direct = straight(scene, lights[0])

@@ -9,11 +9,11 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from nir_render import Scene, load_scene, render
+from nir_render import load_scene, render
 from nir_render.camera.by_spectrum import group_fluxes
 from nir_render.camera.diffuse_images import diffuse_image
 from tests.physics.documents import rectangle_document
-from tests.physics.rooms import ROOMS, plain
+from tests.physics.rooms import ROOMS, load_room
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.vectorised]
 
@@ -24,12 +24,6 @@ SEEDS = 64
 # Of fog the dense one, of walls all but the glossy corridor, say it every time.
 AT_LENGTH = dict.fromkeys(("glossy corridor", "thin fog"), pytest.mark.at_length)
 TILE_PX = 16
-
-
-def _load(room: str, folder: Path, samples: int) -> Scene:
-    path = folder / "room.yaml"
-    path.write_text(yaml.safe_dump(plain(room), sort_keys=False))
-    return load_scene(path, {"render.indirect.samples": samples})
 
 
 def _tile_sums(stack: Array) -> Array:
@@ -53,7 +47,7 @@ def test_the_reported_variance_is_the_true_one_and_no_pixel_is_a_firefly(room: s
     16.4. With samples independent, such a pair falls into one render with a chance of 1/64, so more than 10
     standard errors are passed by at most 1/64 of the pixels that have such a sample, and 16 by none.
     """
-    scene = _load(room, tmp_path, 64)
+    scene = load_room(room, tmp_path, 64)
     lights = [render(scene, "r1.c", seed=seed).indirect for seed in range(SEEDS)]
     values, variance = (
         np.stack([getattr(light, name)[:, 0] for light in lights]).astype(np.float64)
@@ -137,7 +131,7 @@ for threads in (1, 2, 3):
 @pytest.mark.parametrize("room", ["diffuse room", pytest.param("thin fog", marks=pytest.mark.verify)])
 def test_one_thread_and_more_give_the_same_bits(room: str, tmp_path: Path) -> None:
     """By one thread, two, three in a process of their own, as a worker would, and by all in this one."""
-    light = render(_load(room, tmp_path, 16), "r1.c", seed=3).indirect
+    light = render(load_room(room, tmp_path, 16), "r1.c", seed=3).indirect
     assert light is not None
     arguments = [str(tmp_path / "room.yaml"), str(tmp_path)]
     subprocess.run([sys.executable, "-c", _RENDER, *arguments], check=True)
@@ -148,7 +142,7 @@ def test_one_thread_and_more_give_the_same_bits(room: str, tmp_path: Path) -> No
 
 
 def test_the_seed_alone_sets_the_bits(tmp_path: Path) -> None:
-    scene = _load("diffuse room", tmp_path, 16)
+    scene = load_room("diffuse room", tmp_path, 16)
     first, again, other = (render(scene, "r1.c", seed=seed).indirect for seed in (1, 1, 2**40))
     assert first is not None
     assert again is not None
