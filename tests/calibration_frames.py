@@ -172,8 +172,9 @@ def _window(place: int, glare_share: float) -> tuple[slice, slice]:
 def point_spread_bounds(glare_share: float, dsnu_e: float) -> dict[str, float]:
     """Least σ of width and glare: place, flux and background of each range are unknown too.
 
-    Eight frames are added up; DSNU and PRNU are the same in each of them. Without glare only the share is
-    unknown, of glare of 10 px and exponent 2.5.
+    Eight frames are added up; what is left of DSNU, and PRNU, are the same in each of them and at each range: the
+    covariance of a pixel's sums at all ranges is inverted as it is, pixel by pixel. Without glare only the share
+    is unknown, of glare of 10 px and exponent 2.5.
     """
     camera = camera_of(glare_share, "any")
     glare, gain = camera.point_spread.glare, camera.sensor.system_gain_dn_per_e
@@ -186,34 +187,44 @@ def point_spread_bounds(glare_share: float, dsnu_e: float) -> dict[str, float]:
             "exponent": (glare.exponent, 0.05),
         }
     names = [*steps] if glare is not None else ["sigma_px", "share"]
-    total = np.zeros((len(names), len(names)))
     read_e2 = camera.sensor.read_noise_e**2 + 1.0 / (12.0 * gain**2)
-    for place in range(len(RANGES_M)):
+    places, shared = len(RANGES_M), len(names)
+    slopes = np.zeros((shared + 4 * places, places, *_SIZE.values()), dtype=np.float32)
+    light_e, seen = np.zeros((2, places, *_SIZE.values()))
+    for place in range(places):
         at = _window(place, glare_share)
-        image = REPEATS * rail_e(glare_share, place)[0][at]
+        image = REPEATS * rail_e(glare_share, place)[0]
 
-        def change(
-            name: str, value: float, step: float, place: int = place, at: tuple[slice, slice] = at
-        ) -> Array:
-            high, low = (rail_e(glare_share, place, **{name: value + s * step})[0][at] for s in (1, -1))
+        def change(name: str, value: float, step: float, place: int = place) -> Array:
+            high, low = (rail_e(glare_share, place, **{name: value + s * step})[0] for s in (1, -1))
             return np.asarray(REPEATS * (high - low) / (2.0 * step))
 
-        shared = [change(name, *steps[name]) for name in steps]
+        of_all = [change(name, *steps[name]) for name in steps]
         if glare is None:
             some = rail_e(0.02, place)
-            veiled = REPEATS * some[0][at] * rail_e(0.0, place)[1] / some[1]
-            shared.append((veiled - image) / 0.02)
+            veiled = REPEATS * some[0] * rail_e(0.0, place)[1] / some[1]
+            of_all.append((veiled - image) / 0.02)
         own = [change("du", 0.0, 0.02), change("dv", 0.0, 0.02), image, np.ones_like(image)]
-        jacobian = np.array([one.ravel() for one in (*shared, *own)])
-        prnu = camera.sensor.prnu.total
-        variance = image + (prnu * image) ** 2 + REPEATS * read_e2 + (REPEATS * dsnu_e) ** 2
-        information = (jacobian / variance.ravel()) @ jacobian.T
-        count = len(names)
-        own_block = information[count:, count:]
-        total += information[:count, :count] - information[:count, count:] @ np.linalg.solve(
-            own_block, information[count:, :count]
-        )
-    return dict(zip(names, np.sqrt(np.diagonal(np.linalg.inv(total))), strict=True))
+        slopes[:shared, place, *at] = [one[at] for one in of_all]
+        slopes[shared + 4 * place : shared + 4 * place + 4, place, *at] = [one[at] for one in own]
+        light_e[place][at], seen[place][at] = image[at], 1.0
+    prnu = camera.sensor.prnu.total
+    information = np.zeros((len(slopes), len(slopes)))
+    for row in range(_SIZE["rows"]):
+        used = seen[:, row].any(axis=0)
+        if not used.any():
+            continue
+        light, mask, by = (
+            one[..., row, used].T for one in (light_e, seen, slopes)
+        )  # (pixels, places[, slopes])
+        both = mask[:, :, None] * mask[:, None, :]
+        fixed = (REPEATS * dsnu_e) ** 2 * both + prnu**2 * light[:, :, None] * light[:, None, :]
+        own_e2 = (light + REPEATS * read_e2)[:, :, None] * np.eye(places)
+        information += np.einsum("xpk,xpl->kl", by, np.linalg.solve(fixed + own_e2, by), optimize=True)
+    left = information[:shared, :shared] - information[:shared, shared:] @ np.linalg.solve(
+        information[shared:, shared:], information[shared:, :shared]
+    )
+    return dict(zip(names, np.sqrt(np.diagonal(np.linalg.inv(left))), strict=True))
 
 
 def range_constant_bound(dsnu_e: float, calibration: Calibration) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.report.wording import counted
-from perception.calibration.darkness import Darkness, darkness
+from perception.calibration.dark import Darkness, darkness
 from perception.model.flare import image_radius_px
 from perception.model.ranging import angular_radius_rad, flux_at_one_metre_dn
 from perception.types import Calibration, Detection, RawFrame

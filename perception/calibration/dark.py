@@ -1,7 +1,7 @@
-"""What frames with the cap on say: black level, read noise, offsets of pixels."""
+"""What frames with the cap on say: black level, read noise, offsets; and what dark pixels of other frames do."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,8 @@ _MOST_CLIPPED = 1e-3
 _DRIFT_PROBABILITY = 1e-3
 _LIGHT_SIGMAS = 8.0
 _BLOCKS = 8
+_DARK_SIGMAS = 3.0
+_LEAST_LEVEL_SIGMA_DN = 0.3  # of a mean of counts that are rounded, and clipped at 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,3 +246,45 @@ def _drift(frame_means_dn: NDArray[np.float64], variance_dn2: float) -> float:
     freedom = len(frame_means_dn) - 1
     chi2 = float(((frame_means_dn - frame_means_dn.mean()) ** 2).sum()) / max(variance_dn2, 1e-300)
     return math.sqrt(chi2 / freedom) if float(chdtrc(freedom, chi2)) < _DRIFT_PROBABILITY else 1.0
+
+
+@dataclass(frozen=True)
+class Darkness:
+    """The mean count of dark pixels and its σ, and their noise from frame to frame, all in counts."""
+
+    level_dn: float
+    level_sigma_dn: float
+    noise_dn: float
+
+
+def darkness(frames: Sequence[NDArray[np.uint16]]) -> Darkness:
+    """Measure dark level and noise in frames that are mostly dark.
+
+    The level is the mean count of the pixels within three σ of the median; the noise is that of the
+    differences of neighbouring frames there, without what rounding to whole counts adds; of one frame alone,
+    the scatter over its pixels.
+
+    Parameters
+    ----------
+    frames
+        Counts of one camera, at least one frame, each of shape (rows, columns).
+    """
+    levels, squares = [], []
+    inside = np.empty(0, dtype=bool)
+    for number, frame in enumerate(frames):
+        counts = frame.astype(np.float64)
+        middle = float(np.median(counts))
+        # Of whole counts the median deviation is one too, up to half a count too low.
+        scatter = 1.4826 * (float(np.median(np.abs(counts - middle))) + 0.5)
+        here = np.abs(counts - middle) <= _DARK_SIGMAS * scatter
+        levels.append(float(counts[here].mean()))
+        if number:
+            change = (counts - frames[number - 1])[inside & here]
+            squares.append(0.5 * float(np.var(change)) if change.size else 0.0)
+        inside = here
+    if not squares:
+        squares = [float(np.var(frames[0].astype(np.float64)[inside]))]
+    noise_dn = math.sqrt(max(float(np.median(squares)) - _ROUNDING_DN2, 0.0))
+    return Darkness(
+        float(np.mean(levels)), math.hypot(float(np.std(levels)), _LEAST_LEVEL_SIGMA_DN), noise_dn
+    )

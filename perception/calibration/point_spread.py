@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.calibration.rail_equations import RailEquations, RailNoise, rail_equations
 from perception.model.flare import PixelBox, flare_image
 from perception.model.ranging import angular_radius_rad
 from perception.types import Calibration
@@ -54,8 +55,7 @@ class StackedFlare:
     sum_e
         Electrons above black level, shape of the box.
     floor_e2
-        Variance of a dark pixel of the sum: read noise and rounding grow with the number of frames, fixed
-        offsets with its square.
+        Variance of a dark pixel of the sum from frame to frame: read noise and rounding.
     """
 
     range_m: float
@@ -82,7 +82,7 @@ class PointSpreadShape:
 class PointSpreadFit:
     """A fit: the shape, its covariance in ln σ, g, ln r₀, ln (γ − 1), ln growth, and how well it fits.
 
-    `own` is what each place has for itself: u, v, flux and background.
+    `own` is what each place has for itself: u, v, flux and background; `noise`, that of the pixels.
     """
 
     shape: PointSpreadShape
@@ -90,6 +90,7 @@ class PointSpreadFit:
     chi2: float
     freedom: int
     own: Sequence[Array]
+    noise: RailNoise
 
 
 def fit_point_spread(
@@ -101,7 +102,8 @@ def fit_point_spread(
 ) -> PointSpreadFit:
     """Fit the shape to all flares by Gauss–Newton with damping (Levenberg, Marquardt).
 
-    A pixel's variance is that of the model: λ + (PRNU λ)² + floor. Radii of sources have the σ that the
+    A pixel's noise is that of the model; what is fixed about a pixel errs alike at all places
+    (`rail_equations`). Radii of sources have the σ that the
     calibration states; without one they are exact. The shape of glare has a wide prior.
 
     Parameters
@@ -115,7 +117,8 @@ def fit_point_spread(
     free
         Which of ln σ, g, ln r₀, ln (γ − 1), ln growth are to be found.
     like
-        A fit nearby, whose places and fluxes are begun with: two steps from there are enough.
+        A fit nearby, whose places and fluxes are begun with: two steps from there are enough. The noise is
+        then its noise, so that both χ² can be compared.
     """
     shared = to_vector(start)
     free_at = np.flatnonzero(free)
@@ -124,10 +127,16 @@ def fit_point_spread(
         own = [np.array([one.u_px, one.v_px, *_flux_and_background(one)]) for one in flares]
     else:
         own = list(like.own)
-    damping, held = _FIRST_DAMPING if like is None else 0.0, None
+    damping = _FIRST_DAMPING if like is None else 0.0
+
+    def equations(expected: Sequence[tuple[Array, Array]]) -> RailEquations:
+        noise = _noise(flares, expected, calibration) if like is None else like.noise
+        jacobians = [jacobian for _, jacobian in expected]
+        below = (prior[0] - shared, prior[1])
+        return rail_equations(_left_e(flares, expected), jacobians, noise, below)
+
+    held = equations(_expected_of(flares, own, shared, calibration))
     for _ in range(_MOST_STEPS if like is None else _FEW_STEPS):
-        if held is None:
-            held = _normal_equations(flares, own, shared, calibration, prior)
         change, own_changes, covariance = held.step(free_at, damping)
         trial = shared.copy()
         trial[free_at] += change
@@ -135,25 +144,27 @@ def fit_point_spread(
             min(max(x, low), high) for x, (low, high) in zip(trial[2:4], _SHAPE_BOUNDS, strict=True)
         ]
         own_trial = [one + by for one, by in zip(own, own_changes, strict=True)]
-        cost = _cost(flares, own_trial, trial, calibration, prior, held.variances_e2)
+        expected = _expected_of(flares, own_trial, trial, calibration)
+        off = trial - prior[0]
+        cost = held.noise.chi2(_left_e(flares, expected)) + float(off @ (prior[1] * off))
         if cost <= held.chi2 * (1.0 + 1e-12):
             shared, own = trial, own_trial
+            held = equations(expected)
             sigma = np.sqrt(np.diagonal(covariance))
             settled = bool((np.abs(change) < _SETTLED * sigma).all())
-            damping, held = max(0.1 * damping, _LEAST_DAMPING), None
+            damping = max(0.1 * damping, _LEAST_DAMPING)
             if settled and damping < 1e-4:
                 break
         else:
             damping *= 10.0
             if damping > _MOST_DAMPING:
                 break
-    held = _normal_equations(flares, own, shared, calibration, prior)
     _, _, found = held.step(free_at, 0.0)
     covariance = np.zeros((5, 5))
     covariance[np.ix_(free_at, free_at)] = found
     pixels = sum(one.sum_e.size for one in flares)
     freedom = pixels - 4 * len(flares) - len(free_at)
-    return PointSpreadFit(to_shape(shared), covariance, held.chi2, freedom, own)
+    return PointSpreadFit(to_shape(shared), covariance, held.chi2, freedom, own, held.noise)
 
 
 def _prior_of(calibration: Calibration) -> tuple[Array, Array]:
@@ -189,98 +200,41 @@ def _flux_and_background(flare: StackedFlare) -> tuple[float, float]:
     return float((flare.sum_e - background_e).sum()), background_e
 
 
-@dataclass(frozen=True, eq=False)
-class _Equations:
-    """Normal equations of shared and own unknowns, by place; χ², with the prior's; the variances used."""
-
-    shared: list[Array]
-    mixed: list[Array]
-    own: list[Array]
-    shared_slope: list[Array]
-    own_slope: list[Array]
-    prior: Array
-    prior_slope: Array
-    chi2: float
-    variances_e2: list[Array]
-
-    def step(self, free: NDArray[np.int64], damping: float) -> tuple[Array, list[Array], Array]:
-        """Return the steps of the free shared and of the own unknowns, and the covariance of the former."""
-        matrix, slope = self.prior[np.ix_(free, free)].copy(), self.prior_slope[free].copy()
-        solved = []
-        for a, b, c, s, t in zip(
-            self.shared, self.mixed, self.own, self.shared_slope, self.own_slope, strict=True
-        ):
-            a, b, s = a[np.ix_(free, free)], b[free], s[free]
-            c = c + damping * np.diag(np.diagonal(c))
-            answer: Array = np.asarray(np.linalg.solve(c, np.column_stack([b.T, t])), dtype=np.float64)
-            solved.append(answer)
-            matrix += a - b @ answer[:, :-1]
-            slope += s - b @ answer[:, -1]
-        covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-        damped = matrix + damping * np.diag(np.diagonal(matrix))
-        change: Array = np.asarray(np.linalg.solve(damped, slope), dtype=np.float64)
-        return change, [answer[:, -1] - answer[:, :-1] @ change for answer in solved], covariance
+def _expected_of(
+    flares: Sequence[StackedFlare], own: Sequence[Array], shared: Array, calibration: Calibration
+) -> list[tuple[Array, Array]]:
+    return [_expected(flare, one, shared, calibration) for flare, one in zip(flares, own, strict=True)]
 
 
-def _normal_equations(
-    flares: Sequence[StackedFlare],
-    own: Sequence[Array],
-    shared: Array,
-    calibration: Calibration,
-    prior: tuple[Array, Array],
-) -> _Equations:
-    middle, precision = prior
-    off = shared - middle
-    chi2 = float(off @ (precision * off))
-    found = _Equations([], [], [], [], [], np.diag(precision), -precision * off, 0.0, [])
-    for flare, one in zip(flares, own, strict=True):
-        expected_e, jacobian = _expected(flare, one, shared, calibration)
-        variance_e2 = _variance_e2(expected_e, flare, calibration)
-        left = (flare.sum_e - expected_e).ravel()
-        weighted = jacobian / variance_e2.ravel()
-        information, slope = weighted @ jacobian.T, weighted @ left
-        found.shared.append(information[:5, :5])
-        found.mixed.append(information[:5, 5:])
-        found.own.append(information[5:, 5:])
-        found.shared_slope.append(slope[:5])
-        found.own_slope.append(slope[5:])
-        found.variances_e2.append(variance_e2)
-        chi2 += float((left**2 / variance_e2.ravel()).sum())
-    return replace(found, chi2=chi2)
+def _left_e(flares: Sequence[StackedFlare], expected: Sequence[tuple[Array, Array]]) -> list[Array]:
+    return [flare.sum_e - expected_e for flare, (expected_e, _) in zip(flares, expected, strict=True)]
 
 
-def _cost(
-    flares: Sequence[StackedFlare],
-    own: Sequence[Array],
-    shared: Array,
-    calibration: Calibration,
-    prior: tuple[Array, Array],
-    variances_e2: Sequence[Array],
-) -> float:
-    """Return χ² with the variances held."""
-    total = float((shared - prior[0]) @ (prior[1] * (shared - prior[0])))
-    for flare, one, variance_e2 in zip(flares, own, variances_e2, strict=True):
-        expected_e, _ = _expected(flare, one, shared, calibration)
-        total += float(((flare.sum_e - expected_e) ** 2 / variance_e2).sum())
-    return float(total)
-
-
-def _variance_e2(expected_e: Array, flare: StackedFlare, calibration: Calibration) -> Array:
-    lit_e = np.maximum(expected_e, 0.0)
-    return np.asarray(lit_e + (calibration.prnu * lit_e) ** 2 + flare.floor_e2)
+def _noise(
+    flares: Sequence[StackedFlare], expected: Sequence[tuple[Array, Array]], calibration: Calibration
+) -> RailNoise:
+    lit_e = [np.maximum(expected_e, 0.0) for expected_e, _ in expected]
+    return RailNoise(
+        tuple(flare.box for flare in flares),
+        tuple(lit + flare.floor_e2 for flare, lit in zip(flares, lit_e, strict=True)),
+        tuple(
+            np.stack([np.full_like(lit, flare.frames * calibration.dsnu_e), calibration.prnu * lit])
+            for flare, lit in zip(flares, lit_e, strict=True)
+        ),
+    )
 
 
 def _expected(
     flare: StackedFlare, own: Array, shared: Array, calibration: Calibration
 ) -> tuple[Array, Array]:
-    """Return the expected electrons, and their derivatives by shared and own unknowns, shape (9, pixels)."""
+    """Return the expected electrons, and their derivatives by shared and own unknowns, (9, height, width)."""
     u_px, v_px, flux_e, background_e = own.tolist()
     shape, box = to_shape(shared), flare.box
     width_px = shape.sigma_px
     radius_rad = float(angular_radius_rad(flare.range_m, calibration.source_radius_m * shape.growth))
     reach_px = 1.5 * calibration.fx_px * math.tan(radius_rad) + _CORE_SIGMAS * width_px + 2.0
     near = PixelBox.around(u_px, v_px, reach_px, calibration)
-    core_box = _common(near, box)
+    core_box = near.overlap(box)
     known = replace(calibration, psf_sigma_px=width_px)
     image = flare_image(u_px, v_px, radius_rad, core_box, known)
     inside = core_box.seen_from(box).slices
@@ -303,14 +257,7 @@ def _expected(
         fraction,
         np.ones_like(fraction),
     ])  # fmt: skip
-    return flux_e * fraction + background_e, jacobian.reshape(9, -1)
-
-
-def _common(one: PixelBox, other: PixelBox) -> PixelBox:
-    top, left = max(one.top, other.top), max(one.left, other.left)
-    bottom = min(one.top + one.height, other.top + other.height)
-    right = min(one.left + one.width, other.left + other.width)
-    return PixelBox(top, left, max(bottom - top, 0), max(right - left, 0))
+    return flux_e * fraction + background_e, jacobian
 
 
 def _spread_of(fraction: Array, box: PixelBox, place: tuple[float, float], width_px: float) -> float:
@@ -340,11 +287,12 @@ def glare_image(u_px: float, v_px: float, spread_px: float, shape: PointSpreadSh
         x = np.arange(box.width) + (box.left - u_px - du)
         y = (np.arange(box.height) + (box.top - v_px - dv))[:, None]
         away = (x**2 + y**2) / radius2_px2
-        density = weight * (exponent - 1.0) / (math.pi * radius2_px2) * (1.0 + away) ** -exponent
+        log_rise = np.log1p(away)
+        density = weight * (exponent - 1.0) / (math.pi * radius2_px2) * np.exp(-exponent * log_rise)
         slope = 2.0 * exponent * density / (1.0 + away)
         found[0] += density
-        found[1] += slope * x / radius2_px2
-        found[2] += slope * y / radius2_px2
+        found[1] += slope * (x / radius2_px2)
+        found[2] += slope * (y / radius2_px2)
         found[3] += slope * away - 2.0 * density
-        found[4] += density * (1.0 - (exponent - 1.0) * np.log1p(away))
+        found[4] += density * (1.0 - (exponent - 1.0) * log_rise)
     return found

@@ -203,7 +203,7 @@ def _sum(
     total = np.zeros((box.height, box.width))
     for frame, _ in group:
         total += (frame.data_dn[box.slices] - frame.black_level_dn) / gain
-    floor_e2 = summed_floor_e2(calibration, count, group[0][0].gain)
+    floor_e2 = summed_floor_e2(replace(calibration, dsnu_e=0.0), count, group[0][0].gain)
     return StackedFlare(range_m, count, first.u_px, first.v_px, box, total, floor_e2)
 
 

@@ -50,6 +50,13 @@ class PixelBox:
         """Return the box with its place counted from the corner of another."""
         return type(self)(self.top - corner.top, self.left - corner.left, self.height, self.width)
 
+    def overlap(self, other: "PixelBox") -> Self:
+        """Return the part of the box that lies in another; it may be empty."""
+        top, left = max(self.top, other.top), max(self.left, other.left)
+        bottom = min(self.top + self.height, other.top + other.height)
+        right = min(self.left + self.width, other.left + other.width)
+        return type(self)(top, left, max(bottom - top, 0), max(right - left, 0))
+
     def with_margin(self, by_px: int) -> "PixelBox":
         """Return the box with a margin all around, which may reach beyond the image."""
         return PixelBox(self.top - by_px, self.left - by_px, self.height + 2 * by_px, self.width + 2 * by_px)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nir_render.errors import InputError, shown
 from perception import RecordingError, read_picture
-from perception.calibration.darkness import Darkness, darkness
+from perception.calibration.dark import Darkness, darkness
 from perception.files.fields import first_of
 
 KINDS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from perception.calibration.darkness import darkness
+from perception.calibration.dark import darkness
 
 
 def _frames(level_dn: float, noise_dn: float, count: int, pattern_dn: float = 0.0) -> list[np.ndarray]:
