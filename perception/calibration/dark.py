@@ -1,4 +1,4 @@
-"""What frames with the cap on say: black level, read noise, offsets; and what dark pixels of other frames do."""
+"""What frames with the cap on say, black level, read noise, offsets; and what dark pixels of others do."""
 
 import math
 from collections.abc import Iterable, Sequence
