@@ -1,5 +1,6 @@
 """The commands that lead in and out: new-recording and import of a real camera's frames, export of a run."""
 
+import math
 import shlex
 from enum import StrEnum
 from pathlib import Path
@@ -54,6 +55,7 @@ def import_recording(
                 "from": one.constant.origin,
                 "lossy_sigma_dn": one.lossy_sigma_dn,
                 "assumed": [str(line) for line in one.assumed],
+                "warnings": list(one.warnings),
             }
             for name, one in done.items()
         }
@@ -63,8 +65,10 @@ def import_recording(
         share = one.constant.sigma_dn_m2_per_s / one.constant.value_dn_m2_per_s
         typer.echo(
             f"{name}: {one.frames} frames; range constant {one.constant.value_dn_m2_per_s:.4g} DN m²/s ± "
-            f"{share:.1%} from {one.constant.origin}: ranges ± {0.5 * share:.1%} or worse"
+            f"{share:.1%} from {one.constant.origin}: ranges ± {0.5 * share:.1%} by their light alone"
         )
+        across_deg, down_deg = (math.degrees(angle_rad) for angle_rad in one.field_of_view_rad)
+        typer.echo(f"{name}: sees {across_deg:.0f}° across and {down_deg:.0f}° down")
         for line in one.assumed:
             note(f"{name}: assumed {line}")
         if one.lossy_sigma_dn > 0.0:
@@ -72,6 +76,8 @@ def import_recording(
                 f"{name}: JPEG is lossy: compression changes a pixel by a σ of {one.lossy_sigma_dn:.2g} DN, "
                 "which was added to the read noise; record PNG or TIFF for fainter flares"
             )
+        for doubt in one.warnings:
+            warn(f"{name}: {doubt}")
     typer.echo(f"next: nir-render perceive {shlex.quote(str(folder))}")
 
 

@@ -126,7 +126,7 @@ _CAUSE_WORDS = {
     "prnu_m": "unlike pixels", "read_noise_m": "read noise", "dsnu_m": "offsets", "rounding_m": "rounding",
     "range_constant_m": "K, the LED's flux", "source_radius_m": "source's radius",
     "point_spread_m": "point spread", "fog_m": "fog", "other_m": "neighbours, misfit",
-    "response_m": "filter and vignetting (beside)",
+    "response_m": "filter and vignetting (not in all)",
 }  # fmt: skip
 
 

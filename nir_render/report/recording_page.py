@@ -35,7 +35,8 @@ _CHECKED = 8  # frames of a camera that are held against its calibration
 _CLOSE_UPS = 10
 _CLOSE_UP_HALF_PX = 14
 _WHOLE_WIDTH_PX = 720
-_MOST_ROWS = 60
+_MOST_ROWS = 600
+_LABEL_UNITS = (14.0, 2.3)  # width and height of a range's label, about, in hundredths of the frame's width
 _FLAGS = ("saturated", "merged", "ghost")
 
 Found = Mapping[str, Mapping[FrameKey, Sequence[Detection]]]
@@ -101,6 +102,7 @@ def recording_html(
     """
     names, cameras = list(found), cameras_of(keys)
     warnings, seen = _warnings(keys, found, load, calibrations)
+    listed = _with_ranges(found) or found
     return render_page(
         "report/recording_page.html",
         title=folder_name,
@@ -118,14 +120,24 @@ def recording_html(
         ],
         closes=_closes(found, load, calibrations),
         plot=_range_plot(found),
-        rows=_rows(keys, found),
-        more=max(0, _count(found) - _MOST_ROWS),
+        rows=_rows(keys, listed),
+        more=max(0, _count(listed) - _MOST_ROWS),
+        unranged=[name for name in names if name not in listed and any(found[name].values())],
         cameras=_cameras(cameras[:MOST_CAMERAS], calibrations),
         files=list(files),
         causes=Drawing(causes_plot(causes), "σ of ranges by cause, against range")
         if any(causes.values())
         else None,
     )
+
+
+def _with_ranges(found: Found) -> Found:
+    """Return the estimators that ranged something."""
+    return {
+        name: frames
+        for name, frames in found.items()
+        if any(math.isfinite(one.range_m) for listed in frames.values() for one in listed)
+    }
 
 
 def _count(found: Found) -> int:
@@ -233,16 +245,24 @@ def _whole(
         image=Image(data_uri(jpeg.tobytes(), "image/jpeg"), -0.5, -0.5, columns, rows),
         unit_px=unit_px,
         marks=tuple(_mark(name, one, 1.8 * unit_px) for name, listed in found.items() for one in listed),
-        labels=tuple(
-            (
-                one.u_px + (-1.6 if one.u_px > 0.78 * columns else 1.6) * unit_px,
-                one.v_px - 0.8 * unit_px,
-                "end" if one.u_px > 0.78 * columns else "start",
-                _range_text(one),
-            )
-            for one in found.get(labelled, ())[:40]
-        ),
+        labels=tuple(_labels(found.get(labelled, ())[:40], columns)),
     )
+
+
+def _labels(found: Sequence[Detection], columns: int) -> Iterator[tuple[float, float, str, str]]:
+    """Yield the place, the anchor and the text of each range; below one another where they would overlap."""
+    unit_px, placed = columns / 100.0, list[tuple[float, float]]()
+    wide_px, high_px = (units * unit_px for units in _LABEL_UNITS)
+    for one in sorted(found, key=lambda one: one.v_px):
+        at_right = one.u_px > 0.78 * columns
+        left_px = one.u_px + (-1.6 * unit_px - wide_px if at_right else 1.6 * unit_px)
+        v_px = one.v_px - 0.8 * unit_px
+        near = sorted(other_v_px for other_px, other_v_px in placed if abs(other_px - left_px) < wide_px)
+        for other_v_px in near:
+            if abs(v_px - other_v_px) < high_px:
+                v_px = other_v_px + high_px
+        placed.append((left_px, v_px))
+        yield left_px + (wide_px if at_right else 0.0), v_px, "end" if at_right else "start", _range_text(one)
 
 
 def _closes(

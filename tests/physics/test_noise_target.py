@@ -53,7 +53,8 @@ CASES = [
     pytest.param(Case("thin fog", "1 us", 5.0, 2, radius="1 cm"), marks=pytest.mark.verify),
     pytest.param(Case("diffuse room", "1 us", 1.0, 1), marks=(pytest.mark.verify, pytest.mark.at_length)),
     pytest.param(Case("glossy corridor", "20 us", 5.0, 1), marks=(pytest.mark.verify, pytest.mark.at_length)),
-    pytest.param(Case("glossy corridor", "20 us", 1.0, 2), marks=pytest.mark.verify),
+    pytest.param(Case("glossy corridor", "20 us", 5.0, 2), marks=pytest.mark.verify),
+    pytest.param(Case("glossy corridor", "20 us", 1.0, 2), marks=(pytest.mark.verify, pytest.mark.at_length)),
 ]
 
 

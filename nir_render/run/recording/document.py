@@ -215,11 +215,12 @@ class CameraGiven(Document):
 
 
 class KnownRange(Document):
-    """A frame of one source alone at a range that was measured."""
+    """A frame of a source at a range that was measured; where it stands in the frame, if others are in it."""
 
     camera: str
     frame: int | str
     range_m: Annotated[Measured, WithSigma(LENGTH, unsaid=0.01)]
+    place_px: Pixels2 | None = None
 
 
 CameraName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]{0,99}\.[A-Za-z_][A-Za-z0-9_-]{0,99}$")]

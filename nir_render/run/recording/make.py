@@ -14,25 +14,34 @@ from nir_render.errors import InputError, shown
 from nir_render.run import folder as run_folder
 from nir_render.run.recording.bag import Topic, unpacked
 from nir_render.run.recording.calibration import Assumed, camera_calibration
-from nir_render.run.recording.document import CameraGiven, KnownRange, Measured, RecordingDocument
+from nir_render.run.recording.document import CameraGiven, KnownRange, RecordingDocument
 from nir_render.run.recording.pictures import KINDS, Pictures, find_pictures, read_pictures
-from nir_render.run.recording.range_constant import Constant, from_data_sheets, from_known_ranges
+from nir_render.run.recording.range_constant import (
+    Constant,
+    KnownFlare,
+    contradictions,
+    from_data_sheets,
+    from_known_ranges,
+)
 from nir_render.scene.documents.files import find_file
 from nir_render.scene.problems import Places, explain
 from nir_render.scene.text.yaml_text import read_yaml
 from perception import (
     FrameRecord,
-    RawFrame,
     RecordingError,
     calibration_document,
     read_frame,
     read_picture,
     read_recording,
 )
+from perception.model.bearing import field_angle_rad
 from perception.types import Calibration
 
 FILE = "recording.yaml"
 _TEMPLATE = Path(__file__).parent / "template.yaml"
+
+_WHOLE_BITS, _LESS_BITS = 16, 14
+_MISSING, _EMPTY = "this key is missing", "stands empty; fill it in"
 
 _NO_BRIGHTNESS = "nothing tells how bright a source looks; give intensity, power, or a frame of known_ranges"
 
@@ -49,6 +58,16 @@ class Imported:
     constant: Constant
     assumed: tuple[Assumed, ...]
     lossy_sigma_dn: float
+    warnings: tuple[str, ...]
+
+    @property
+    def field_of_view_rad(self) -> tuple[float, float]:
+        """How much the camera sees across and down, through its principal point."""
+        known = self.calibration
+        u_px, v_px = known.cx_px, known.cy_px
+        ends = [(-0.5, v_px), (known.width_px - 0.5, v_px), (u_px, -0.5), (u_px, known.height_px - 0.5)]
+        left, right, top, bottom = field_angle_rad(ends, known).tolist()
+        return left + right, top + bottom
 
 
 def new_recording(folder: Path, bag: Path | None = None) -> list[str]:
@@ -142,7 +161,16 @@ def import_recording(folder: Path, *, overwrite: bool) -> dict[str, Imported]:
         raw = read_yaml(path)
     except ValueError as error:
         raise InputError(str(error)) from None
-    document, pictures = _checked(_without_empty(raw), folder, path)
+    try:
+        document, pictures = _checked(_without_empty(raw), folder, path)
+    except InputError as error:
+        empty = tuple(f": {key}: {_MISSING}" for key in _empty_keys(raw))
+        raise InputError(
+            *(
+                line.removesuffix(_MISSING) + _EMPTY if line.endswith(empty) else line
+                for line in error.problems
+            )
+        ) from None
     places = Places(str(path))
     problems: list[str] = []
     done: dict[str, Imported] = {}
@@ -281,14 +309,14 @@ def _camera(
         for index, file in enumerate(pictures.files)
     ]
     constant = from_data_sheets(given, document.source, calibration)
-    ranges: list[tuple[RawFrame, Measured]] = []
+    flares: list[KnownFlare] = []
     for one in document.known_ranges:
         if one.camera == name:
             index = _index_of(one, pictures)
             assert index is not None  # _contradictions has told
-            ranges.append((read_frame(folder, records[index]), one.range_m))
-    if ranges:
-        constant = from_known_ranges(ranges, calibration, None)
+            flares.append(KnownFlare(read_frame(folder, records[index]), one.range_m, one.place_px))
+    if flares:
+        constant = from_known_ranges(flares, calibration)
     elif constant is not None:
         assumed += [
             Assumed(key, getattr(given, key))
@@ -299,7 +327,26 @@ def _camera(
     sigma = {**calibration.sigma, "range_constant_dn_m2_per_s": constant.sigma_dn_m2_per_s}
     known = replace(calibration, range_constant_dn_m2_per_s=constant.value_dn_m2_per_s, sigma=sigma)
     lines = [{"format": 1, **vars(record)} for record in records]
-    return Imported(known, len(records), constant, tuple(assumed), pictures.lossy_sigma_dn), lines
+    warnings = (*_doubts(given, pictures), *contradictions(flares, known))
+    return Imported(known, len(records), constant, tuple(assumed), pictures.lossy_sigma_dn, warnings), lines
+
+
+def _doubts(given: CameraGiven, pictures: Pictures) -> Iterator[str]:
+    """Yield what may be a slip in what is given, seen by the pictures."""
+    if given.bit_depth_bit == pictures.bits == _WHOLE_BITS and pictures.most_dn < 2**_LESS_BITS:
+        bits = max(pictures.most_dn.bit_length(), 8)
+        yield (
+            f"bit_depth is {_WHOLE_BITS} bit, and no picture has a count above {pictures.most_dn}: if the "
+            f"sensor counts to less, write its depth, such as {bits + bits % 2} bit, or what clips is not "
+            "known to"
+        )
+    if given.times is None and pictures.gaps:
+        after, before = pictures.gaps[0]
+        yield (
+            f"numbers are missing among the pictures, after {after} comes {before}"
+            + (f", and {len(pictures.gaps) - 1} more times" if len(pictures.gaps) > 1 else "")
+            + ": frame_rate takes them as following at once; write times: FILE where pictures were lost"
+        )
 
 
 def _times_s(given: CameraGiven, pictures: Pictures, folder: Path) -> list[float]:
@@ -317,6 +364,14 @@ def _times_s(given: CameraGiven, pictures: Pictures, folder: Path) -> list[float
     if not all(math.isfinite(one) and one < other for one, other in itertools.pairwise([*times_s, math.inf])):
         raise ValueError(f"times: {given.times}: times must increase from line to line")
     return times_s
+
+
+def _empty_keys(raw: Any, above: str = "") -> Iterator[str]:
+    """Yield the dotted names of keys that stand empty."""
+    for key, value in raw.items() if isinstance(raw, Mapping) else ():
+        if value is None:
+            yield f"{above}{key}"
+        yield from _empty_keys(value, f"{above}{key}.")
 
 
 def _without_empty(raw: Any) -> Any:

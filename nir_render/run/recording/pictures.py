@@ -1,6 +1,8 @@
 """The pictures of one camera: which they are, what they have in common, and what their dark pixels say."""
 
+import itertools
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +33,20 @@ class Pictures:
     most_dn: int
     lossy_sigma_dn: float
     darkness: Darkness
+
+    @property
+    def gaps(self) -> list[tuple[str, str]]:
+        """Pictures between which numbers are missing, by the step that most of their names go on by."""
+        numbers = [[part for part in _as_counted(file) if part[0]] for file in self.files]
+        steps: list[int] = []
+        for one, other in itertools.pairwise(numbers):
+            if len(one) != len(other) or one[:-1] != other[:-1] or not one:
+                return []  # several numbers, or none: no running number
+            steps.append(int(other[-1][1]) - int(one[-1][1]))
+        usual = Counter(steps).most_common(1)[0][0] if steps else 0
+        return [
+            pair for pair, step in zip(itertools.pairwise(self.files), steps, strict=True) if step > usual
+        ]
 
 
 def find_pictures(folder: Path, pattern: str) -> list[str]:

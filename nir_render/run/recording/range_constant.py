@@ -1,7 +1,7 @@
 """The range constant of a recorded camera: from one frame at a known range, or from data sheets."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,9 @@ _C_M_PER_S = 299_792_458.0
 _MOST_PASSES = 8
 _CONVERGED = 3e-4
 _NEAR_PX = 12
+_LEAST_OTHER = 0.1  # of the brightest's light: what is fainter is a reflection, and not what is meant
+_MOST_TOLD = 6
+_MOST_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -63,10 +66,17 @@ def from_data_sheets(given: CameraGiven, source: SourceGiven, calibration: Calib
     return Constant(constant, constant * math.hypot(*shares), "data sheets")
 
 
-def from_known_ranges(
-    ranges: Sequence[tuple[RawFrame, Measured]], calibration: Calibration, guess: Constant | None
-) -> Constant:
-    """Return the K that the flares of frames at known ranges tell, the brightest of each frame.
+@dataclass(frozen=True, eq=False)
+class KnownFlare:
+    """A frame of a source at a range that was measured, and about where it is; None: it is alone."""
+
+    frame: RawFrame
+    range_m: Measured
+    place_px: tuple[float, float] | None = None
+
+
+def from_known_ranges(flares: Sequence[KnownFlare], calibration: Calibration) -> Constant:
+    """Return the K that the flares of frames at known ranges tell.
 
     How large a flare looks is not used: it would tell the K that is being tried. The frames are looked
     at again with the K just found until it changes no more.
@@ -74,13 +84,14 @@ def from_known_ranges(
     Raises
     ------
     ValueError
-        A frame shows no flare that can be measured, by its number.
+        A frame shows no flare that can be measured, none where it should be, or several and not which is
+        meant: by its number.
     """
-    first = _rough_constant(*ranges[0], calibration) if guess is None else guess.value_dn_m2_per_s
     sigma = {**calibration.sigma, "source_radius_m": calibration.source_radius_m}
+    first = _rough_constant(flares[0], calibration)
     known = replace(calibration, range_constant_dn_m2_per_s=first, sigma=sigma)
     for _ in range(_MOST_PASSES):
-        single = [_constant_of(frame, distance, known) for frame, distance in ranges]
+        single = [_constant_of(flare, known) for flare in flares]
         weights = np.array([1.0 / sigma**2 for _, sigma in single])
         constant = float(np.average([value for value, _ in single], weights=weights))
         change = abs(constant / known.range_constant_dn_m2_per_s - 1.0)
@@ -92,35 +103,89 @@ def from_known_ranges(
     if len(values) > 1:  # they share the point spread and the response: the scatter tells what is left
         spread = max(spread, float(values.std(ddof=1)) / math.sqrt(len(values)))
     spread = math.hypot(spread, _response_share(calibration) * constant)
-    count = len(ranges)
+    count = len(flares)
     return Constant(constant, spread, f"{count} frame{'s' if count > 1 else ''} at known range")
 
 
-def _constant_of(frame: RawFrame, distance: Measured, known: Calibration) -> tuple[float, float]:
-    """Return the K that one frame tells, and its σ."""
+def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> Iterator[str]:
+    """Yield which known ranges do not come out again, flux and size taken together, by more than their σ."""
+    for flare in flares:
+        hit = _flare_of(flare, calibration)
+        sigma_m = math.hypot(hit.range_sigma_m, flare.range_m.sigma)
+        if abs(hit.range_m - flare.range_m.value) > _MOST_SIGMAS * sigma_m:
+            yield (
+                f"the flare at ({hit.u_px:.0f}, {hit.v_px:.0f}) px of frame {flare.frame.index} comes out at "
+                f"{hit.range_m:.3f} ± {hit.range_sigma_m:.3f} m, and {flare.range_m.value:g} m was measured: "
+                "its size and its light do not fit one range. Check focal_length, pixel_pitch, the source's "
+                "radius, and whether that is the source whose range is known; do not trust ranges before"
+            )
+
+
+def _flare_of(flare: KnownFlare, known: Calibration) -> Detection:
+    """Return the flare that is meant.
+
+    Raises
+    ------
+    ValueError
+        There is none, or there are several.
+    """
+    frame = flare.frame
     found = [hit for hit in detect(frame, known) if math.isfinite(hit.range_sigma_m)]
+    where = f"frame {frame.index} of {frame.camera}"
     if not found:
         raise ValueError(
-            f"frame {frame.index} of {frame.camera} shows no flare that can be measured; take one with a "
-            "single source in view, not clipped"
+            f"{where} shows no flare that can be measured; take one that is not clipped, and check "
+            "focal_length, pixel_pitch and the source's radius: they say how large it should look"
         )
-    hit: Detection = max(found, key=lambda hit: hit.flux_dn)
+    found.sort(key=lambda hit: -hit.flux_dn)
+    if flare.place_px is not None:
+        u_px, v_px = flare.place_px
+        nearest = min(found, key=lambda hit: math.hypot(hit.u_px - u_px, hit.v_px - v_px))
+        if math.hypot(nearest.u_px - u_px, nearest.v_px - v_px) > _NEAR_PX:
+            raise ValueError(
+                f"{where} shows no flare within {_NEAR_PX} px of ({u_px:g}, {v_px:g}) px; there are "
+                f"{_places(found)}"
+            )
+        return nearest
+    others = [hit for hit in found[1:] if hit.flux_dn > _LEAST_OTHER * found[0].flux_dn]
+    if others:
+        one = found[0]
+        raise ValueError(
+            f"{where} shows {len(others) + 1} flares, {_places([one, *others])}; say which one's range is "
+            f'known, such as place: "[{one.u_px:.0f}, {one.v_px:.0f}] px"'
+        )
+    return found[0]
+
+
+def _places(found: Sequence[Detection]) -> str:
+    return ", ".join(f"({hit.u_px:.0f}, {hit.v_px:.0f}) px" for hit in found[:_MOST_TOLD])
+
+
+def _constant_of(flare: KnownFlare, known: Calibration) -> tuple[float, float]:
+    """Return the K that one frame tells, and its σ."""
+    frame, hit = flare.frame, _flare_of(flare, known)
     exposed_s = float(effective_exposure_s(hit.u_px, hit.v_px, frame.exposure_s, frame.gain, known))
-    constant = hit.flux_dn * distance.value**2 / exposed_s
-    return constant, constant * 2.0 * math.hypot(hit.range_sigma_m / hit.range_m, distance.relative)
+    constant = hit.flux_dn * flare.range_m.value**2 / exposed_s
+    return constant, constant * 2.0 * math.hypot(hit.range_sigma_m / hit.range_m, flare.range_m.relative)
 
 
-def _rough_constant(frame: RawFrame, distance: Measured, calibration: Calibration) -> float:
+def _rough_constant(flare: KnownFlare, calibration: Calibration) -> float:
     """Return a first guess of K: all counts about the brightest pixel, above the rest of the frame."""
+    frame = flare.frame
     counts = frame.data_dn.astype(np.float64) - np.median(frame.data_dn)
-    row, column = np.unravel_index(int(np.argmax(counts)), counts.shape)
+    seen = counts
+    if flare.place_px is not None:
+        rows, columns = np.ogrid[: counts.shape[0], : counts.shape[1]]
+        u_px, v_px = flare.place_px
+        seen = np.where((abs(rows - v_px) <= _NEAR_PX) & (abs(columns - u_px) <= _NEAR_PX), counts, -np.inf)
+    row, column = np.unravel_index(int(np.argmax(seen)), counts.shape)
     near = counts[
         max(row - _NEAR_PX, 0) : row + _NEAR_PX + 1, max(column - _NEAR_PX, 0) : column + _NEAR_PX + 1
     ]
     exposed_s = float(
         effective_exposure_s(float(column), float(row), frame.exposure_s, frame.gain, calibration)
     )
-    return max(float(near.sum()), 1.0) * distance.value**2 / exposed_s
+    return max(float(near.sum()), 1.0) * flare.range_m.value**2 / exposed_s
 
 
 def _response_share(calibration: Calibration) -> float:

@@ -286,3 +286,90 @@ def test_times_of_a_file_are_the_frames(tmp_path: Path, pictures: Path) -> None:
     ):
         with pytest.raises(InputError, match=said):
             imported(written, *keys)
+
+
+def _two_in_view(folder: Path) -> None:
+    """Another source, 1.3 m away, beside the one at 1 m in the third picture."""
+    mean_e = expected_e(TRUE, [(*_place(2), 1.0), (150.4, 110.7, 1.3)], EXPOSURE_S)
+    data_dn = expose(mean_e, TRUE, random(8, 0), EXPOSURE_S).data_dn.astype(np.uint8)
+    assert cv2.imwrite(str(folder / "img10.png"), data_dn)
+
+
+def test_of_several_sources_in_a_frame_the_one_is_named_whose_range_is_known(
+    tmp_path: Path, pictures: Path
+) -> None:
+    """Which of both it is nobody can tell but who measured: either leads to the same range constant."""
+    constants = []
+    for number, (range_text, place) in enumerate((("1 m", "[83, 65] px"), ("1.3 m", "[151, 110] px"))):
+        known_range = {"camera": "r1.front", "frame": 2, "range": f"{range_text} ± 5 mm", "place": place}
+        (tmp_path / str(number)).mkdir()
+        folder = _folder(tmp_path / str(number), pictures, {"known_ranges": [known_range]})
+        _two_in_view(folder)
+        done = import_recording(folder, overwrite=False)["r1.front"]
+        assert done.warnings == ()
+        constants.append(done.calibration.range_constant_dn_m2_per_s)
+    assert constants[0] == pytest.approx(1e6, rel=0.1)
+    assert constants[1] == pytest.approx(constants[0], rel=0.1)
+
+    (tmp_path / "unsaid").mkdir()
+    folder = _folder(tmp_path / "unsaid", pictures)
+    _two_in_view(folder)
+    with pytest.raises(InputError, match=r'frame 2 .* shows 2 flares, .*; say which .* "\[84, 64\] px"'):
+        import_recording(folder, overwrite=False)
+
+    (tmp_path / "nowhere").mkdir()
+    nowhere = {"camera": "r1.front", "frame": 2, "range": "1 m", "place": "[20, 20] px"}
+    folder = _folder(tmp_path / "nowhere", pictures, {"known_ranges": [nowhere]})
+    with pytest.raises(
+        InputError, match=r"shows no flare within 12 px of \(20, 20\) px; there are \(84, 64\) px"
+    ):
+        import_recording(folder, overwrite=False)
+
+
+def test_a_known_range_that_does_not_come_out_again_is_told(tmp_path: Path, pictures: Path) -> None:
+    """A focal length in the wrong unit: light and size tell two ranges. As it should be, nothing is told."""
+    for folder in ("right", "wrong"):
+        (tmp_path / folder).mkdir()
+    done = import_recording(_folder(tmp_path / "right", pictures), overwrite=False)["r1.front"]
+    assert done.warnings == ()
+    across_rad, down_rad = done.field_of_view_rad
+    assert across_rad == pytest.approx(2.0 * math.atan(100.0 / 300.0))
+    assert down_rad == pytest.approx(2.0 * math.atan(80.0 / 300.0))
+    wrong = _folder(tmp_path / "wrong", pictures, focal_length="900 px ± 2 %")
+    (said,) = import_recording(wrong, overwrite=False)["r1.front"].warnings
+    assert "of frame 2 comes out at" in said
+    assert "1 m was measured" in said
+    assert "Check focal_length" in said
+
+
+def test_missing_numbers_among_the_pictures_are_told(tmp_path: Path, pictures: Path) -> None:
+    folder = _folder(tmp_path, pictures)
+    (folder / "img12.png").unlink()
+    (said,) = import_recording(folder, overwrite=False)["r1.front"].warnings
+    assert said.startswith(
+        "numbers are missing among the pictures, after img11.png comes img13.png: frame_rate"
+    )
+    times = folder / "times.txt"
+    times.write_text("\n".join(f"{0.1 * n:g}" for n in (0, 1, 2, 3, 5, 6, 7)))
+    document = yaml.safe_load((folder / "recording.yaml").read_text(encoding="utf-8"))
+    camera = document["cameras"]["r1.front"]
+    del camera["frame_rate"]
+    camera["times"] = "times.txt"
+    (folder / "recording.yaml").write_text(yaml.safe_dump(document, allow_unicode=True), encoding="utf-8")
+    assert import_recording(folder, overwrite=True)["r1.front"].warnings == ()
+
+
+def test_twelve_bits_in_files_of_sixteen_are_asked_about(tmp_path: Path, pictures: Path) -> None:
+    folder = _folder(tmp_path, pictures, bit_depth="16 bit")
+    for path in folder.glob("*.png"):
+        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert counts is not None
+        assert cv2.imwrite(str(path), counts.astype(np.uint16) * 10)
+    warnings = import_recording(folder, overwrite=False)["r1.front"].warnings
+    assert any("bit_depth is 16 bit, and no picture has a count above" in said for said in warnings)
+
+
+def test_a_key_that_stands_empty_is_not_called_missing(tmp_path: Path, pictures: Path) -> None:
+    folder = _folder(tmp_path, pictures, exposure=None)
+    with pytest.raises(InputError, match=r"cameras\.r1\.front\.exposure: stands empty; fill it in"):
+        import_recording(folder, overwrite=False)
