@@ -236,10 +236,6 @@ class Told:
         )  # neighbours' errors hang together
 
 
-def test_poses_of_three_seeds_are_true() -> None:
-    Told.of(range(3)).check()
-
-
 @pytest.mark.verify
 def test_intervals_of_poses_hold_the_truth() -> None:
     Told.of(range(SEEDS)).check()

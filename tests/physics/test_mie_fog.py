@@ -153,6 +153,7 @@ def _of_a_ball(off_rad: float, distance_m: float, radius_m: float, extinction_pe
     return float(np.sum(per_step * per_m * lit) / (4.0 * math.pi**2 * radius_m**2))
 
 
+@pytest.mark.verify
 def test_a_large_lamp_hanging_in_heavy_fog_is_as_bright_as_its_integral(make: Loader) -> None:
     """A ball of 0.4 m, 2 m away, fills 23 degrees: wider than the forward peak, of which asking for its light meets little.
 
