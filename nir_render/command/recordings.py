@@ -65,7 +65,7 @@ def import_recording(
         share = one.constant.sigma_dn_m2_per_s / one.constant.value_dn_m2_per_s
         typer.echo(
             f"{name}: {one.frames} frames; range constant {one.constant.value_dn_m2_per_s:.4g} DN m²/s ± "
-            f"{share:.1%} from {one.constant.origin}: ranges ± {0.5 * share:.1%} by their light alone"
+            f"{share:.1%} from {one.constant.origin}: ranges ± {0.5 * share:.1%} or worse by light alone"
         )
         across_deg, down_deg = (math.degrees(angle_rad) for angle_rad in one.field_of_view_rad)
         typer.echo(f"{name}: sees {across_deg:.0f}° across and {down_deg:.0f}° down")

@@ -3,7 +3,7 @@
 Over a frame stand, as SVG, truth and what each estimator found; `pictures.html` draws them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -25,6 +25,7 @@ MOST_CAMERAS = 8
 _FAINT_SOFTENING = 0.001
 _CLOSE_UPS = 10
 _CLOSE_UP_HALF_PX = 14
+_LABEL_UNITS = (19.0, 2.4)  # width and height of a label of a range, in hundredths of the frame's width
 _WHOLE_WIDTH_PX = 720
 """About the width at which a frame stands in the page, for screens of double density: it bounds the size."""
 
@@ -314,3 +315,33 @@ def _encoded(picture: NDArray[np.uint8], kind: str, options: Sequence[int] = ())
     if not done:
         raise RuntimeError(f"OpenCV could not encode a picture as {kind}")
     return buffer.tobytes()
+
+
+def labels_of(
+    texts: Sequence[tuple[float, float, str]], columns: int, rows: int
+) -> Iterator[tuple[float, float, str, str]]:
+    """Yield place, anchor and text of labels, each where none is yet, as near to its flare as can be.
+
+    Parameters
+    ----------
+    texts
+        Column and row of each flare, and what is said of it.
+    columns, rows
+        Of the frame, in whose pixels places are.
+    """
+    unit_px, placed = columns / 100.0, list[tuple[float, float]]()
+    wide_px, high_px = (units * unit_px for units in _LABEL_UNITS)
+    for u_px, v_px, text in sorted(texts, key=lambda one: one[1]):
+        at_right = u_px > 0.78 * columns
+        left_px = u_px + (-1.6 * unit_px - wide_px if at_right else 1.6 * unit_px)
+        taken_px = [down_px for other_px, down_px in placed if abs(other_px - left_px) < wide_px]
+        wanted_px = min(max(v_px - 0.8 * unit_px, high_px), rows - 1.0)
+        tried_px = (wanted_px + turn * step * high_px for step in range(2 * len(texts)) for turn in (1, -1))
+        free_px = (
+            one_px
+            for one_px in tried_px
+            if high_px <= one_px <= rows - 1.0
+            and all(abs(one_px - other_px) > 0.99 * high_px for other_px in taken_px)
+        )
+        placed.append((left_px, next(free_px, wanted_px)))
+        yield left_px + (wide_px if at_right else 0.0), placed[-1][1], "end" if at_right else "start", text

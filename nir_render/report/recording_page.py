@@ -17,6 +17,7 @@ from nir_render.report.pictures import (
     Line,
     Mark,
     cameras_of,
+    labels_of,
     png_uri,
     spread,
     whole_picture,
@@ -35,8 +36,7 @@ _CHECKED = 8  # frames of a camera that are held against its calibration
 _CLOSE_UPS = 10
 _CLOSE_UP_HALF_PX = 14
 _WHOLE_WIDTH_PX = 720
-_MOST_ROWS = 600
-_LABEL_UNITS = (14.0, 2.3)  # width and height of a range's label, about, in hundredths of the frame's width
+_MOST_ROWS, _MOST_LABELS = 600, 40
 _FLAGS = ("saturated", "merged", "ghost")
 
 Found = Mapping[str, Mapping[FrameKey, Sequence[Detection]]]
@@ -102,7 +102,7 @@ def recording_html(
     """
     names, cameras = list(found), cameras_of(keys)
     warnings, seen = _warnings(keys, found, load, calibrations)
-    listed = _with_ranges(found) or found
+    listed = _listed(found) or found
     return render_page(
         "report/recording_page.html",
         title=folder_name,
@@ -122,7 +122,7 @@ def recording_html(
         plot=_range_plot(found),
         rows=_rows(keys, listed),
         more=max(0, _count(listed) - _MOST_ROWS),
-        unranged=[name for name in names if name not in listed and any(found[name].values())],
+        without_paper="paper" in found and "paper" not in listed,
         cameras=_cameras(cameras[:MOST_CAMERAS], calibrations),
         files=list(files),
         causes=Drawing(causes_plot(causes), "σ of ranges by cause, against range")
@@ -131,12 +131,12 @@ def recording_html(
     )
 
 
-def _with_ranges(found: Found) -> Found:
-    """Return the estimators that ranged something."""
+def _listed(found: Found) -> Found:
+    """Return what is listed: all but what paper found, where it has no range constant."""
     return {
         name: frames
         for name, frames in found.items()
-        if any(math.isfinite(one.range_m) for listed in frames.values() for one in listed)
+        if name != "paper" or any(math.isfinite(one.range_m) for listed in frames.values() for one in listed)
     }
 
 
@@ -237,6 +237,7 @@ def _whole(
     assert done
     unit_px = columns / 100.0
     labelled = next((name for name in ("robust", *names) if name in names), "")
+    said = [(one.u_px, one.v_px, _range_text(one)) for one in found.get(labelled, ())[:_MOST_LABELS]]
     return SeenFrame(
         camera=frame.camera,
         index=frame.index,
@@ -245,24 +246,8 @@ def _whole(
         image=Image(data_uri(jpeg.tobytes(), "image/jpeg"), -0.5, -0.5, columns, rows),
         unit_px=unit_px,
         marks=tuple(_mark(name, one, 1.8 * unit_px) for name, listed in found.items() for one in listed),
-        labels=tuple(_labels(found.get(labelled, ())[:40], columns)),
+        labels=tuple(labels_of(said, columns, rows)),
     )
-
-
-def _labels(found: Sequence[Detection], columns: int) -> Iterator[tuple[float, float, str, str]]:
-    """Yield the place, the anchor and the text of each range; below one another where they would overlap."""
-    unit_px, placed = columns / 100.0, list[tuple[float, float]]()
-    wide_px, high_px = (units * unit_px for units in _LABEL_UNITS)
-    for one in sorted(found, key=lambda one: one.v_px):
-        at_right = one.u_px > 0.78 * columns
-        left_px = one.u_px + (-1.6 * unit_px - wide_px if at_right else 1.6 * unit_px)
-        v_px = one.v_px - 0.8 * unit_px
-        near = sorted(other_v_px for other_px, other_v_px in placed if abs(other_px - left_px) < wide_px)
-        for other_v_px in near:
-            if abs(v_px - other_v_px) < high_px:
-                v_px = other_v_px + high_px
-        placed.append((left_px, v_px))
-        yield left_px + (wide_px if at_right else 0.0), v_px, "end" if at_right else "start", _range_text(one)
 
 
 def _closes(

@@ -79,6 +79,8 @@ def calibrate_camera(
         return as_calibrated(frames.load(index), calibration, known)
 
     if frames.ranges_m:
+        if frames.flat:  # how unlike pixels are is the same without glare taken off, and counts in the rail
+            known = replace(known, prnu=calibrate_flat(map(load, frames.flat), known).prnu)
         spread = calibrate_point_spread(frames.ranges_m, load, known, progress)
         known = spread.calibration
     if frames.flat:

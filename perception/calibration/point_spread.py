@@ -140,9 +140,9 @@ def fit_point_spread(
         change, own_changes, covariance = held.step(free_at, damping)
         trial = shared.copy()
         trial[free_at] += change
-        trial[2:4] = [
-            min(max(x, low), high) for x, (low, high) in zip(trial[2:4], _SHAPE_BOUNDS, strict=True)
-        ]
+        for at, (low, high) in enumerate(_SHAPE_BOUNDS, start=2):
+            if free[at]:
+                trial[at] = min(max(trial[at], low), high)
         own_trial = [one + by for one, by in zip(own, own_changes, strict=True)]
         expected = _expected_of(flares, own_trial, trial, calibration)
         off = trial - prior[0]
@@ -156,7 +156,7 @@ def fit_point_spread(
             if settled and damping < 1e-4:
                 break
         else:
-            damping *= 10.0
+            damping = max(10.0 * damping, _FIRST_DAMPING)
             if damping > _MOST_DAMPING:
                 break
     _, _, found = held.step(free_at, 0.0)

@@ -8,8 +8,9 @@ is D⁻¹ − D⁻¹ A (1 + Aᵀ D⁻¹ A)⁻¹ Aᵀ D⁻¹: of 2 × 2 matrices,
 place by itself, they would average away, and the share of glare would have intervals that are too short.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +70,7 @@ class RailNoise:
             scaled, count = values / own_e2, shared + each + 1
             found[np.ix_(at([place]), at([place]))] += scaled.reshape(count, -1) @ values.reshape(count, -1).T
             weighted.append(scaled)
-        for tile, places in self._tiles():
+        for tile, places in self._tiles:
             sums = np.zeros((shared + each * len(places) + 1, 2, tile.height, tile.width))
             matrix = np.zeros((2, 2, tile.height, tile.width))
             matrix[0, 0] = matrix[1, 1] = 1.0
@@ -96,21 +97,18 @@ class RailNoise:
         """Return rᵀΣ⁻¹r of what an expectation leaves, shapes of the boxes."""
         return float(self.information([left[None] for left in left_e], 0)[0, 0])
 
-    def _tiles(self) -> Iterator[tuple[PixelBox, list[int]]]:
-        """Cut the sensor into tiles, and say which places have pixels in each: memory stays small."""
-        top, left = (min(getattr(box, side) for box in self.boxes) for side in ("top", "left"))
-        bottom = max(box.top + box.height for box in self.boxes)
-        right = max(box.left + box.width for box in self.boxes)
-        for row in range(top, bottom, _TILE_PX):
-            for column in range(left, right, _TILE_PX):
-                tile = PixelBox(row, column, min(_TILE_PX, bottom - row), min(_TILE_PX, right - column))
-                places = [
-                    place
-                    for place, box in enumerate(self.boxes)
-                    if 0 not in tile.overlap(box).corner_and_size[2:]
-                ]
-                if places:
-                    yield tile, places
+    @cached_property
+    def _tiles(self) -> list[tuple[PixelBox, list[int]]]:
+        """Tiles of the sensor, and which places have pixels in each: memory stays small."""
+        places: dict[tuple[int, int], list[int]] = {}
+        for place, box in enumerate(self.boxes):
+            for row in range(box.top // _TILE_PX, (box.top + box.height - 1) // _TILE_PX + 1):
+                for column in range(box.left // _TILE_PX, (box.left + box.width - 1) // _TILE_PX + 1):
+                    places.setdefault((row, column), []).append(place)
+        return [
+            (PixelBox(_TILE_PX * row, _TILE_PX * column, _TILE_PX, _TILE_PX), inside)
+            for (row, column), inside in sorted(places.items())
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +127,9 @@ class RailEquations:
         damped = matrix + damping * np.diag(np.diagonal(matrix))
         change = np.asarray(np.linalg.solve(damped, self.slope[at]), dtype=np.float64)
         shared = len(free)
-        covariance = np.asarray(np.linalg.inv(matrix)[:shared, :shared], dtype=np.float64)
+        covariance = np.asarray(
+            np.linalg.solve(matrix, np.eye(len(at))[:, :shared])[:shared], dtype=np.float64
+        )
         return change[:shared], change[shared:].reshape(-1, OWN), covariance
 
 

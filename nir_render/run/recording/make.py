@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from nir_render.errors import InputError, shown
@@ -34,7 +35,7 @@ from perception import (
     read_picture,
     read_recording,
 )
-from perception.model.bearing import field_angle_rad
+from perception.model.bearing import direction_camera
 from perception.types import Calibration
 
 FILE = "recording.yaml"
@@ -62,12 +63,14 @@ class Imported:
 
     @property
     def field_of_view_rad(self) -> tuple[float, float]:
-        """How much the camera sees across and down, through its principal point."""
+        """How much the camera sees across and down, through its principal point or what is nearest to it."""
         known = self.calibration
-        u_px, v_px = known.cx_px, known.cy_px
+        u_px = min(max(known.cx_px, 0.0), known.width_px - 1.0)
+        v_px = min(max(known.cy_px, 0.0), known.height_px - 1.0)
         ends = [(-0.5, v_px), (known.width_px - 0.5, v_px), (u_px, -0.5), (u_px, known.height_px - 0.5)]
-        left, right, top, bottom = field_angle_rad(ends, known).tolist()
-        return left + right, top + bottom
+        x, y, z = direction_camera(ends, known).T
+        across_rad, down_rad = np.arctan2(x, z), np.arctan2(y, z)
+        return float(across_rad[1] - across_rad[0]), float(down_rad[3] - down_rad[2])
 
 
 def new_recording(folder: Path, bag: Path | None = None) -> list[str]:
@@ -184,7 +187,7 @@ def import_recording(folder: Path, *, overwrite: bool) -> dict[str, Imported]:
         else:
             lines += records
     if problems:
-        raise InputError("\n".join(problems))
+        raise InputError(*problems)
     run_folder.write_json(
         folder / run_folder.CALIBRATION, calibration_document(one.calibration for one in done.values())
     )
@@ -217,7 +220,7 @@ def _checked(raw: Any, folder: Path, path: Path) -> tuple[RecordingDocument, dic
     if document is not None:
         problems += [places.tell(keys, keys, said) for keys, said in _contradictions(document, pictures)]
     if problems or document is None:
-        raise InputError("\n".join(problems))
+        raise InputError(*problems)
     return document, pictures
 
 
@@ -314,7 +317,8 @@ def _camera(
         if one.camera == name:
             index = _index_of(one, pictures)
             assert index is not None  # _contradictions has told
-            flares.append(KnownFlare(read_frame(folder, records[index]), one.range_m, one.place_px))
+            frame, file = read_frame(folder, records[index]), pictures.files[index]
+            flares.append(KnownFlare(file, frame, one.range_m, one.place_px))
     if flares:
         constant = from_known_ranges(flares, calibration)
     elif constant is not None:
@@ -333,11 +337,11 @@ def _camera(
 
 def _doubts(given: CameraGiven, pictures: Pictures) -> Iterator[str]:
     """Yield what may be a slip in what is given, seen by the pictures."""
-    if given.bit_depth_bit == pictures.bits == _WHOLE_BITS and pictures.most_dn < 2**_LESS_BITS:
-        bits = max(pictures.most_dn.bit_length(), 8)
+    is_whole = given.bit_depth_bit == pictures.bits == _WHOLE_BITS
+    if is_whole and given.saturation_dn is None and pictures.most_dn < 2**_LESS_BITS:
         yield (
             f"bit_depth is {_WHOLE_BITS} bit, and no picture has a count above {pictures.most_dn}: if the "
-            f"sensor counts to less, write its depth, such as {bits + bits % 2} bit, or what clips is not "
+            "sensor counts to less, often to 10, 12 or 14 bit, write that; pixels that clip are else not "
             "known to"
         )
     if given.times is None and pictures.gaps:
@@ -368,7 +372,8 @@ def _times_s(given: CameraGiven, pictures: Pictures, folder: Path) -> list[float
 
 def _empty_keys(raw: Any, above: str = "") -> Iterator[str]:
     """Yield the dotted names of keys that stand empty."""
-    for key, value in raw.items() if isinstance(raw, Mapping) else ():
+    pairs = raw.items() if isinstance(raw, Mapping) else enumerate(raw) if isinstance(raw, list) else ()
+    for key, value in pairs:
         if value is None:
             yield f"{above}{key}"
         yield from _empty_keys(value, f"{above}{key}.")
@@ -378,4 +383,6 @@ def _without_empty(raw: Any) -> Any:
     """Take out keys that stand empty: then they are missing, and told so."""
     if isinstance(raw, Mapping):
         return {key: _without_empty(value) for key, value in raw.items() if value is not None}
+    if isinstance(raw, list):
+        return [_without_empty(value) for value in raw]
     return raw

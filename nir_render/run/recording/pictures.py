@@ -16,6 +16,10 @@ from perception.files.fields import first_of
 
 KINDS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _LOOKED_AT = 8
+_FEWEST_NUMBERED, _MOSTLY = (
+    4,
+    0.75,
+)  # pictures, and share of the steps that are alike, of a number that counts
 
 
 @dataclass(frozen=True)
@@ -36,14 +40,17 @@ class Pictures:
 
     @property
     def gaps(self) -> list[tuple[str, str]]:
-        """Pictures between which numbers are missing, by the step that most of their names go on by."""
-        numbers = [[part for part in _as_counted(file) if part[0]] for file in self.files]
-        steps: list[int] = []
-        for one, other in itertools.pairwise(numbers):
-            if len(one) != len(other) or one[:-1] != other[:-1] or not one:
-                return []  # several numbers, or none: no running number
-            steps.append(int(other[-1][1]) - int(one[-1][1]))
-        usual = Counter(steps).most_common(1)[0][0] if steps else 0
+        """Pictures between which numbers are missing, where their names go on by one number in even steps."""
+        names = [_as_counted(file) for file in self.files]
+        if len(names) < _FEWEST_NUMBERED or len({tuple(kind for kind, _ in name) for name in names}) > 1:
+            return []
+        varying = [parts for parts in zip(*names, strict=True) if len(set(parts)) > 1]
+        if len(varying) != 1 or not all(isinstance(number, int) for _, number in varying[0]):
+            return []
+        steps = [int(other) - int(one) for (_, one), (_, other) in itertools.pairwise(varying[0])]
+        usual, times = Counter(steps).most_common(1)[0]
+        if times < _MOSTLY * len(steps) or any(step % usual for step in steps):
+            return []  # times, perhaps
         return [
             pair for pair, step in zip(itertools.pairwise(self.files), steps, strict=True) if step > usual
         ]

@@ -17,7 +17,7 @@ _C_M_PER_S = 299_792_458.0
 _MOST_PASSES = 8
 _CONVERGED = 3e-4
 _NEAR_PX = 12
-_LEAST_OTHER = 0.1  # of the brightest's light: what is fainter is a reflection, and not what is meant
+_LEAST_OTHER = 0.005  # of the brightest's light: a source so faint is fourteen times as far
 _MOST_TOLD = 6
 _MOST_SIGMAS = 3.0
 
@@ -68,8 +68,12 @@ def from_data_sheets(given: CameraGiven, source: SourceGiven, calibration: Calib
 
 @dataclass(frozen=True, eq=False)
 class KnownFlare:
-    """A frame of a source at a range that was measured, and about where it is; None: it is alone."""
+    """A frame of a source at a range that was measured, and about where it is; None: it is alone.
 
+    `name` is that of the picture.
+    """
+
+    name: str
     frame: RawFrame
     range_m: Measured
     place_px: tuple[float, float] | None = None
@@ -104,20 +108,28 @@ def from_known_ranges(flares: Sequence[KnownFlare], calibration: Calibration) ->
         spread = max(spread, float(values.std(ddof=1)) / math.sqrt(len(values)))
     spread = math.hypot(spread, _response_share(calibration) * constant)
     count = len(flares)
-    return Constant(constant, spread, f"{count} frame{'s' if count > 1 else ''} at known range")
+    return Constant(constant, spread, f"{count} flare{'s' if count > 1 else ''} at known range")
 
 
 def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> Iterator[str]:
     """Yield which known ranges do not come out again, flux and size taken together, by more than their σ."""
     for flare in flares:
-        hit = _flare_of(flare, calibration)
+        wanted = f"{flare.range_m.value:g} m was measured of {flare.name}"
+        check = (
+            "Check the range that was measured, and of which source, focal_length, pixel_pitch and the "
+            "source's radius; do not trust ranges before"
+        )
+        try:
+            hit = _flare_of(flare, calibration)
+        except ValueError:
+            yield f"{wanted}, and nothing there looks like a source of that size at such a range. {check}"
+            continue
         sigma_m = math.hypot(hit.range_sigma_m, flare.range_m.sigma)
         if abs(hit.range_m - flare.range_m.value) > _MOST_SIGMAS * sigma_m:
             yield (
-                f"the flare at ({hit.u_px:.0f}, {hit.v_px:.0f}) px of frame {flare.frame.index} comes out at "
-                f"{hit.range_m:.3f} ± {hit.range_sigma_m:.3f} m, and {flare.range_m.value:g} m was measured: "
-                "its size and its light do not fit one range. Check focal_length, pixel_pitch, the source's "
-                "radius, and whether that is the source whose range is known; do not trust ranges before"
+                f"{wanted}, and its flare at ({hit.u_px:.0f}, {hit.v_px:.0f}) px comes out at "
+                f"{hit.range_m:.3f} ± {hit.range_sigma_m:.3f} m: its light, its size and what other frames "
+                f"say do not fit one range. {check}"
             )
 
 
@@ -131,7 +143,7 @@ def _flare_of(flare: KnownFlare, known: Calibration) -> Detection:
     """
     frame = flare.frame
     found = [hit for hit in detect(frame, known) if math.isfinite(hit.range_sigma_m)]
-    where = f"frame {frame.index} of {frame.camera}"
+    where = f"frame {frame.index} of {frame.camera} ({flare.name})"
     if not found:
         raise ValueError(
             f"{where} shows no flare that can be measured; take one that is not clipped, and check "

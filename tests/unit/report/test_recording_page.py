@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nir_render.report.pictures import labels_of
 from nir_render.report.recording_checks import (
     darkness_warnings,
     shape_warnings,
@@ -70,6 +71,45 @@ def test_what_sigmas_are_made_of_is_drawn_where_it_was_asked_for() -> None:
         page = _page(FRAMES[:1], CAMERA, causes)
         assert ("What the σ of a range is made of" in page) == bool(causes)
         assert page.count('<figure class="plot">') == 1 + bool(causes)
+
+
+def test_labels_of_flares_beside_each_other_do_not_overlap() -> None:
+    """Eight within 40 px of a frame of 1280, at its edges too: each label by itself, and inside the frame."""
+    unit_px = 12.8
+    for u_px, v_px in ((600.0, 400.0), (1200.0, 955.0), (1010.0, 3.0), (20.0, 950.0)):
+        texts = [(u_px + 5.0 * k, min(v_px + 3.0 * (k % 3), 959.0), "1.198 ± 0.001 m") for k in range(8)]
+        boxes = []
+        for at_px, down_px, anchor, text in labels_of(texts, 1280, 960):
+            left_px = at_px - (17.0 * unit_px if anchor == "end" else 0.0)
+            assert text == "1.198 ± 0.001 m"
+            assert left_px >= 0.0
+            assert left_px + 17.0 * unit_px <= 1280.0
+            assert 2.3 * unit_px <= down_px <= 959.0
+            boxes.append((left_px, down_px))
+        for number, (left_px, down_px) in enumerate(boxes):
+            for other_px, other_down_px in boxes[:number]:
+                apart = (
+                    abs(left_px - other_px) > 17.0 * unit_px or abs(down_px - other_down_px) > 2.2 * unit_px
+                )
+                assert apart, (u_px, v_px)
+
+
+def test_what_paper_cannot_range_is_not_listed() -> None:
+    """Without a range constant of its own paper has no ranges; another's that claims none are listed."""
+    seen = {(one.camera, one.index): detect(one, CAMERA) for one in FRAMES[:2]}
+    blind = {key: [replace(one, range_m=math.nan) for one in found] for key, found in seen.items()}
+    for name, listed in (("paper", False), ("mine", True)):
+        page = recording_html(
+            keys=list(seen),
+            found={"robust": seen, name: blind},
+            load=lambda key: FRAMES[key[1]],
+            calibrations={"r1.front": CAMERA},
+            folder_name="run",
+            files=[],
+        )
+        assert ("Without those of paper" in page) == (not listed)
+        rows = page[page.index("<h2>Detections</h2>") :]
+        assert rows.count("no range</td>") == (2 if listed else 0)
 
 
 def test_it_shows_frames_and_ranges_with_their_sigma() -> None:

@@ -1,21 +1,28 @@
 """The information of a rail's pixels against their whole covariance, written out and inverted."""
 
 import numpy as np
+import pytest
 
+import perception.calibration.rail_equations as rail_equations_module
 from perception.calibration.rail_equations import RailEquations, RailNoise, rail_equations
 from perception.model.flare import PixelBox
 from tests.unit.perception.simulation import random
 
-BOXES = (PixelBox(3, 40, 6, 10), PixelBox(5, 44, 7, 8), PixelBox(90, 100, 5, 5))  # two of which overlap
+# All overlap in some pixels, two in others; one lies apart.
+BOXES = (PixelBox(3, 40, 6, 10), PixelBox(5, 44, 7, 8), PixelBox(7, 38, 6, 9), PixelBox(90, 100, 5, 5))
 SHARED = 5
 
 
-def _noise() -> RailNoise:
+def _noise(scale: tuple[float, float]) -> RailNoise:
+    """Noise whose offsets and responses err so many times as much as usual."""
     draw = random(1, 0)
     return RailNoise(
         BOXES,
         tuple(draw.uniform(50.0, 90.0, (box.height, box.width)) for box in BOXES),
-        tuple(draw.uniform(2.0, 12.0, (2, box.height, box.width)) for box in BOXES),
+        tuple(
+            np.array(scale)[:, None, None] * draw.uniform(2.0, 12.0, (2, box.height, box.width))
+            for box in BOXES
+        ),
     )
 
 
@@ -28,8 +35,14 @@ def _covariance(noise: RailNoise) -> np.ndarray:
     return np.asarray(np.diag(own_e2) + same * (common @ common.T))
 
 
-def test_what_places_share_counts_once() -> None:
-    noise, draw = _noise(), random(2, 0)
+@pytest.mark.parametrize("scale", [(1.0, 1.0), (0.0, 1.0), (1.0, 0.0), (0.0, 0.0)])
+@pytest.mark.parametrize("tile_px", [4, 48])
+def test_what_places_share_counts_once(
+    scale: tuple[float, float], tile_px: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Boxes that are cut by tiles, too, and pixels that err in nothing alike."""
+    monkeypatch.setattr(rail_equations_module, "_TILE_PX", tile_px)
+    noise, draw = _noise(scale), random(2, 0)
     jacobians = [draw.normal(size=(9, box.height, box.width)) for box in BOXES]
     left = [10.0 * draw.normal(size=(box.height, box.width)) for box in BOXES]
     below, precision = draw.normal(size=5), draw.uniform(1.0, 2.0, 5)

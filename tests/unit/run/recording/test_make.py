@@ -13,7 +13,9 @@ import yaml
 
 from nir_render.errors import InputError
 from nir_render.run.recording.make import import_recording, new_recording
+from nir_render.run.recording.pictures import Pictures
 from perception import detect, read_recording
+from perception.calibration.dark import Darkness
 from perception.types import Calibration
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
@@ -234,7 +236,7 @@ def test_what_is_wrong_is_named(
 def test_a_dark_frame_tells_no_range(tmp_path: Path, pictures: Path) -> None:
     folder = _folder(tmp_path, pictures)
     assert cv2.imwrite(str(folder / "img10.png"), np.full((160, 200), 5, np.uint8))
-    with pytest.raises(InputError, match=r"frame 2 of r1.front shows no flare that can be measured"):
+    with pytest.raises(InputError, match=r"frame 2 of r1.front \(img10.png\) shows no flare that can"):
         import_recording(folder, overwrite=False)
 
 
@@ -335,11 +337,33 @@ def test_a_known_range_that_does_not_come_out_again_is_told(tmp_path: Path, pict
     across_rad, down_rad = done.field_of_view_rad
     assert across_rad == pytest.approx(2.0 * math.atan(100.0 / 300.0))
     assert down_rad == pytest.approx(2.0 * math.atan(80.0 / 300.0))
-    wrong = _folder(tmp_path / "wrong", pictures, focal_length="900 px ± 2 %")
-    (said,) = import_recording(wrong, overwrite=False)["r1.front"].warnings
-    assert "of frame 2 comes out at" in said
-    assert "1 m was measured" in said
-    assert "Check focal_length" in said
+    for number, (focal_length, range_text, told) in enumerate(
+        (
+            ("900 px ± 2 %", "1 m ± 5 mm", "1 m was measured of img10.png, and its flare at"),
+            ("100 px ± 2 %", "1 m ± 5 mm", "1 m was measured of img10.png, and "),
+            ("300 px ± 2 %", "2 m ± 5 mm", "2 m was measured of img10.png, and "),
+            ("300 px ± 2 %", "0.5 m ± 5 mm", "0.5 m was measured of img10.png, and "),
+        )
+    ):
+        (tmp_path / str(number)).mkdir()
+        known_range = {"camera": "r1.front", "frame": 2, "range": range_text}
+        wrong = _folder(
+            tmp_path / str(number), pictures, {"known_ranges": [known_range]}, focal_length=focal_length
+        )
+        (said,) = import_recording(wrong, overwrite=False)["r1.front"].warnings
+        assert told in said
+        assert "Check the range that was measured, and of which source, focal_length" in said
+
+
+def test_the_field_of_view_of_a_part_beside_the_axis(tmp_path: Path, pictures: Path) -> None:
+    """Of 200 columns, the first of which lies 300 px right of the axis."""
+    sheets = {"source": {"radius": "10 mm", "intensity": "16 mW/sr"}, "known_ranges": []}
+    folder = _folder(
+        tmp_path, pictures, sheets, principal_point="[-300, 79.5] px", pixel_pitch="5 um", f_number=2
+    )
+    across_rad, down_rad = import_recording(folder, overwrite=False)["r1.front"].field_of_view_rad
+    assert across_rad == pytest.approx(math.atan(499.5 / 300.0) - math.atan(299.5 / 300.0))
+    assert down_rad == pytest.approx(2.0 * math.atan2(80.0, 300.0))
 
 
 def test_missing_numbers_among_the_pictures_are_told(tmp_path: Path, pictures: Path) -> None:
@@ -359,6 +383,21 @@ def test_missing_numbers_among_the_pictures_are_told(tmp_path: Path, pictures: P
     assert import_recording(folder, overwrite=True)["r1.front"].warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("names", "gaps"),
+    [
+        ([f"img_{n:03d}_cam0.png" for n in (0, 1, 2, 4, 5)], [("img_002_cam0.png", "img_004_cam0.png")]),
+        ([f"2026/{n}.png" for n in (0, 10, 20, 30, 60, 70)], [("2026/30.png", "2026/60.png")]),
+        ([f"{n}.png" for n in (0, 33, 67, 100, 133, 167)], []),  # milliseconds
+        ([f"{n}.png" for n in (1, 2, 3, 4)], []),
+        (["a.png", "b.png", "c.png", "d.png"], []),
+        (["a1.png", "a2.png", "b1.png", "b2.png"], []),
+    ],
+)
+def test_gaps_are_those_of_a_number_that_counts(names: list[str], gaps: list[tuple[str, str]]) -> None:
+    assert Pictures(tuple(names), 8, 8, 8, 255, 0.0, Darkness(5.0, 0.1, 1.0)).gaps == gaps
+
+
 def test_twelve_bits_in_files_of_sixteen_are_asked_about(tmp_path: Path, pictures: Path) -> None:
     folder = _folder(tmp_path, pictures, bit_depth="16 bit")
     for path in folder.glob("*.png"):
@@ -367,9 +406,18 @@ def test_twelve_bits_in_files_of_sixteen_are_asked_about(tmp_path: Path, picture
         assert cv2.imwrite(str(path), counts.astype(np.uint16) * 10)
     warnings = import_recording(folder, overwrite=False)["r1.front"].warnings
     assert any("bit_depth is 16 bit, and no picture has a count above" in said for said in warnings)
+    document = yaml.safe_load((folder / "recording.yaml").read_text(encoding="utf-8"))
+    document["cameras"]["r1.front"]["saturation"] = "4095 DN"
+    (folder / "recording.yaml").write_text(yaml.safe_dump(document, allow_unicode=True), encoding="utf-8")
+    warnings = import_recording(folder, overwrite=True)["r1.front"].warnings
+    assert not any("bit_depth" in said for said in warnings)
 
 
 def test_a_key_that_stands_empty_is_not_called_missing(tmp_path: Path, pictures: Path) -> None:
-    folder = _folder(tmp_path, pictures, exposure=None)
-    with pytest.raises(InputError, match=r"cameras\.r1\.front\.exposure: stands empty; fill it in"):
+    known_range = {"camera": "r1.front", "frame": 2, "range": None}
+    folder = _folder(tmp_path, pictures, {"known_ranges": [known_range]}, exposure=None, bit_depth=None)
+    with pytest.raises(InputError) as error:
         import_recording(folder, overwrite=False)
+    told = [line.split(": ", 1)[1] for line in error.value.problems]
+    for key in ("cameras.r1.front.exposure", "cameras.r1.front.bit_depth", "known_ranges.0.range"):
+        assert f"{key}: stands empty; fill it in" in told
