@@ -39,8 +39,8 @@ from benchmarks.memory import SCENE
 
 EXPOSURES = 10
 LOOKS_EVERY_S = 0.1
-UNKILLED_S = 20.0
-"""The mean time after which something is killed, however little is done meanwhile."""
+UNKILLED = 4.0
+"""The mean time until something is killed, however little is done, over that to the calm run's first job."""
 WORKERS = 2
 WEIGHTS = {"worker": 6.0, "nanny": 1.0, "scheduler": 1.5, "driver": 1.5}
 """Of ten kills, how many are of which process."""
@@ -192,11 +192,12 @@ def campaign_in(folder: Path, jobs: int) -> Path:
 
 
 def killed(
-    family: Family, parts: Parts, jobs: int, kills: int, chance: random.Random
+    family: Family, parts: Parts, jobs: int, kills: int, unkilled_s: float, chance: random.Random
 ) -> tuple[Counter[str], int]:
     """Run a campaign to its end while its processes are killed.
 
-    Returns how many of which kind were, and how many of these before the last job was done.
+    `unkilled_s` is the mean time until something is killed, however little is done meanwhile. Returns how many
+    of which kind were killed, and how many of these before the last job was done.
     """
     done: Counter[str] = Counter()
     while_running = 0
@@ -207,7 +208,7 @@ def killed(
             return float("inf"), float("inf")
         # Of what is left to do an even share; the last is for the end without a kill.
         jobs_on = chance.expovariate((left + 1) / max(jobs - len(parts.seen), 1))
-        return len(parts.seen) + jobs_on, time.monotonic() + chance.expovariate(1.0 / UNKILLED_S)
+        return len(parts.seen) + jobs_on, time.monotonic() + chance.expovariate(1.0 / unkilled_s)
 
     family.begin()
     jobs_then, until = next_kill()
@@ -262,8 +263,11 @@ def main() -> None:
         calm = Family(campaign, place / "calm", place, others=False)
         calm.begin()
         started = time.perf_counter()
+        first_s = 0.0
         while not calm.has_ended_well():
             time.sleep(LOOKS_EVERY_S)
+            if not first_s and any((place / "calm" / "jobs").glob("*")):
+                first_s = time.perf_counter() - started
             calm.begin()
         calm_s = time.perf_counter() - started
         calm.end()
@@ -274,7 +278,7 @@ def main() -> None:
             parts, started = Parts(output), time.perf_counter()
             chance = random.Random(asked.seed)  # noqa: S311 (no secret)
             try:
-                done, while_running = killed(family, parts, jobs, asked.kills, chance)
+                done, while_running = killed(family, parts, jobs, asked.kills, UNKILLED * first_s, chance)
                 seconds = time.perf_counter() - started
                 time.sleep(10 * LOOKS_EVERY_S)
                 parts.look()
