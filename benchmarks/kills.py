@@ -196,8 +196,8 @@ def killed(
 ) -> tuple[Counter[str], int]:
     """Run a campaign to its end while its processes are killed.
 
-    `unkilled_s` is the mean time until something is killed, however little is done meanwhile. Returns how many
-    of which kind were killed, and how many of these before the last job was done.
+    `unkilled_s` is the mean time until something is killed, however little is done meanwhile. Returns
+    how many of which kind were killed, and how many of these before the last job was done.
     """
     done: Counter[str] = Counter()
     while_running = 0

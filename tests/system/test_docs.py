@@ -199,4 +199,6 @@ def test_the_gallery_is_what_its_script_makes() -> None:
     assert {path.stem for path in gallery.PICTURES.glob("*.jpg")} == shown
     for scene in shown:
         assert len(gallery.words(scene)) > 60
-        assert cv2.imread(str(gallery.PICTURES / f"{scene}.jpg")).shape[1] == gallery.WIDTH_PX
+        picture = cv2.imread(str(gallery.PICTURES / f"{scene}.jpg"))
+        assert picture is not None
+        assert picture.shape[1] == gallery.WIDTH_PX
