@@ -55,7 +55,8 @@ def following_of(
         return Following()
     odometry = own_odometry(scene)
     found = {
-        name: followed_of(name, frames, calibrations, hits, odometry) for name, hits in detections.items()
+        name: followed_of(name, frames, calibrations, hits, as_kept(odometry))
+        for name, hits in detections.items()
     }
     return Following(odometry, found)
 
@@ -66,12 +67,15 @@ def is_sequence(frames: Sequence[RawFrame]) -> bool:
 
 
 def own_odometry(scene: Scene) -> dict[str, tuple[Odometry, ...]]:
-    """Return what robots that take frames know of their own way, by robot, with the bits that files keep."""
+    """Return what robots that take frames know of their own way, by robot."""
+    return {robot: tuple(odometry_of(scene, robot, scene.document.seed)) for robot in observers_astir(scene)}
+
+
+def as_kept(odometry: ByRobot) -> dict[str, tuple[Odometry, ...]]:
+    """Return odometry with the bits that it has when it comes from a file: turns are quaternions there."""
     return {
-        robot: tuple(
-            parse_odometry(odometry_record(one)) for one in odometry_of(scene, robot, scene.document.seed)
-        )
-        for robot in observers_astir(scene)
+        robot: tuple(parse_odometry(odometry_record(one)) for one in records)
+        for robot, records in odometry.items()
     }
 
 
