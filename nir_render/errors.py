@@ -26,3 +26,7 @@ class InputError(ValueError):
     def __init__(self, *problems: str) -> None:
         super().__init__("\n".join(problems))
         self.problems = problems
+
+
+class DiskFullError(InputError):
+    """There is no room for a file; what else would be written would find none either."""

@@ -25,7 +25,7 @@ _FIELD = re.compile(r"^(?P<kind>[A-Za-z0-9_/]+)(?P<array>\[(?P<count>\d*)\])? (?
 
 
 @dataclass(frozen=True)
-class _Field:
+class Field:
     """A field: its kind; whether it is an array, and of how many where that is fixed."""
 
     name: str
@@ -62,7 +62,7 @@ def encode(kind: str, value: Mapping[str, Any]) -> bytes:
 
 
 def _write_into(buffer: bytearray, kind: str, value: Mapping[str, Any]) -> None:
-    fields = _fields(kind)
+    fields = fields_of(kind)
     if value.keys() != {field.name for field in fields}:
         wrong = value.keys() ^ {field.name for field in fields}
         raise ValueError(f"{kind}: fields {', '.join(sorted(wrong))} are missing or unknown")
@@ -109,21 +109,22 @@ def _align(buffer: bytearray, size: int) -> None:
 
 
 @cache
-def _fields(kind: str) -> tuple[_Field, ...]:
+def fields_of(kind: str) -> tuple[Field, ...]:
+    """Return the fields of a message of `DEFINITIONS`, in their order."""
     found = []
     for line in DEFINITIONS[kind].split("\n"):
         match = _FIELD.match(line)
         if match is None:
             raise ValueError(f"{kind}: {line!r} is no field")
         count = int(match["count"]) if match["count"] else None
-        found.append(_Field(match["name"], match["kind"], match["array"] is not None, count))
+        found.append(Field(match["name"], match["kind"], match["array"] is not None, count))
     return tuple(found)
 
 
 def _needed(kind: str) -> list[str]:
     """Return the messages that one is made of, each once."""
     needed: dict[str, None] = {}
-    for field in _fields(kind):
+    for field in fields_of(kind):
         if field.kind in DEFINITIONS:
             needed |= dict.fromkeys([field.kind, *_needed(field.kind)])
     return list(needed)

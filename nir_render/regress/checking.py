@@ -9,6 +9,7 @@ from nir_render.errors import InputError
 from nir_render.light.light import Light
 from nir_render.light.npz import light_hash
 from nir_render.regress.findings import Check, Finding, ImagePair, SceneCheck
+from nir_render.regress.following import as_kept, followed_of, is_sequence, own_odometry
 from nir_render.regress.make import FrameSetting, detections_of, frame_settings
 from nir_render.regress.reference import Reference, changes_of, document_of, made_by
 from nir_render.regress.repeatable import check_repeatable
@@ -16,6 +17,7 @@ from nir_render.regress.scenes_of import references_folder, scenes_of
 from nir_render.regress.stages.camera import compare_calibration, compare_electrons, compare_frame
 from nir_render.regress.stages.direct import compare_tables
 from nir_render.regress.stages.exposure import compare_choices
+from nir_render.regress.stages.following import compare_followed, compare_odometry
 from nir_render.regress.stages.light import GroupTests, compare_indirect, finding_of
 from nir_render.regress.stages.perception import compare_detections
 from nir_render.regress.stages.view import compare_view
@@ -250,7 +252,25 @@ def _findings_after_light(case: _SceneCase) -> tuple[list[Finding], list[ImagePa
         compare_detections(estimator, before, found.get(estimator, ()), exact=exact)
         for estimator, before in reference.detections.items()
     )
+    findings.extend(_followed(scene, reference, exact=exact))
     return [*findings, check_repeatable(scene, reference, taken, found)], pairs
+
+
+def _followed(scene: Scene, reference: Reference, *, exact: bool) -> list[Finding]:
+    """Compare what robots know of their way, whom they follow and what they read."""
+    frames = [shot.frame for shot in reference.shots]
+    if not is_sequence(frames):
+        return []
+    before = reference.following
+    if before is None:
+        words = "the reference has none: 'nir-render regress update --all' adds them"
+        return [Finding("perception", "tracks and messages", "skipped", words)]
+    findings = [compare_odometry(before.odometry, as_kept(own_odometry(scene)), exact=exact)]
+    for name, known in before.by_estimator.items():
+        detections = reference.detections[name]
+        now = followed_of(name, frames, reference.calibrations, detections, before.odometry)
+        findings += compare_followed(name, known, now, exact=exact)
+    return findings
 
 
 def _check_stock_renders(scene: Scene) -> None:

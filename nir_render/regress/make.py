@@ -13,6 +13,7 @@ from nir_render.errors import InputError
 from nir_render.light.light import Light
 from nir_render.light.npz import light_hash
 from nir_render.randomness import RandomKey, generator
+from nir_render.regress.following import following_of
 from nir_render.regress.reference import (
     Reference,
     ReferenceLight,
@@ -107,6 +108,7 @@ def make_reference(
     shots = tuple(replace(shot, chosen=chosen.get((shot.frame.camera, shot.frame.index))) for shot in shots)
     calibrations = {name: calibration(scene, name) for name in scene.cameras()}
     frames = [shot.frame for shot in shots]
+    detections = detections_of(frames, calibrations)
     return Reference(
         document=document_of(scene),
         seed=scene.document.seed,
@@ -115,8 +117,9 @@ def make_reference(
         lights=lights,
         shots=shots,
         calibrations=calibrations,
-        detections=detections_of(frames, calibrations),
+        detections=detections,
         history=history,
+        following=following_of(scene, frames, calibrations, detections),
     )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.timing.exposure_control import Setting
 from nir_render.light.light import Light
+from nir_render.regress.following import Following
 from nir_render.scene.documents.materials import texture_of
 from nir_render.scene.documents.shapes import Mesh
 from nir_render.scene.scene import Scene
@@ -83,6 +84,8 @@ class Reference:
         By estimator.
     history
         Why it was made, and each time that it was made anew: `reason` and `time`.
+    following
+        Odometry, and what each estimator follows and reads; None where the reference is older than this.
     """
 
     document: Mapping[str, Any]
@@ -94,6 +97,7 @@ class Reference:
     calibrations: Mapping[str, Calibration]
     detections: Mapping[str, tuple[Detection, ...]]
     history: tuple[Mapping[str, str], ...]
+    following: Following | None = None
 
 
 def document_of(scene: Scene) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """References on disk: a folder for each scene, which is also a recording that any stack can read.
 
 reference.json (the scene, seed, versions, history), light.N.npz, third.npz, expected.npz, frames.jsonl with
-frames/, calibration.json, detections.NAME.jsonl; and above all scenes manifest.json with every file's hash.
+frames/, calibration.json, detections.NAME.jsonl; of sequences odometry.jsonl, and tracks and messages of NAME
+in .jsonl; and above all scenes manifest.json with every file's hash.
 """
 
 import hashlib
 import io
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from nir_render.camera.timing.exposure_control import Setting
 from nir_render.errors import InputError
 from nir_render.light.npz import read_light, write_light
+from nir_render.regress.following import Followed, Following
 from nir_render.regress.reference import Reference, ReferenceLight, ReferenceShot
 from nir_render.run import folder as run_folder
 from perception import (
@@ -25,11 +27,18 @@ from perception import (
     detection_record,
     encode_png16,
     frame_record,
+    message_record,
+    odometry_record,
     parse_detection,
+    parse_message,
+    parse_track,
     read_calibrations,
     read_frame,
     read_frame_records,
+    read_odometry,
+    track_record,
 )
+from perception.files.tracks import ODOMETRY
 
 FORMAT = 1
 _FILE = "reference.json"
@@ -136,8 +145,11 @@ def _write(folder: Path, reference: Reference) -> None:
     run_folder.write_json(folder / "calibration.json", calibrations)
     for estimator, found in reference.detections.items():
         run_folder.write_lines(folder / f"detections.{estimator}.jsonl", map(detection_record, found))
+    if reference.following is not None:
+        _write_following(folder, reference.following)
     facts = {
         "format": FORMAT,
+        "follows": reference.following is not None,
         "seed": reference.seed,
         "renders": reference.renders,
         "lights": lights,
@@ -193,7 +205,29 @@ def _read(folder: Path) -> Reference:
         calibrations=read_calibrations(folder),
         detections=detections,
         history=tuple(facts["history"]),
+        following=_read_following(folder, detections) if facts.get("follows", False) else None,
     )
+
+
+def _write_following(folder: Path, following: Following) -> None:
+    odometry = [odometry_record(one) for records in following.odometry.values() for one in records]
+    if odometry:
+        run_folder.write_lines(folder / ODOMETRY, odometry)
+    for name, followed in following.by_estimator.items():
+        run_folder.write_lines(folder / f"tracks.{name}.jsonl", map(track_record, followed.tracks))
+        run_folder.write_lines(folder / f"messages.{name}.jsonl", map(message_record, followed.messages))
+
+
+def _read_following(folder: Path, estimators: Iterable[str]) -> Following:
+    found = {
+        name: Followed(
+            tuple(run_folder.parse_lines(folder / f"tracks.{name}.jsonl", parse_track)),
+            tuple(run_folder.parse_lines(folder / f"messages.{name}.jsonl", parse_message)),
+        )
+        for name in estimators
+        if (folder / f"tracks.{name}.jsonl").is_file()
+    }
+    return Following(read_odometry(folder), found)
 
 
 def _key(shot: ReferenceShot) -> str:

@@ -5,6 +5,7 @@ killed goes on. A file that is added later is written aside, synced and renamed.
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
-from nir_render.errors import InputError
+from nir_render.errors import DiskFullError, InputError
 from perception.files.fields import Place, RecordingError, first_of, parse_json
 from perception.files.readers import number as number_of
 
@@ -32,6 +33,7 @@ LOOK = "look.png"
 POSES = "poses.jsonl"
 SETS = "sets.json"
 _DIGEST = ".digest"
+_NO_ROOM = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}  # a quota is a POSIX matter
 
 Item = TypeVar("Item")
 
@@ -306,10 +308,9 @@ def note_seconds(folder: Path, stage: str, started: float) -> None:
 
 
 def disk_error(path: Path, error: OSError) -> InputError:
-    """Return the error to show where the disk refuses."""
-    return InputError(
-        f"{path}: cannot be written ({error.strerror or error}); nothing half-written was left there"
-    )
+    """Return the error to show where the disk refuses; a DiskFullError where it has no room."""
+    kind = DiskFullError if error.errno in _NO_ROOM else InputError
+    return kind(f"{path}: cannot be written ({error.strerror or error}); nothing half-written was left there")
 
 
 def _read(path: Path) -> str:

@@ -8,6 +8,7 @@ from nir_render.scene.documents.ambient.lamps import Infrared, Lamp
 from nir_render.scene.documents.ambient.sun import Air, Skylight, Sun
 from nir_render.scene.documents.curves import CurveDocument
 from nir_render.scene.documents.emitters import Source
+from nir_render.scene.documents.spectral.led import SpectrumDocument
 from nir_render.spectra.curve import Curve, constant_curve
 from nir_render.spectra.illuminants import (
     SILICON_M,
@@ -46,9 +47,14 @@ def emission_spectrum(emitter: Emitter) -> Curve:
             return constant_curve(1.0, *SILICON_M, "the sky's spectrum").normalised()
         assert emitter.sun.air is not None  # a sky has one of both
         return _behind(emitter.sun.air, emitter.sun).diffuse.normalised()
-    curve = emitter.spectrum.curve("the source's spectrum").normalised()
+    curve = _source_spectrum(emitter.spectrum)
     offset_m = emitter.unit.wavelength_m
     return replace(curve, wavelength_m=curve.wavelength_m + offset_m) if offset_m else curve
+
+
+@lru_cache(maxsize=64)
+def _source_spectrum(spectrum: SpectrumDocument) -> Curve:
+    return spectrum.curve("the source's spectrum").normalised()
 
 
 def emission_units(emitter: Emitter) -> float:

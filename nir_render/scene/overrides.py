@@ -1,6 +1,5 @@
 """Changes of a raw document at dotted paths: `--set`, `Scene.with_`, the axes of a campaign."""
 
-import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,14 +16,14 @@ _COMPONENTS = {"x": 0, "y": 1, "z": 2, "0": 0, "1": 1, "2": 2}  # of vectors
 
 
 def apply_overrides(raw: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of a raw document with values set at dotted paths.
+    """Return a raw document with values set at dotted paths; what they leave is shared with the one given.
 
     Numbers in a path index lists; x, y, z (or 0, 1, 2) at its end are components of a vector:
     `robots.r2.position.x`.
     A preset's name on the way becomes the ground under the change: `...sensor.read_noise` on
     `sensor: mt9m031` gives `{preset: mt9m031, read_noise: ...}`.
     """
-    changed: dict[str, Any] = copy.deepcopy(dict(raw))
+    changed: dict[str, Any] = dict(raw)
     for path, value in overrides.items():
         keys = path.split(".")
         if not all(keys):
@@ -44,13 +43,17 @@ def _without_rivals(changed: dict[str, Any], overrides: Mapping[str, Any]) -> di
     if len(set_now) != 1:
         return changed
     (rival,) = set(_RIVALS) - set_now
-    *way, last = rival.split(".")
-    node: Any = changed
-    for key in way:
-        node = node.get(key) if isinstance(node, dict) else None
-    if isinstance(node, dict):
-        node.pop(last, None)  # `_set` has copied all on the way to the other one; the rest is a deep copy
-    return changed
+    found: dict[str, Any] = _without(changed, rival.split("."))
+    return found
+
+
+def _without(node: Any, way: list[str]) -> Any:
+    """Return nested data without what lies at the end of a way; all else is shared."""
+    if not isinstance(node, dict) or way[0] not in node:
+        return node
+    if len(way) == 1:
+        return {key: value for key, value in node.items() if key != way[0]}
+    return {**node, way[0]: _without(node[way[0]], way[1:])}
 
 
 def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:

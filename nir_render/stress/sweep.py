@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 import yaml
 
-from nir_render.errors import InputError
+from nir_render.errors import DiskFullError, InputError
 from nir_render.report.wording import counted
 from nir_render.run.folder import disk_error, locked, read_json, write_file, write_json, write_lines
 from nir_render.run.manifest import versions
@@ -138,10 +138,18 @@ def sweep(
                         progress(done, len(jobs))
             except KeyboardInterrupt:
                 raise StoppedError(done - len(failed), len(jobs)) from None
+            except DiskFullError as full:
+                raise InputError(
+                    f"{full}; {done - len(failed)} of {len(jobs)} jobs are done; make room, and the same "
+                    "command goes on"
+                ) from None
         for place in (folder, parts, folder / _LIGHT):
             _remove_abandoned(place, ".*.partial-*")
         _remove_abandoned(parts, f"{MARK}*")
-        result = _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
+        try:
+            result = _gather(campaign, jobs, folder, failed, len(jobs) - len(missing))
+        except DiskFullError as full:
+            raise InputError(f"{full}; make room, and the same command goes on") from None
         if store is not None:
             for name in (TABLE, JOBS, MANIFEST):
                 store.put(folder / name, name)

@@ -8,6 +8,7 @@ import re
 import shutil
 from pathlib import Path
 
+import cv2
 import pytest
 import yaml
 
@@ -184,3 +185,20 @@ def test_what_a_page_loads_from_elsewhere_is_found(tmp_path: Path) -> None:
     for name, text in faults.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     assert {found.split(":")[0] for found in offline.remote_loads(tmp_path)} == set(faults)
+
+
+def test_the_gallery_is_what_its_script_makes() -> None:
+    """Its text follows from the scene files; pictures are drawn anew by hand, and none is left over."""
+    spec = importlib.util.spec_from_file_location("gallery", ROOT / "tools" / "gallery.py")
+    assert spec is not None
+    assert spec.loader is not None
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    assert gallery.PAGE.read_text(encoding="utf-8") == gallery.page()
+    shown = {scene for scenes in gallery.SHOWN.values() for scene in scenes}
+    assert {path.stem for path in gallery.PICTURES.glob("*.jpg")} == shown
+    for scene in shown:
+        assert len(gallery.words(scene)) > 60
+        picture = cv2.imread(str(gallery.PICTURES / f"{scene}.jpg"))
+        assert picture is not None
+        assert picture.shape[1] == gallery.WIDTH_PX

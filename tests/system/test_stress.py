@@ -223,3 +223,31 @@ def test_twenty_kills_lose_nothing_and_do_nothing_twice(tmp_path: Path) -> None:
     assert len(list(output.glob("jobs/*.parquet"))) == 200
     assert contents(output) == contents(tmp_path / "calm")
     assert left_over(output) == []
+
+
+@pytest.mark.verify
+@pytest.mark.at_length
+@pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="only root may make a small disk")
+def test_a_disk_that_fills_up_is_told_and_the_same_command_goes_on(tmp_path: Path) -> None:
+    """A disk of 500 kB in memory, the worker's own folders on it too; then one of 50 MB: the table of a calm run."""
+    file, disk = campaign(tmp_path, ranges=4, exposures=8), tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=500k", "tmpfs", disk]).returncode != 0:
+        pytest.skip("this machine lets nobody mount a disk")
+    try:
+        process = start(file, disk / "out")
+        _, err = process.communicate(timeout=300)
+        said = " ".join(err.split())
+        assert process.returncode == 2, err
+        assert "cannot be written (No space left on device)" in said
+        done = len(times_of(disk / "out"))
+        assert f"{done} of 32 jobs are done; make room, and the same command goes on" in said
+        assert "Traceback" not in err
+        assert 0 < done < 32
+        subprocess.run(["mount", "-o", "remount,size=50M", disk], check=True)
+        assert json.loads(finished(file, disk / "out", "--json"))["done_before"] == done
+        finished(file, tmp_path / "calm")
+        assert contents(disk / "out") == contents(tmp_path / "calm")
+        assert left_over(disk / "out") == []
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)

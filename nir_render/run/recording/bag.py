@@ -92,19 +92,35 @@ def _image(data: bytes) -> tuple[int, NDArray[np.uint8] | NDArray[np.uint16]]:
     at = _aligned(16 + length)
     rows, columns, length = struct.unpack_from("<III", data, at)
     encoding = data[at + 12 : at + 12 + length].rstrip(b"\0").decode("ascii", errors="replace")
+    at += 12 + length
+    (is_big_endian,) = struct.unpack_from("<B", data, at)
+    at = _aligned(at + 1)
+    step, size = struct.unpack_from("<II", data, at)
+    pixels = data[at + 8 : at + 8 + size]
+    return 1_000_000_000 * seconds + nanoseconds, counts_of(
+        rows, columns, encoding, is_big_endian, step, pixels
+    )
+
+
+def counts_of(
+    rows: int, columns: int, encoding: str, is_big_endian: int, step: int, data: bytes
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Return the raw counts of a `sensor_msgs/Image` by its fields, shape (rows, columns).
+
+    Raises
+    ------
+    ValueError
+        It is not grey, or cut off.
+    """
     if encoding not in _DEPTHS:
         raise ValueError(f"a picture is {encoding!r}; wanted raw counts: {', '.join(_DEPTHS)}")
-    is_big_endian = data[at + 12 + length]
-    at = _aligned(at + 13 + length)
-    step, size = struct.unpack_from("<II", data, at)
     depth = _DEPTHS[encoding]
-    if size != rows * step or step < columns * depth or len(data) < at + 8 + size:
+    if len(data) != rows * step or step < columns * depth:
         raise ValueError(f"a picture of {columns} × {rows} px is cut off")
-    lines = np.frombuffer(data, np.uint8, size, at + 8).reshape(rows, step)[:, : columns * depth]
+    lines = np.frombuffer(data, np.uint8).reshape(rows, step)[:, : columns * depth]
     if depth == 1:
-        return 1_000_000_000 * seconds + nanoseconds, lines
-    counts = np.ascontiguousarray(lines).view(">u2" if is_big_endian else "<u2").astype(np.uint16)
-    return 1_000_000_000 * seconds + nanoseconds, counts
+        return lines
+    return np.ascontiguousarray(lines).view(">u2" if is_big_endian else "<u2").astype(np.uint16)
 
 
 def _aligned(at: int) -> int:

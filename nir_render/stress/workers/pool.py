@@ -25,7 +25,7 @@ from distributed.comm import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.scheduler import KilledWorker
 
-from nir_render.errors import InputError
+from nir_render.errors import DiskFullError, InputError
 from nir_render.run.perceive import estimators_in_process
 from nir_render.scene.scene import Scene
 from nir_render.stress.job.execute import execute
@@ -109,6 +109,8 @@ def run_jobs(
     ------
     InputError
         There is no scheduler, or none any more; or a worker is refused, at the start or later.
+    DiskFullError
+        A worker has no room for what a job has found: the next ones would have none either.
     """
     # `scratch` may hold what a killed run has left.
     shutil.rmtree(scratch, ignore_errors=True)
@@ -325,7 +327,7 @@ def _do(job: Job, plugin: str) -> str | None:
     context = get_worker().plugins[plugin]
     try:
         context.do(job)
-    except RefusedError:
+    except (RefusedError, DiskFullError):
         raise
     except Exception as error:  # one job that fails must not take the others along
         return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
@@ -339,7 +341,7 @@ def _fault(future: Future) -> str | None:
     if error is None:
         problem: str | None = future.result()
         return problem
-    if isinstance(error, RefusedError):
+    if isinstance(error, RefusedError | DiskFullError):
         raise error
     if isinstance(error, KilledWorker):
         deaths = error.allowed_failures + 1  # a scheduler that someone else has started has its own limit

@@ -3,17 +3,27 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nir_render.errors import InputError
 from nir_render.light.npz import light_hash
 from nir_render.regress import create, update
+from nir_render.regress.following import Followed, Following, as_kept
 from nir_render.regress.scenes_of import scenes_of
+from nir_render.regress.stages.following import compare_followed, compare_odometry
 from nir_render.regress.store import names_in, read_reference, write_references
-from perception import read_calibrations, read_frames
+from perception import (
+    Message,
+    Odometry,
+    Track,
+    read_calibrations,
+    read_frames,
+)
 from tests.unit.regress import cases
 
 
@@ -36,6 +46,25 @@ def test_a_reference_comes_back_as_it_was(stored: Path, tmp_path: Path) -> None:
     assert after.detections["paper"] == ()
     for name in ("document", "seed", "renders", "made_by", "history"):
         assert getattr(after, name) == getattr(before, name)
+
+
+def test_what_follows_from_it_comes_back_with_its_bits(tmp_path: Path) -> None:
+    """A robot that turns, seen from one whose odometry is noisy: what was written is what is compared."""
+    known = cases.reference(cases.scene(tmp_path))
+    turn = Rotation.from_euler("z", 0.123).as_matrix()
+    odometry = Odometry("r1", 0.1, np.array([0.1, 1.0 / 3.0, 0.0]), turn, 0.01, 0.002)
+    track = Track("r1", 0.1, 3, np.array([2.0, 1.0 / 3.0, 0.1]), np.full(3, 0.1), np.eye(6) / 3.0)
+    word = Message("r1", 3, np.float64(1.0) / 3.0, 6.75, 11, "recover", 0.9999, 5)
+    following = Following(
+        {"r1": (odometry,)}, {"robust": Followed((track,), (word,)), "paper": Followed((), ())}
+    )
+    write_references(tmp_path / "refs", {"small": replace(known, following=following)}, [], lambda: None)
+    read = read_reference(tmp_path / "refs", "small", tmp_path).following
+    assert read is not None
+    assert compare_odometry(as_kept(following.odometry), read.odometry, exact=True).same_bits
+    for name, before in following.by_estimator.items():
+        findings = compare_followed(name, before, read.by_estimator[name], exact=True)
+        assert [finding.same_bits for finding in findings] == [True, True]
 
 
 def test_its_folder_is_a_recording(stored: Path) -> None:

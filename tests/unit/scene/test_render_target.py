@@ -1,5 +1,6 @@
 """The target for the noise of rendering, and the fixed count that may stand in its place."""
 
+import copy
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,14 @@ def test_the_resolved_document_loads_to_the_same_target(scene: Scene, tmp_path: 
         changed = scene.with_(changes)
         path.write_text(changed.resolved_yaml(), encoding="utf-8")
         assert load_scene(path).document.render == changed.document.render
+
+
+def test_what_is_changed_is_a_copy(scene: Scene) -> None:
+    """Copies share what they leave alone: so nothing is changed where it stands, and a rival that goes goes from the copy."""
+    scene = scene.with_({"render.indirect.samples": 64, "render.indirect.scale": 4})
+    before = copy.deepcopy(scene.raw)
+    changed = scene.with_({"render.noise": f"2 {PERCENT}", "robots.r2.rig.sources.top.flux": "0.1 W"})
+    assert scene.raw == before
+    assert changed.raw["render"] == {"noise": f"2 {PERCENT}", "indirect": {"scale": 4}}
+    scene.with_({"render.indirect.samples": 16})
+    assert scene.raw == before

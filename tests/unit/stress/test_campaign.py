@@ -14,6 +14,7 @@ from nir_render.stress.campaign import Campaign, campaign_schema, load_campaign
 from nir_render.stress.jobs import Job, plan
 from nir_render.stress.sweep import PLANNED, plan_record, status_record
 from nir_render.stress.workers.pool import part_file
+from nir_render.transport.indirect.guide import group_power
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.mitsuba
@@ -49,6 +50,20 @@ def test_the_shipped_campaigns_can_be_read(file: Path) -> None:
     campaign = load_campaign(file)
     assert campaign.name == file.stem
     assert {bound.metric for bound in campaign.bounds} <= set(campaign.metrics)
+
+
+def test_lamps_of_the_large_campaign_share_their_light() -> None:
+    """So 200 scenes of four cameras are 40 renders of each: its lamps take one share of the samples, whatever their flux."""
+    campaign = load_campaign(ROOT / "scenes" / "campaigns" / "ranging_clutter_200.yaml")
+    (lamp,) = (axis for axis in campaign.axes if axis.name == "lamp")
+    powers = set()
+    for value in lamp.values:
+        snapshot = campaign.scene.with_(dict.fromkeys(lamp.paths, value)).at(0.0)
+        powers |= {
+            tuple(group_power(snapshot, snapshot.camera(name).camera)) for name in campaign.scene.cameras()
+        }
+    assert len(lamp.values) == 5
+    assert len(powers) == 1
 
 
 def test_editors_know_campaigns() -> None:

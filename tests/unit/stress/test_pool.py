@@ -1,6 +1,8 @@
 """Workers that are killed at a bad moment, or that are not of one mind with the program that asks them."""
 
 import contextlib
+import errno
+import pickle
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,13 +17,23 @@ from distributed.comm import CommClosedError
 from distributed.scheduler import KilledWorker
 
 from nir_render import InputError
+from nir_render.errors import DiskFullError
 from nir_render.stress import sweep as sweeps
 from nir_render.stress.campaign import load_campaign
 from nir_render.stress.jobs import Job, is_same, made_by_of, plan
-from nir_render.stress.table import read_part
+from nir_render.stress.table import read_part, write_part
 from nir_render.stress.workers import cluster, pool
 from nir_render.stress.workers.cluster import RefusedError, check_this_worker, process_facts, terms_of
-from nir_render.stress.workers.pool import Work, _Context, _fault, _tell_workers, part_file, run_jobs
+from nir_render.stress.workers.pool import (
+    Done,
+    Work,
+    _Context,
+    _do,
+    _fault,
+    _tell_workers,
+    part_file,
+    run_jobs,
+)
 from nir_render.transport import cache_key
 from tests.system.test_stress import campaign as tiny_campaign
 
@@ -177,3 +189,48 @@ def test_as_many_deaths_are_told_as_the_scheduler_allows() -> None:
     refused = RefusedError("no")
     with pytest.raises(RefusedError):
         _fault(cast("Future", SimpleNamespace(exception=lambda: refused)))
+
+
+@pytest.mark.mitsuba
+def test_a_disk_that_fills_up_ends_the_campaign_and_says_how_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No room for the third of six jobs: none is tried after it, and the same call does the four that are missing."""
+    campaign = load_campaign(tiny_campaign(tmp_path, ranges=2, exposures=3))
+    jobs, tried, room = plan(campaign), list[str](), 2
+
+    def run(work: Work, jobs: list[Job], *_: object) -> Iterator[Done]:
+        def do(job: Job) -> None:
+            tried.append(job.key)
+            if len(tried) > room:
+                monkeypatch.setattr("os.fsync", full)
+            write_part(part_file(work.parts, job), [], job.key * 2)
+
+        here = SimpleNamespace(plugins={"name": SimpleNamespace(do=do, begin_anew_in_time=lambda: None)})
+        monkeypatch.setattr(pool, "get_worker", lambda: here)
+        for job in jobs:
+            error: BaseException | None = None
+            try:
+                _do(job, "name")
+            except DiskFullError as found:  # goes from the worker to the driver as bytes
+                error = pickle.loads(pickle.dumps(found))
+            future = SimpleNamespace(exception=lambda error=error: error, result=lambda: None)
+            yield Done(job, _fault(cast("Future", future)))
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sweeps, "run_jobs", run)
+    with pytest.raises(InputError) as told:
+        sweeps.sweep(campaign, jobs, tmp_path / "out", workers=1, progress=lambda *_: None)
+    assert str(told.value).endswith(
+        "cannot be written (No space left on device); nothing half-written was left there; "
+        "2 of 6 jobs are done; make room, and the same command goes on"
+    )
+    assert tried == [job.key for job in jobs[:3]]
+    assert len(list((tmp_path / "out" / "jobs").iterdir())) == 2
+    monkeypatch.undo()
+    monkeypatch.setattr(sweeps, "run_jobs", run)
+    room = 99
+    result = sweeps.sweep(campaign, jobs, tmp_path / "out", workers=1, progress=lambda *_: None)
+    assert (result.reused, result.failed, len(tried)) == (2, {}, 7)
