@@ -15,7 +15,7 @@ bytes.
 
 import hashlib
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
@@ -233,38 +233,40 @@ def _versions() -> tuple[str, ...]:
 
 def digest(value: Any) -> str:
     """Return the hash of plain data, arrays and models: 64 hexadecimal digits."""
-    hashed = hashlib.sha256()
-    for part in _parts(value):
-        hashed.update(part)
-    return hashed.hexdigest()
+    parts: list[bytes] = []
+    _write(value, parts.append)
+    return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def _parts(value: Any) -> Iterable[bytes]:
-    """Yield the canonical bytes of plain data, arrays and models."""
-    match value:
-        case None:
-            yield b"n"
-        case bool() | int() | np.integer():
-            yield f"i{int(value)};".encode()
-        case float():
-            yield b"d" + struct.pack("<d", value)
-        case str():
-            yield f"s{len(value.encode())};{value}".encode()
-        case np.ndarray():
-            array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
-            yield f"a{array.dtype.str}{array.shape};".encode()
-            yield array.tobytes()
-        case tuple() | list():
-            yield f"l{len(value)};".encode()
-            for item in value:
-                yield from _parts(item)
-        case BaseModel():
-            fields = {name: getattr(value, name) for name in type(value).model_fields}
-            yield from _parts((type(value).__name__, fields))
-        case Mapping():
-            yield f"m{len(value)};".encode()
-            for key, item in value.items():
-                yield from _parts(key)
-                yield from _parts(item)
-        case _:
-            raise TypeError(f"{type(value).__name__} has no canonical bytes")
+def _write(value: Any, write: Callable[[bytes], None]) -> None:
+    """Write the canonical bytes of plain data, arrays and models; what is most is asked for first."""
+    if isinstance(value, str):
+        text = value.encode()
+        write(b"s%d;%b" % (len(text), text))
+    elif isinstance(value, float):
+        write(b"d" + _DOUBLE.pack(value))
+    elif isinstance(value, tuple | list):
+        write(b"l%d;" % len(value))
+        for item in value:
+            _write(item, write)
+    elif value is None:
+        write(b"n")
+    elif isinstance(value, bool | int | np.integer):
+        write(b"i%d;" % int(value))
+    elif isinstance(value, np.ndarray):
+        array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
+        write(f"a{array.dtype.str}{array.shape};".encode())
+        write(array.tobytes())
+    elif isinstance(value, BaseModel):
+        fields = {name: getattr(value, name) for name in type(value).model_fields}
+        _write((type(value).__name__, fields), write)
+    elif isinstance(value, Mapping):
+        write(b"m%d;" % len(value))
+        for key, item in value.items():
+            _write(key, write)
+            _write(item, write)
+    else:
+        raise TypeError(f"{type(value).__name__} has no canonical bytes")
+
+
+_DOUBLE = struct.Struct("<d")

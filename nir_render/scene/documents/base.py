@@ -105,12 +105,18 @@ class Document(BaseModel):
     @classmethod
     def key_problems(cls, data: Any) -> list["KeyProblem"]:
         """Return what is wrong with the keys of data; raise ValueError where they are no mapping."""
-        known = [*(document_key(name) for name in cls.model_fields), *cls.read_keys]
+        known = _keys_of(cls)
         if not isinstance(data, Mapping):
             like = f"such as {cls.example}" if cls.example else f"known keys: {', '.join(sorted(known))}"
             raise ValueError(f"{shown(data)} stands where keys with values are wanted, {like}")
         found = (_key_problem(key, value, known) for key, value in data.items())
         return [problem for problem in found if problem is not None]
+
+
+@cache
+def _keys_of(model: type[Document]) -> tuple[str, ...]:
+    """Return the keys that a model takes."""
+    return *(document_key(name) for name in model.model_fields), *model.read_keys
 
 
 @dataclass(frozen=True)
