@@ -48,7 +48,10 @@ class Tab:
             json.dumps({"id": number, "method": method, "params": parameters})
         )
         while True:
-            told = json.loads(await self._connection.read_message() or "{}")
+            text = await self._connection.read_message()
+            if text is None:
+                raise SystemExit("the browser has gone: open the page in it by hand to see why")
+            told = json.loads(text)
             if told.get("id") == number:
                 return told.get("result", told)
             self._note(told)
@@ -63,6 +66,10 @@ class Tab:
     def _note(self, told: dict[str, Any]) -> None:
         said = told.get("params", {})
         match told.get("method"):
+            case "Network.requestWillBeSent":
+                address = said["request"]["url"]
+                if not address.startswith(("file:", "data:", "blob:")):
+                    self.messages.append(f"network: {address}")
             case "Log.entryAdded":
                 entry = said["entry"]
                 self.messages.append(f"{entry['level']}: {entry['text']} {entry.get('url', '')}".strip())

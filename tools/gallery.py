@@ -45,7 +45,8 @@ def words(scene: str) -> str:
         lines.append(line.removeprefix("#").strip())
     # A sentence that goes on with the command is left out with it.
     text = " ".join(lines).removesuffix("Run it with:").strip()
-    return text[: text.rfind(".") + 1]
+    end = text.rfind(".") + 1
+    return text[: end + text[end:].startswith(")")]
 
 
 def page() -> str:

@@ -1,19 +1,21 @@
-"""Messages by their definitions: as the text that a file describes itself by, and as bytes (CDR).
+"""Messages by their definitions: the text that a file describes itself by, bytes (CDR), ROS's own classes.
 
 CDR is how ROS 2 writes messages (OMG, Common Data Representation, plain, little-endian): fields one after the
 other, each primitive aligned to its size, counted from behind the four bytes of the head; strings and
 sequences begin with their length.
 """
 
+import importlib
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from nir_render.errors import InputError
 from nir_render.export.ros_definitions import DEFINITIONS
 
 _HEAD = b"\x00\x01\x00\x00"
@@ -128,3 +130,47 @@ def _needed(kind: str) -> list[str]:
         if field.kind in DEFINITIONS:
             needed |= dict.fromkeys([field.kind, *_needed(field.kind)])
     return list(needed)
+
+
+MakeMessage = Callable[..., Any]
+"""The class of a message: its fields by name make one."""
+
+
+def made(kind: str, value: Any, message_of: Callable[[str], MakeMessage]) -> Any:
+    """Return a message with fields as `ros_messages` has them, and those within it, of ROS's own classes."""
+    if kind not in DEFINITIONS:
+        return value
+    fields: dict[str, Any] = {}
+    for field in fields_of(kind):
+        content = value[field.name]
+        nested = isinstance(content, Sequence) and not isinstance(content, str | bytes)
+        if nested and field.kind in DEFINITIONS:
+            content = [made(field.kind, one, message_of) for one in content]
+        elif not nested:
+            content = made(field.kind, content, message_of)
+        fields[field.name] = content
+    return message_of(kind)(**fields)
+
+
+def class_of(kind: str) -> MakeMessage:
+    """Return the class of a message of the installed ROS."""
+    package, _, name = kind.partition("/")
+    try:
+        found: MakeMessage = getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        raise InputError(
+            f"{kind} is not to be had: run this where ROS 2 is installed and sourced "
+            f"(source /opt/ros/…/setup.bash), with the package {package}"
+        ) from None
+    return found
+
+
+def quality_of_sensors() -> Any:
+    """Return ROS's own quality of service for data of sensors."""
+    try:
+        return importlib.import_module("rclpy.qos").qos_profile_sensor_data
+    except ImportError:
+        raise InputError(
+            "rclpy is not to be had: run this where ROS 2 is installed and sourced "
+            "(source /opt/ros/…/setup.bash)"
+        ) from None

@@ -9,8 +9,9 @@
 It was not tried on ROS itself: what stands in for a node is in `tests/unit/export/test_live.py`.
 """
 
-import importlib
 import json
+import logging
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +24,6 @@ from scipy.spatial.transform import Rotation
 from nir_render.errors import InputError
 from nir_render.export import cdr
 from nir_render.export import ros_messages as ros
-from nir_render.export.ros_definitions import DEFINITIONS
 from nir_render.run.recording.bag import counts_of
 from perception import (
     Calibration,
@@ -36,15 +36,15 @@ from perception import (
     message_record,
     track_record,
 )
+from perception.model.sensor import without_offsets
 from perception.rig.frame_sets import robot_of
 
 _IMAGE, _ODOMETRY = "sensor_msgs/Image", "nav_msgs/Odometry"
 _TEXT, _MARKERS = "std_msgs/String", "visualization_msgs/MarkerArray"
-_KEPT_S = 2.0  # of the robot's own motion, before the last set
+_KEPT_S, _MOST_KEPT_S = 2.0, 30.0  # of the robot's own motion, before the last set; where none comes
+_JUMP_S = 1.0  # back: then a clock was set, or a bag begins again
 _QUEUED = 10
-
-MakeMessage = Callable[..., Any]
-"""The class of a message: its fields by name make one."""
+_LOG = logging.getLogger(__name__)
 
 
 class Node(Protocol):
@@ -82,11 +82,27 @@ class Taken:
     stamped: Literal["begin", "middle"] = "begin"
 
 
+@dataclass(frozen=True)
+class OdometryError:
+    """How far odometry is off, per axis: each record by itself, and how that grows with the root of time.
+
+    A message's own covariance says what has been gathered since the start, or a large number for axes that
+    are not measured: neither is asked for here. The defaults are those of a small wheeled robot.
+    """
+
+    position_sigma_m: float = 0.001
+    rotation_sigma_rad: float = 0.002
+    position_walk_m_per_sqrt_s: float = 0.01
+    rotation_walk_rad_per_sqrt_s: float = 0.0035
+
+
 class Live:
     """What takes a robot's pictures as they come, and tells whom it follows and what they say.
 
-    Pictures that begin within half a period of the first of a set are one set: it goes through the stack when
-    all cameras are in it, or when a later one comes. Times of the stack count from the first message's whole
+    Pictures that begin within half a period of the first of a set are one set. Each camera's come in their
+    order, those of several at their own pace: a set goes through the stack when all cameras are in it or have
+    sent later pictures, or some `patience_s` after it. What comes later still is left out, and counted in
+    `late`. Exposures of a bracket are no set here. Times of the stack count from the first message's whole
     second on, `clock_s`.
 
     Parameters
@@ -97,6 +113,10 @@ class Live:
         How each takes its pictures, by its name.
     period_s
         From one set to the next.
+    odometry_error
+        How far the odometry is off.
+    patience_s
+        How long a camera that sends nothing is waited for.
     pipeline
         The stack; by default a `Pipeline` as it comes. One whose `detector` is `DetectorProcesses` is faster
         with several cameras.
@@ -115,6 +135,8 @@ class Live:
         taken: Mapping[str, Taken],
         period_s: float = 1.0 / 30.0,
         pipeline: Pipeline | None = None,
+        odometry_error: OdometryError = OdometryError(),
+        patience_s: float = 0.25,
         told: "Callable[[Outcome], None]" = lambda _: None,
     ) -> None:
         robots = sorted({robot_of(name) for name in calibrations})
@@ -134,7 +156,11 @@ class Live:
         self._pipeline = Pipeline(calibrations) if pipeline is None else pipeline
         self._told = told
         self._count = dict.fromkeys(calibrations, 0)
-        self._set: list[RawFrame] = []
+        self.late = dict.fromkeys(calibrations, 0)
+        self._odometry_error, self._patience_s = odometry_error, patience_s
+        self._sets: list[list[RawFrame]] = []
+        self._latest_s: dict[str, float] = {}
+        self._pushed_s = -math.inf
         self._odometry: deque[Odometry] = deque()
 
     def attach(
@@ -142,10 +168,13 @@ class Live:
         node: Node,
         topics: Mapping[str, str] | None = None,
         odometry: str | None = None,
-        message_of: Callable[[str], MakeMessage] | None = None,
+        message_of: Callable[[str], cdr.MakeMessage] | None = None,
         quality: Any = None,
+        warn: Callable[[str], None] = _LOG.warning,
     ) -> None:
         """Have a node's topics fed to this, and publish on it what comes out.
+
+        A message that cannot be taken is left out, and told by `warn`.
 
         That is on `/ROBOT/tracks` and `/ROBOT/messages` JSON in `std_msgs/String`, `tracks` the lines of
         `tracks.NAME.jsonl` and `messages` those of `messages.NAME.jsonl`, so that no package of messages need
@@ -161,24 +190,31 @@ class Live:
             The class of a message by its name, `package/Name`; by default that of the installed ROS.
         quality
             Of service for what is heard; by default ROS's own for data of sensors.
+        warn
+            Takes what is wrong with messages, such as `node.get_logger().warning`.
 
         Raises
         ------
         InputError
             ROS is not installed or not sourced; a topic is of no camera.
         """
-        message_of = _on_ros if message_of is None else message_of
+        message_of = cdr.class_of if message_of is None else message_of
         if quality is None:
-            quality = _quality_of_sensors()
+            quality = cdr.quality_of_sensors()
         if unknown := sorted(set(topics or {}) - set(self._calibrations)):
             raise InputError(f"topics: {', '.join(unknown)}: no such camera is calibrated")
         for camera in self._calibrations:
             usual = f"/{camera.replace('.', '/')}/image_raw"
             node.create_subscription(
-                message_of(_IMAGE), (topics or {}).get(camera, usual), self._taker(camera), quality
+                message_of(_IMAGE),
+                (topics or {}).get(camera, usual),
+                _safely(self._taker(camera), warn),
+                quality,
             )
         if odometry is not None:
-            node.create_subscription(message_of(_ODOMETRY), odometry, self.take_odometry, quality)
+            node.create_subscription(
+                message_of(_ODOMETRY), odometry, _safely(self.take_odometry, warn), quality
+            )
         publish = {
             what: node.create_publisher(message_of(kind), f"/{self.robot}/{what}", _QUEUED).publish
             for what, kind in (("tracks", _TEXT), ("messages", _TEXT), ("markers", _MARKERS))
@@ -187,11 +223,11 @@ class Live:
 
         def told(outcome: Outcome) -> None:
             own(outcome)
-            publish["tracks"](_made(_TEXT, {"data": outcome.tracks_json()}, message_of))
+            publish["tracks"](cdr.made(_TEXT, {"data": outcome.tracks_json()}, message_of))
             if outcome.messages:
-                publish["messages"](_made(_TEXT, {"data": outcome.messages_json()}, message_of))
+                publish["messages"](cdr.made(_TEXT, {"data": outcome.messages_json()}, message_of))
             markers = ros.to_markers(outcome.tracks, self.robot, outcome.clock_s + outcome.time_s)
-            publish["markers"](_made(_MARKERS, markers, message_of))
+            publish["markers"](cdr.made(_MARKERS, markers, message_of))
 
         self._told = told
 
@@ -221,6 +257,14 @@ class Live:
                 f"{camera}: a picture has {columns} × {rows} px, its calibration {known.width_px} × "
                 f"{known.height_px}; calibrate it as it is driven"
             )
+        full_scale_dn = 2**known.bit_depth - 1
+        if int(data_dn.max()) > full_scale_dn or (
+            message.encoding.lower() == "mono8" and full_scale_dn > 255
+        ):
+            raise InputError(
+                f"{camera}: a picture of {message.encoding} counts to {int(data_dn.max())}, its calibration "
+                f"has {known.bit_depth} bit; send counts as the sensor made them, neither shifted nor cut"
+            )
         time_s = self._time_s(message.header.stamp)
         if taken.stamped == "middle":
             time_s -= 0.5 * (taken.exposure_s + taken.line_time_s * (known.height_px - 1))
@@ -229,38 +273,47 @@ class Live:
             known.black_level_dn, taken.line_time_s, taken.gain,
         )  # fmt: skip
         self._count[camera] += 1
-        if self._set and (
-            any(camera == other.camera for other in self._set)
-            or abs(time_s - self._set[0].time_s) > self._half_s
-        ):
-            self._push()
-        self._set.append(frame)
-        if len(self._set) == len(self._calibrations):
-            self._push()
+        self._latest_s[camera] = max(time_s, self._latest_s.get(camera, -math.inf))
+        if time_s <= self._pushed_s + self._half_s:
+            self.late[camera] += 1
+            return
+        for taken_together in self._sets:
+            near = abs(time_s - min(other.time_s for other in taken_together)) <= self._half_s
+            if near and all(camera != other.camera for other in taken_together):
+                taken_together.append(without_offsets(frame, known))
+                break
+        else:
+            self._sets.append([without_offsets(frame, known)])
+            self._sets.sort(key=lambda each: min(other.time_s for other in each))
+        self._push(whole_only=True)
 
     def take_odometry(self, message: Any) -> None:
-        """Take a `nav_msgs/Odometry` of the robot; one that is not later than the last begins anew."""
+        """Take a `nav_msgs/Odometry`; what is not later is passed over, a jump back begins anew."""
         pose = message.pose.pose
-        sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))
         place, turn = pose.position, pose.orientation
         time_s = self._time_s(message.header.stamp)
         if self._odometry and time_s <= self._odometry[-1].time_s:
+            if self._odometry[-1].time_s - time_s <= _JUMP_S:
+                return
             self._odometry.clear()
+        error = self._odometry_error
         self._odometry.append(
             Odometry(
                 self.robot,
                 time_s,
                 np.array([place.x, place.y, place.z]),
                 Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix(),
-                position_sigma_m=float(sigma[:3].max()),
-                rotation_sigma_rad=float(sigma[3:].max()),
+                error.position_sigma_m,
+                error.rotation_sigma_rad,
+                error.position_walk_m_per_sqrt_s,
+                error.rotation_walk_rad_per_sqrt_s,
             )
         )
+        self._forget(time_s - _MOST_KEPT_S)
 
     def finish(self) -> None:
-        """Take in the set that is not whole, and tell what can be read as no more will come."""
-        if self._set:
-            self._push()
+        """Take in the sets that are not whole, and tell what can be read as no more will come."""
+        self._push(whole_only=False)
         said = self._pipeline.finish()
         if said and self.clock_s is not None:
             self._told(Outcome(self.clock_s, max(one.end_s for one in said), (), said))
@@ -274,13 +327,28 @@ class Live:
             self.clock_s = int(stamp.sec)
         return (int(stamp.sec) - self.clock_s) + 1e-9 * int(stamp.nanosec)
 
-    def _push(self) -> None:
-        frames, self._set = sorted(self._set, key=lambda frame: frame.time_s), []
-        heard: Heard = self._pipeline.push(frames, tuple(self._odometry))
-        while len(self._odometry) > 2 and self._odometry[1].time_s < heard.time_s - _KEPT_S:
+    def _push(self, whole_only: bool) -> None:
+        """Put sets through, in their order: those to which nothing comes any more, or all."""
+        while self._sets and (not whole_only or self._is_whole(self._sets[0])):
+            frames = sorted(self._sets.pop(0), key=lambda frame: frame.time_s)
+            self._pushed_s = frames[0].time_s
+            heard: Heard = self._pipeline.push(frames, tuple(self._odometry))
+            self._forget(heard.time_s - _KEPT_S)
+            assert self.clock_s is not None
+            self._told(Outcome(self.clock_s, heard.time_s, heard.tracks, heard.messages))
+
+    def _is_whole(self, frames: Sequence[RawFrame]) -> bool:
+        """Tell whether all cameras are in a set, have sent later pictures, or are not waited for any more."""
+        begin_s, there = min(frame.time_s for frame in frames), {frame.camera for frame in frames}
+        given_up = max(self._latest_s.values()) > begin_s + self._half_s + self._patience_s
+        return given_up or all(
+            camera in there or self._latest_s.get(camera, -math.inf) > begin_s + self._half_s
+            for camera in self._calibrations
+        )
+
+    def _forget(self, before_s: float) -> None:
+        while len(self._odometry) > 2 and self._odometry[1].time_s < before_s:
             self._odometry.popleft()
-        assert self.clock_s is not None
-        self._told(Outcome(self.clock_s, heard.time_s, heard.tracks, heard.messages))
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,40 +376,13 @@ class Outcome:
         return json.dumps({**head, what: list(records)}, allow_nan=False)
 
 
-def _made(kind: str, value: Any, message_of: Callable[[str], MakeMessage]) -> Any:
-    """Return a message with fields as `ros_messages` has them, and those within it, of ROS's own classes."""
-    if kind not in DEFINITIONS:
-        return value
-    fields: dict[str, Any] = {}
-    for field in cdr.fields_of(kind):
-        content = value[field.name]
-        nested = isinstance(content, Sequence) and not isinstance(content, str | bytes)
-        if nested and field.kind in DEFINITIONS:
-            content = [_made(field.kind, one, message_of) for one in content]
-        elif not nested:
-            content = _made(field.kind, content, message_of)
-        fields[field.name] = content
-    return message_of(kind)(**fields)
+def _safely(take: Callable[[Any], None], warn: Callable[[str], None]) -> Callable[[Any], None]:
+    """Return a callback that tells of what it cannot take: an exception would end the node."""
 
+    def called(message: Any) -> None:
+        try:
+            take(message)
+        except ValueError as error:  # InputError is one
+            warn(f"a message is left out: {error}")
 
-def _on_ros(kind: str) -> MakeMessage:
-    """Return the class of a message of the installed ROS."""
-    package, _, name = kind.partition("/")
-    try:
-        made: MakeMessage = getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError):
-        raise InputError(
-            f"{kind} is not to be had: run this where ROS 2 is installed and sourced "
-            f"(source /opt/ros/…/setup.bash), with the package {package}"
-        ) from None
-    return made
-
-
-def _quality_of_sensors() -> Any:
-    try:
-        return importlib.import_module("rclpy.qos").qos_profile_sensor_data
-    except ImportError:
-        raise InputError(
-            "rclpy is not to be had: run this where ROS 2 is installed and sourced "
-            "(source /opt/ros/…/setup.bash)"
-        ) from None
+    return called

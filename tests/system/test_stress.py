@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -241,7 +242,10 @@ def test_a_disk_that_fills_up_is_told_and_the_same_command_goes_on(tmp_path: Pat
         assert process.returncode == 2, err
         assert "cannot be written (No space left on device)" in said
         done = len(times_of(disk / "out"))
-        assert f"{done} of 32 jobs are done; make room, and the same command goes on" in said
+        # A worker may end a job after the command has counted.
+        told = re.search(r"(\d+) of 32 jobs are done; make room, and the same command goes on", said)
+        assert told is not None, said
+        assert done - 2 < int(told[1]) <= done
         assert "Traceback" not in err
         assert 0 < done < 32
         subprocess.run(["mount", "-o", "remount,size=50M", disk], check=True)

@@ -8,6 +8,7 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -40,14 +41,14 @@ def compare_odometry(before: ByRobot, after: ByRobot, *, exact: bool) -> Finding
     for name, records in before.items():
         for one, other in zip(records, after[name], strict=True):
             pairs = [(getattr(one, key), getattr(other, key)) for key in vars(one) if key != "robot"]
-            off = max(float(np.max(np.abs(np.subtract(new, old)))) for old, new in pairs)
+            off = float(np.max([np.max(np.abs(np.subtract(new, old))) for old, new in pairs]))
             same = same and off == 0.0
-            if off > worst:
+            if not off <= worst:  # NaN too
                 worst, seen = off, f"{name} at {one.time_s:g} s: {off:.3g} in SI units"
     return Finding(
         "camera",
         "odometry",
-        "fail" if worst > _ROUNDING or (exact and not same) else "pass",
+        "fail" if not worst <= _ROUNDING or (exact and not same) else "pass",
         seen,
         f"{_ROUNDING:.0e} in SI units",
         same_bits=same,
@@ -61,7 +62,7 @@ def compare_followed(name: str, before: Followed, after: Followed, *, exact: boo
         _lines(before.messages, message_record) == _lines(after.messages, message_record),
     ]
     problem, renamed = _tracks(before.tracks, after.tracks)
-    said = _messages(before.messages, after.messages, renamed)
+    said = "" if problem else _messages(before.messages, after.messages, renamed)
     allowed = f"{_ROUNDING:.0e} of σ; numbers may be others, one for one"
     return [
         _finding(f"tracks of {name}", problem, len(_numbers(after.tracks)), "track", allowed, same[0], exact),
@@ -98,6 +99,7 @@ def _numbers(tracks: Sequence[Track]) -> set[_Number]:
 def _tracks(before: Sequence[Track], after: Sequence[Track]) -> tuple[str, dict[_Number, int]]:
     """Return what is unlike, or nothing; and by which number each track goes now."""
     renamed: dict[_Number, int] = {}
+    was: dict[_Number, int] = {}
     old, new = _by_set(before), _by_set(after)
     if old.keys() != new.keys():
         key = min(old.keys() ^ new.keys(), key=lambda each: each[1])
@@ -110,10 +112,10 @@ def _tracks(before: Sequence[Track], after: Sequence[Track]) -> tuple[str, dict[
             number = _Number(robot, one.track)
             if renamed.setdefault(number, other.track) != other.track:
                 return f"{where}: track {one.track} goes on as another one", renamed
+            if was.setdefault(_Number(robot, other.track), one.track) != one.track:
+                return f"{where}: two tracks have become one", renamed
             if said := _unlike(one, other):
                 return f"{where}: track {one.track}: {said}", renamed
-        if len({renamed[_Number(robot, one.track)] for one in olds}) < len(olds):
-            return f"{where}: two tracks have become one", renamed
     return "", renamed
 
 
@@ -152,7 +154,7 @@ def _unlike(before: Track, after: Track) -> str:
     for field in ("detections", "identity", "ghost"):
         if getattr(before, field) != getattr(after, field):
             return f"{field} {getattr(before, field)} → {getattr(after, field)}"
-    if abs(after.unseen_s - before.unseen_s) > _ROUNDING:
+    if not abs(after.unseen_s - before.unseen_s) <= _ROUNDING:
         return f"unseen_s {before.unseen_s:g} → {after.unseen_s:g}"
     sigma = np.sqrt(np.diag(before.covariance))
     pulls = np.abs(_state(after) - _state(before)) / sigma
@@ -168,7 +170,10 @@ def _messages(before: Sequence[Message], after: Sequence[Message], renamed: Mapp
     """Say what is unlike, or nothing; tracks may go by other numbers."""
     if len(before) != len(after):
         return f"{len(before)} → {len(after)} messages"
-    for one, other in zip(sorted(before, key=_order), sorted(after, key=_order), strict=True):
+    olds = [(_order(one, renamed.get(_Number(one.robot, one.track), one.track)), one) for one in before]
+    news = [(_order(one, one.track), one) for one in after]
+    pairs = zip(sorted(olds, key=itemgetter(0)), sorted(news, key=itemgetter(0)), strict=True)
+    for (_, one), (_, other) in pairs:
         where = f"{one.robot}, track {one.track}, {one.start_s:.2f} s"
         if one.word != other.word:
             return f"{where}: word {one.word} → {other.word}"
@@ -181,10 +186,10 @@ def _messages(before: Sequence[Message], after: Sequence[Message], renamed: Mapp
                 return f"{where}: {field} {getattr(one, field)} → {getattr(other, field)}"
         for field in ("start_s", "end_s", "confidence"):
             off = getattr(other, field) - getattr(one, field)
-            if abs(off) > _ROUNDING:
+            if not abs(off) <= _ROUNDING:
                 return f"{where}: {field} moved by {off:.3g}"
     return ""
 
 
-def _order(message: Message) -> tuple[str, float, int]:
-    return message.robot, round(message.start_s, 3), message.word
+def _order(message: Message, track: int) -> tuple[str, int, float, int]:
+    return message.robot, track, message.start_s, message.word

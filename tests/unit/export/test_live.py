@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from nir_render.errors import InputError
 from nir_render.export import ros_messages as ros
 from nir_render.export.cdr import fields_of
-from nir_render.export.live import Live, Outcome, Taken
+from nir_render.export.live import Live, OdometryError, Outcome, Taken
 from nir_render.export.mcap_file import export_mcap
 from perception import (
     Heard,
@@ -163,10 +163,12 @@ class Notes(Pipeline):
     def __init__(self) -> None:
         self.sets: list[list[tuple[str, int]]] = []
         self.odometry: list[tuple[Odometry, ...]] = []
+        self.frames: list[list[RawFrame]] = []
 
     def push(self, frames: Any, odometry: Any = ()) -> Heard:
         self.sets.append([(frame.camera, round(1e3 * frame.time_s)) for frame in frames])
         self.odometry.append(tuple(odometry))
+        self.frames.append(list(frames))
         return Heard(frames[0].time_s, SetMeasurements((), ()), (), ())
 
     def finish(self) -> tuple[()]:
@@ -201,29 +203,67 @@ def test_pictures_of_half_a_period_are_a_set() -> None:
     ]
 
 
-def test_odometry_comes_back_as_it_was_sent() -> None:
-    """Ours, as the export writes it, a quarter turn; what is older than two seconds is forgotten."""
+def test_a_camera_may_lag_behind_and_one_that_is_silent_is_not_waited_for() -> None:
+    """Of pictures each 100 ms, of which one camera's come 120 ms late, all are in sets of two; then it falls silent."""
     pipeline = Notes()
     live = _two(pipeline)
+    dark = frame_of(0, [])
+    sent = [(100 * k, "r1.front", 100 * k) for k in range(20)]
+    sent += [(100 * k + 120, "r1.back", 100 * k) for k in range(8)]
+    for _, camera, time_ms in sorted(sent):
+        live.take_image(camera, _image(replace(dark, camera=camera), 1e-3 * time_ms))
+    whole = [[("r1.back", 100 * k), ("r1.front", 100 * k)] for k in range(8)]
+    assert [sorted(one) for one in pipeline.sets[:8]] == whole
+    # A quarter of a second, and half a period, after it began a set goes on without the other.
+    assert pipeline.sets[8:] == [[("r1.front", 100 * k)] for k in range(8, 16)]
+    live.take_image("r1.back", _image(replace(dark, camera="r1.back"), 1.0))
+    assert live.late == {"r1.front": 0, "r1.back": 1}
+    live.finish()
+    assert pipeline.sets[16:] == [[("r1.front", 100 * k)] for k in range(16, 20)]
+
+
+def test_known_offsets_are_taken_off_and_counts_that_cannot_be_are_left_out() -> None:
+    offset_dn = np.zeros((CAMERA.height_px, CAMERA.width_px), np.int16)
+    offset_dn[10, 20] = 7
+    pipeline, said = Notes(), list[str]()
+    live = Live({CAMERA.camera: replace(CAMERA, offset_dn=offset_dn)}, {CAMERA.camera: TAKEN}, 0.1, pipeline)
+    node = StandIn()
+    live.attach(node, message_of=_class_of, quality=10, warn=said.append)
+    frame = frame_of(0, [])
+    node.heard["/r1/front/image_raw"](_image(frame, 0.0))
+    assert int(frame.data_dn[10, 20]) - int(pipeline.frames[0][0].data_dn[10, 20]) == 7
+    assert int(frame.data_dn[10, 21]) == int(pipeline.frames[0][0].data_dn[10, 21])
+    shifted = replace(frame, data_dn=np.full_like(frame.data_dn, 16 * 300))
+    node.heard["/r1/front/image_raw"](_image(shifted, 0.1))
+    assert len(pipeline.sets) == 1
+    assert len(said) == 1
+    assert "send counts as the sensor made them" in said[0]
+
+
+def test_odometry_comes_back_as_it_was_sent_but_for_its_covariance() -> None:
+    """Ours, as the export writes it, a quarter turn; what is older than two seconds is forgotten, so are twins."""
+    pipeline = Notes()
+    live = _two(pipeline, odometry_error=OdometryError(0.01, 0.02, 0.03, 0.04))
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     dark = frame_of(0, [])
     for step in range(60):
-        sent = Odometry("r1", 0.1 * step, np.array([0.1 * step, 0.2, 0.3]), turn, 0.01, 0.02)
+        sent = Odometry("r1", 0.1 * step, np.array([0.1 * step, 0.2, 0.3]), turn, 1e3, 1e3)
         fields = ros.to_odometry(sent, "r1", sent.time_s)
         pose = {name: SimpleNamespace(**fields["pose"]["pose"][name]) for name in ("position", "orientation")}
-        live.take_odometry(
-            SimpleNamespace(
-                header=SimpleNamespace(stamp=SimpleNamespace(**fields["header"]["stamp"])),
-                pose=SimpleNamespace(pose=SimpleNamespace(**pose), covariance=fields["pose"]["covariance"]),
-            )
+        message = SimpleNamespace(
+            header=SimpleNamespace(stamp=SimpleNamespace(**fields["header"]["stamp"])),
+            pose=SimpleNamespace(pose=SimpleNamespace(**pose), covariance=fields["pose"]["covariance"]),
         )
+        live.take_odometry(message)
+        live.take_odometry(message)  # as a lossy connection may send it again
         live.take_image("r1.front", _image(replace(dark, camera="r1.front"), 0.1 * step))
     live.finish()
     last = pipeline.odometry[-1][-1]
     assert last.time_s == pytest.approx(5.9)
     assert last.position_m == pytest.approx([5.9, 0.2, 0.3])
     assert last.rotation == pytest.approx(turn)
-    assert (last.position_sigma_m, last.rotation_sigma_rad) == pytest.approx((0.01, 0.02))
+    assert (last.position_sigma_m, last.rotation_sigma_rad) == (0.01, 0.02)
+    assert (last.position_walk_m_per_sqrt_s, last.rotation_walk_rad_per_sqrt_s) == (0.03, 0.04)
     assert 20 <= len(pipeline.odometry[-1]) <= 24
 
 

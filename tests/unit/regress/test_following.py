@@ -56,6 +56,32 @@ def test_the_same_is_the_same_and_other_numbers_are_too() -> None:
     assert [one.verdict for one in compare_followed("robust", BEFORE, swapped, exact=True)] == ["fail"] * 2
 
 
+def test_two_that_follow_each_other_are_not_one() -> None:
+    """Track 1 ends, track 2 begins; as one track under a third number it is a drift, and the reverse too."""
+    early, late = (_track(1, index) for index in (0, 1)), (_track(2, index) for index in (2, 3))
+    apart = Followed((*early, *late), ())
+    one = Followed(tuple(replace(each, track=7) for each in apart.tracks), ())
+    for before, after, said in (
+        (apart, one, "two tracks have become one"),
+        (one, apart, "goes on as another"),
+    ):
+        (tracks, messages) = compare_followed("robust", before, after, exact=False)
+        assert tracks.verdict == "fail"
+        assert said in tracks.seen
+        assert messages.verdict == "pass"
+
+
+def test_two_may_say_one_word_at_once_under_other_numbers() -> None:
+    words = tuple(replace(WORD, track=track, ambiguous_with=None) for track in (1, 2))
+    later = replace(words[1], start_s=1.2500004)
+    before = Followed(BEFORE.tracks, (words[0], later))
+    after = Followed(
+        tuple(replace(one, track=3 - one.track) for one in BEFORE.tracks),
+        (replace(words[0], track=2), replace(later, track=1)),
+    )
+    assert [one.verdict for one in compare_followed("robust", before, after, exact=False)] == ["pass"] * 2
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
