@@ -208,7 +208,7 @@ class Live:
             node.create_subscription(
                 message_of(_IMAGE),
                 (topics or {}).get(camera, usual),
-                _safely(self._taker(camera), warn),
+                _safely(partial(self.take_image, camera), warn),
                 quality,
             )
         if odometry is not None:
@@ -278,13 +278,13 @@ class Live:
             self.late[camera] += 1
             return
         for taken_together in self._sets:
-            near = abs(time_s - min(other.time_s for other in taken_together)) <= self._half_s
+            near = abs(time_s - _begin_s(taken_together)) <= self._half_s
             if near and all(camera != other.camera for other in taken_together):
                 taken_together.append(without_offsets(frame, known))
                 break
         else:
             self._sets.append([without_offsets(frame, known)])
-            self._sets.sort(key=lambda each: min(other.time_s for other in each))
+            self._sets.sort(key=_begin_s)
         self._push(whole_only=True)
 
     def take_odometry(self, message: Any) -> None:
@@ -318,9 +318,6 @@ class Live:
         if said and self.clock_s is not None:
             self._told(Outcome(self.clock_s, max(one.end_s for one in said), (), said))
 
-    def _taker(self, camera: str) -> Callable[[Any], None]:
-        return partial(self.take_image, camera)
-
     def _time_s(self, stamp: Any) -> float:
         """Return a stamp by the stack's clock: float64 has not the digits for ROS's."""
         if self.clock_s is None:
@@ -339,7 +336,7 @@ class Live:
 
     def _is_whole(self, frames: Sequence[RawFrame]) -> bool:
         """Tell whether all cameras are in a set, have sent later pictures, or are not waited for any more."""
-        begin_s, there = min(frame.time_s for frame in frames), {frame.camera for frame in frames}
+        begin_s, there = _begin_s(frames), {frame.camera for frame in frames}
         given_up = max(self._latest_s.values()) > begin_s + self._half_s + self._patience_s
         return given_up or all(
             camera in there or self._latest_s.get(camera, -math.inf) > begin_s + self._half_s
@@ -374,6 +371,10 @@ class Outcome:
     def _json(self, what: str, records: Iterable[Mapping[str, Any]]) -> str:
         head = {"format": 1, "clock_s": self.clock_s, "time_s": self.time_s}
         return json.dumps({**head, what: list(records)}, allow_nan=False)
+
+
+def _begin_s(frames: Sequence[RawFrame]) -> float:
+    return min(frame.time_s for frame in frames)
 
 
 def _safely(take: Callable[[Any], None], warn: Callable[[str], None]) -> Callable[[Any], None]:

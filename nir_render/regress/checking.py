@@ -9,7 +9,7 @@ from nir_render.errors import InputError
 from nir_render.light.light import Light
 from nir_render.light.npz import light_hash
 from nir_render.regress.findings import Check, Finding, ImagePair, SceneCheck
-from nir_render.regress.following import as_kept, followed_of, is_sequence, own_odometry
+from nir_render.regress.following import as_kept, followed_of, is_sequence
 from nir_render.regress.make import FrameSetting, detections_of, frame_settings
 from nir_render.regress.reference import Reference, changes_of, document_of, made_by
 from nir_render.regress.repeatable import check_repeatable
@@ -25,6 +25,7 @@ from nir_render.regress.statistics import judge
 from nir_render.regress.store import names_in, read_reference
 from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import render
+from nir_render.simulation.odometry import odometry_by_robot
 from nir_render.transport.cache import LightCache
 
 FALSE_ALARM_RATE = 1e-3
@@ -265,7 +266,7 @@ def _followed(scene: Scene, reference: Reference, *, exact: bool) -> list[Findin
     if before is None:
         words = "the reference has none: 'nir-render regress update --all' adds them"
         return [Finding("perception", "tracks and messages", "skipped", words)]
-    findings = [compare_odometry(before.odometry, as_kept(own_odometry(scene)), exact=exact)]
+    findings = [compare_odometry(before.odometry, as_kept(odometry_by_robot(scene)), exact=exact)]
     for name, known in before.by_estimator.items():
         detections = reference.detections[name]
         now = followed_of(name, frames, reference.calibrations, detections, before.odometry)

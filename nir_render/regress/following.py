@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from nir_render.evaluate.tracks import FEW_SETS
 from nir_render.scene.scene import Scene
-from nir_render.simulation.odometry import observers_astir, odometry_of
+from nir_render.simulation.odometry import odometry_by_robot
 from perception import (
     Calibration,
     Detection,
@@ -53,22 +53,15 @@ def following_of(
     """Return what follows from the detections of a scene's frames, by each estimator."""
     if not is_sequence(frames):
         return Following()
-    odometry = own_odometry(scene)
-    found = {
-        name: followed_of(name, frames, calibrations, hits, as_kept(odometry))
-        for name, hits in detections.items()
-    }
+    odometry = odometry_by_robot(scene)
+    kept = as_kept(odometry)
+    found = {name: followed_of(name, frames, calibrations, hits, kept) for name, hits in detections.items()}
     return Following(odometry, found)
 
 
 def is_sequence(frames: Sequence[RawFrame]) -> bool:
     """Tell whether frames say anything of tracks."""
     return len({frame.index for frame in frames}) >= FEW_SETS
-
-
-def own_odometry(scene: Scene) -> dict[str, tuple[Odometry, ...]]:
-    """Return what robots that take frames know of their own way, by robot."""
-    return {robot: tuple(odometry_of(scene, robot, scene.document.seed)) for robot in observers_astir(scene)}
 
 
 def as_kept(odometry: ByRobot) -> dict[str, tuple[Odometry, ...]]:

@@ -39,7 +39,7 @@ from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Begun, Shot, simulate
 from nir_render.simulation.frame_times import frame_times
-from nir_render.simulation.odometry import observers_astir, odometry_of, true_poses
+from nir_render.simulation.odometry import odometry_by_robot, true_poses
 from nir_render.simulation.sent import sent_packets
 from nir_render.transport.cache import LightCache
 from nir_render.transport.cache_key import digest as digest_of
@@ -144,9 +144,7 @@ def _write_times(scene: Scene, folder: Path) -> None:
     # Where robots stand still, poses are of use where their headings show.
     if any(robot.moves or len(robot.rig.sources) > 1 for robot in robots):
         run_folder.write_lines(folder / run_folder.POSES, (pose.record() for pose in true_poses(scene)))
-    believed = [
-        line for robot in observers_astir(scene) for line in odometry_of(scene, robot, scene.document.seed)
-    ]
+    believed = [line for records in odometry_by_robot(scene).values() for line in records]
     if believed:
         run_folder.write_lines(folder / ODOMETRY, map(odometry_record, believed))
     sent = [packet.record() for packet in sent_packets(scene)]

@@ -20,11 +20,15 @@ Array = NDArray[np.float64]
 _SLACK = 1e-6  # of a period, by which a frame on the scene's clock may seem off it
 
 
-def observers_astir(scene: Scene) -> list[str]:
-    """Return the robots that take frames and have odometry: those that move, or may believe they do."""
+def odometry_by_robot(scene: Scene) -> dict[str, list[Odometry]]:
+    """Return what robots that take frames know of their own way: those that move, or may believe they do."""
     names = dict.fromkeys(name.partition(".")[0] for name in scene.cameras())
-    robots = scene.document.robots
-    return [name for name in names if robots[name].moves or robots[name].rig.odometry is not None]
+    robots, seed = scene.document.robots, scene.document.seed
+    return {
+        name: odometry_of(scene, name, seed)
+        for name in names
+        if robots[name].moves or robots[name].rig.odometry is not None
+    }
 
 
 def pose_times_s(scene: Scene) -> Array:

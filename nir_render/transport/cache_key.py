@@ -41,6 +41,7 @@ from nir_render.transport.fingerprint import code_hash, matching, package_versio
 
 _PACKAGES = ("nir-render", "mitsuba", "drjit", "numpy")
 # Files of this package that decide the bits of light: a change of one is another version.
+_DOUBLE = struct.Struct("<d")
 _CODE = (
     "transport/**/*.py",
     "scene/**/*.py",
@@ -267,6 +268,3 @@ def _write(value: Any, write: Callable[[bytes], None]) -> None:
             _write(item, write)
     else:
         raise TypeError(f"{type(value).__name__} has no canonical bytes")
-
-
-_DOUBLE = struct.Struct("<d")

@@ -42,9 +42,7 @@ class PixelBox:
 
     def inside(self, shape: tuple[int, int]) -> Self:
         """Return the part of the box that lies in a frame of so many rows and columns; it may be empty."""
-        top, left = max(self.top, 0), max(self.left, 0)
-        bottom, right = min(self.top + self.height, shape[0]), min(self.left + self.width, shape[1])
-        return type(self)(top, left, max(bottom - top, 0), max(right - left, 0))
+        return self.overlap(PixelBox(0, 0, *shape))
 
     def seen_from(self, corner: "PixelBox") -> Self:
         """Return the box with its place counted from the corner of another."""

@@ -164,16 +164,7 @@ def import_recording(folder: Path, *, overwrite: bool) -> dict[str, Imported]:
         raw = read_yaml(path)
     except ValueError as error:
         raise InputError(str(error)) from None
-    try:
-        document, pictures = _checked(_without_empty(raw), folder, path)
-    except InputError as error:
-        empty = tuple(f": {key}: {_MISSING}" for key in _empty_keys(raw))
-        raise InputError(
-            *(
-                line.removesuffix(_MISSING) + _EMPTY if line.endswith(empty) else line
-                for line in error.problems
-            )
-        ) from None
+    document, pictures = _checked(raw, folder, path)
     places = Places(str(path))
     problems: list[str] = []
     done: dict[str, Imported] = {}
@@ -203,10 +194,15 @@ def _checked(raw: Any, folder: Path, path: Path) -> tuple[RecordingDocument, dic
     """Return the document and its pictures; raise InputError with all that is wrong in both."""
     problems: list[str] = []
     document: RecordingDocument | None = None
+    empty = tuple(f": {key}: {_MISSING}" for key in _empty_keys(raw))
+    raw = _without_empty(raw)
     try:
         document = RecordingDocument.model_validate(raw)
     except ValidationError as error:
-        problems += explain(error, raw, str(path))
+        problems += (
+            line.removesuffix(_MISSING) + _EMPTY if line.endswith(empty) else line
+            for line in explain(error, raw, str(path))
+        )
     places = Places(str(path))
     pictures: dict[str, Pictures] = {}
     for name, pattern in _patterns(raw).items():
@@ -344,11 +340,12 @@ def _doubts(given: CameraGiven, pictures: Pictures) -> Iterator[str]:
             "sensor counts to less, often to 10, 12 or 14 bit, write that; pixels that clip are else not "
             "known to"
         )
-    if given.times is None and pictures.gaps:
-        after, before = pictures.gaps[0]
+    gaps = pictures.gaps if given.times is None else []
+    if gaps:
+        after, before = gaps[0]
         yield (
             f"numbers are missing among the pictures, after {after} comes {before}"
-            + (f", and {len(pictures.gaps) - 1} more times" if len(pictures.gaps) > 1 else "")
+            + (f", and {len(gaps) - 1} more times" if len(gaps) > 1 else "")
             + ": frame_rate takes them as following at once; write times: FILE where pictures were lost"
         )
 

@@ -16,10 +16,8 @@ from perception.files.fields import first_of
 
 KINDS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _LOOKED_AT = 8
-_FEWEST_NUMBERED, _MOSTLY = (
-    4,
-    0.75,
-)  # pictures, and share of the steps that are alike, of a number that counts
+_FEWEST_NUMBERED = 4  # pictures whose names may count
+_MOSTLY = 0.75  # of the steps of a number that counts are alike
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from nir_render.evaluate.metrics import Evaluation, Score, angle_deg, evaluate
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.clock import Shot, simulate
-from nir_render.simulation.odometry import observers_astir, odometry_of
+from nir_render.simulation.odometry import odometry_by_robot
 from nir_render.stress.job.sequences import Row, Sequences
 from nir_render.transport.cache import LightCache
 from perception import Calibration, Detection, Estimator, OwnSetEstimator, detect, frame_sets
@@ -73,8 +73,7 @@ class _Finder:
     ) -> None:
         self._estimators, self._calibrations = estimators, calibrations
         self._of_sets = {name: one for name, one in estimators.items() if isinstance(one, OwnSetEstimator)}
-        moving = observers_astir(scene) if self._of_sets else []
-        self._odometry = {robot: odometry_of(scene, robot, scene.document.seed) for robot in moving}
+        self._odometry = odometry_by_robot(scene) if self._of_sets else {}
 
     def found(self, shots: Iterable[Shot]) -> Iterator[tuple[Shot, dict[str, Sequence[Detection]]]]:
         """Yield each shot with what every estimator finds in it."""

@@ -12,7 +12,7 @@ from nir_render.evaluate.messages import evaluate_messages, parse_told
 from nir_render.evaluate.tracks import FEW_SETS, evaluate_tracks, sets_in_time
 from nir_render.run.follow import Follower, OwnParts
 from nir_render.scene.scene import Scene
-from nir_render.simulation.odometry import observers_astir, odometry_of, true_poses
+from nir_render.simulation.odometry import odometry_by_robot, true_poses
 from nir_render.simulation.sent import sent_packets
 from nir_render.truth.sources import SourceTruth
 from perception import Calibration, Detection, RawFrame, frame_sets, parse_signal, parse_track
@@ -29,8 +29,7 @@ class Sequences:
         self._scene, self._calibrations = scene, calibrations
         # What is too short to say anything is not followed.
         followed = estimators if scene.document.clock.frames >= FEW_SETS else ()
-        moving = observers_astir(scene) if followed else []
-        odometry = {robot: odometry_of(scene, robot, scene.document.seed) for robot in moving}
+        odometry = odometry_by_robot(scene) if followed else {}
         self._followers = {name: Follower(name, calibrations, odometry, OwnParts()) for name in followed}
         self._waiting: list[tuple[RawFrame, Mapping[str, Sequence[Detection]]]] = []
         self._records: list[RawFrame] = []
