@@ -102,8 +102,8 @@ class Live:
     Pictures that begin within half a period of the first of a set are one set. Each camera's come in their
     order, those of several at their own pace: a set goes through the stack when all cameras are in it or have
     sent later pictures, or some `patience_s` after it. What comes later still is left out, and counted in
-    `late`. Exposures of a bracket are no set here. Times of the stack count from the first message's whole
-    second on, `clock_s`.
+    `late`; where that is more than a second, a clock was set back, and sets begin anew. Exposures of a
+    bracket are no set here. Times of the stack count from the first message's whole second on, `clock_s`.
 
     Parameters
     ----------
@@ -273,6 +273,10 @@ class Live:
             known.black_level_dn, taken.line_time_s, taken.gain,
         )  # fmt: skip
         self._count[camera] += 1
+        if time_s < self._pushed_s - _JUMP_S:
+            self._push(whole_only=False)
+            self._pushed_s = -math.inf
+            self._latest_s.clear()
         self._latest_s[camera] = max(time_s, self._latest_s.get(camera, -math.inf))
         if time_s <= self._pushed_s + self._half_s:
             self.late[camera] += 1

@@ -222,6 +222,20 @@ def test_a_camera_may_lag_behind_and_one_that_is_silent_is_not_waited_for() -> N
     assert pipeline.sets[16:] == [[("r1.front", 100 * k)] for k in range(16, 20)]
 
 
+def test_a_clock_that_is_set_back_begins_anew() -> None:
+    """As a bag that is played again: no picture of it is late."""
+    pipeline = Notes()
+    live = _two(pipeline)
+    dark = frame_of(0, [])
+    for time_ms in (5000, 5100, 0, 100):
+        for camera in ("r1.back", "r1.front"):
+            live.take_image(camera, _image(replace(dark, camera=camera), 1e-3 * time_ms))
+    live.finish()
+    assert live.late == {"r1.front": 0, "r1.back": 0}
+    begins_ms = [one[0][1] + 1000 * int(live.clock_s or 0) for one in pipeline.sets]
+    assert begins_ms == [5000, 5100, 0, 100]
+
+
 def test_known_offsets_are_taken_off_and_counts_that_cannot_be_are_left_out() -> None:
     offset_dn = np.zeros((CAMERA.height_px, CAMERA.width_px), np.int16)
     offset_dn[10, 20] = 7
