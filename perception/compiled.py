@@ -7,8 +7,8 @@ without being compiled, far slower, where the variable NUMBA_DISABLE_JIT is set:
 and for the test that holds that both find the same.
 
 What is kept on disk is renewed when the file of a function changes, not when another does. So what its file
-takes from others is a part of what a function is known by: constants, named tuples, and the files of the
-compiled functions that it calls.
+takes from others is a part of what a function is known by: constants, named tuples, and the files of
+compiled functions.
 """
 
 import hashlib
@@ -48,22 +48,24 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 def _with_constants(function: types.FunctionType) -> types.FunctionType:
     """Return a function with what it takes from other files in a closure, by which Numba knows it.
 
-    These are constants, and the files of compiled functions that it calls, with all that these take.
+    These are constants, and the files of compiled functions, with all that these take.
     """
     held = tuple(
         (name, value.tobytes() if isinstance(value, np.ndarray) else getattr(value, "_fields", value))
         for name, value in sorted(function.__globals__.items())
         if name.upper() == name or hasattr(value, "_fields")
     )
-    called = tuple(
+    # Of a helper that the same file defines below nothing is known here: so all that the file imports.
+    taken = tuple(
         (name, _file_digest(own.__code__.co_filename), own.__closure__[-1].cell_contents)
-        for name in function.__code__.co_names
-        if isinstance(value := function.__globals__.get(name), Dispatcher)
+        for name, value in sorted(function.__globals__.items())
+        if isinstance(value, Dispatcher)
         and (own := value.py_func).__code__.co_filename != function.__code__.co_filename
     )
+    known = hashlib.sha256(repr((held, taken)).encode()).hexdigest()
     code = function.__code__
     code = code.replace(co_freevars=(*code.co_freevars, "constants"))
-    closure = (*(function.__closure__ or ()), types.CellType(repr((held, called))))
+    closure = (*(function.__closure__ or ()), types.CellType(known))
     made = types.FunctionType(code, function.__globals__, function.__name__, function.__defaults__, closure)
     made.__doc__, made.__module__, made.__qualname__ = (
         function.__doc__,

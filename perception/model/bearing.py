@@ -1,9 +1,11 @@
 """From a pixel to a direction: through the lens, then from camera axes to body axes."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perception.model.lens import unproject
+from perception.model.lens import unproject, unproject_each
 from perception.types import Calibration
 
 _HALF_PIXELS = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
@@ -52,8 +54,21 @@ def pixel_turn(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.flo
     Between half a pixel before and half a pixel beyond, of places of shape (n, 2). Lengths are angles in rad.
     """
     around_px = np.asarray(points_px, dtype=np.float64)[:, None, :] + _HALF_PIXELS
-    around = direction_camera(around_px.reshape(-1, 2), calibration).reshape(-1, 4, 3)
-    return np.asarray(around[:, 1::2] - around[:, 0::2])
+    return _turn(direction_camera(around_px.reshape(-1, 2), calibration))
+
+
+def pixel_turns(
+    points_px: NDArray[np.float64], calibrations: Sequence[Calibration], camera: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """As `pixel_turn`, each in the axes of its camera, by its number in `calibrations`, shape (n,)."""
+    around_px = (points_px[:, None, :] + _HALF_PIXELS).reshape(-1, 2)
+    return _turn(unproject_each(around_px, calibrations, np.repeat(camera, 4)))
+
+
+def _turn(around: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Subtract the directions about each place, of half a pixel before from those of half a pixel beyond."""
+    before_and_beyond = around.reshape(-1, 4, 3)
+    return np.asarray(before_and_beyond[:, 1::2] - before_and_beyond[:, 0::2])
 
 
 def bearing_body(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from there on, so that it stays outside.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, cast
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 LensModel = Literal["rectilinear", "brown_conrady", "fisheye"]
 
 COEFFICIENTS = {"rectilinear": (0,), "brown_conrady": (4, 5, 8), "fisheye": (4,)}
@@ -60,6 +62,21 @@ def unproject(points_px: Array, calibration: Calibration) -> Array:
     """
     point = (points_px - (calibration.cx_px, calibration.cy_px)) / (calibration.fx_px, calibration.fy_px)
     direction = distortion_of(calibration).direction(point)
+    return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
+
+
+def unproject_each(points_px: Array, calibrations: Sequence[Calibration], camera: Indices) -> Array:
+    """As `unproject`, of points in the pictures of several cameras: those of like lenses at once.
+
+    `camera`, shape (n,), says by number in whose picture each point lies.
+    """
+    intrinsics = np.array([(each.cx_px, each.cy_px, each.fx_px, each.fy_px) for each in calibrations])[camera]
+    point = (points_px - intrinsics[:, :2]) / intrinsics[:, 2:]
+    lenses = [distortion_of(each) for each in calibrations]
+    direction = lenses[0].direction(point) if lenses else np.empty((0, 3))
+    for lens in set(lenses[1:]) - {lenses[0]} if lenses else ():
+        own = np.array([each == lens for each in lenses])[camera]
+        direction[own] = lens.direction(point[own])
     return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
 

@@ -372,7 +372,7 @@ def _together_into(
         # A fit with a prior of variance 1 answers an error a of what it assumed by −C a.
         found.moved_m[source, x] = -of_all[x, 3]
     turn, covariance = np.empty((3, 3)), found.covariance[source]
-    _axes_into(turn, bearing)
+    axes_into(turn, bearing)
     turn[:2] /= range_m
     for a in range(3):
         for b in range(3):
@@ -387,7 +387,7 @@ def _together_into(
 
 
 @compiled
-def _axes_into(axes: Array, bearing: Array) -> None:
+def axes_into(axes: Array, bearing: Array) -> None:
     """Write unit vectors to the left, upwards and along a bearing (`bearing_axes`)."""
     x, y, z = bearing
     level = math.hypot(x, y)

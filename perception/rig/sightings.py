@@ -1,17 +1,21 @@
 """What the detections of a set say, as arrays: where from, whither, how far, when, and how sure."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import bearing_body, pixel_turn
+from perception.compiled import compiled
+from perception.model.bearing import bearing_body, pixel_turns
 from perception.rig.frame_sets import Exposed
-from perception.rig.rays import UNKNOWN_RANGE, Rays
-from perception.types import Calibration, Detection, bearing_axes
+from perception.rig.rays import UNKNOWN_RANGE, Rays, axes_into
+from perception.types import Calibration, Detection
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 UNCLAIMED_PX = 1.0
 """Standard deviation that the place of a detection is given in association where none is claimed."""
@@ -53,14 +57,14 @@ class Sightings:
     """
 
     keys: tuple[tuple[str, int, int], ...]
-    frame: NDArray[np.int64]
+    frame: Indices
     rays: Rays
     together: Rays
     mounting_rad2: Array
-    claimed: NDArray[np.bool_]
-    saturated: NDArray[np.bool_]
-    merged: NDArray[np.bool_]
-    ghost: NDArray[np.bool_]
+    claimed: Flags
+    saturated: Flags
+    merged: Flags
+    ghost: Flags
 
 
 def sightings_of(
@@ -89,52 +93,24 @@ def sightings_of(
                 hit.range_sigma_common_m, hit.saturated, hit.merged, hit.ghost,
             ]
             for hit in hits
-        ]
-    ).reshape(-1, 10).T  # fmt: skip
-    u_px, v_px, u_sigma_px, v_sigma_px, range_m, sigma_m, common_m = columns[:7]
-    saturated, merged, ghost = np.ascontiguousarray(columns[7:].astype(bool))
-    axes = bearing_axes(_bearings(hits, calibrations))
-    ranged = (range_m > 0.0) & (range_m < FARTHEST_KNOWN_M)
-    # Of a clipped flare that was not recovered the range is but a bound.
-    bound = saturated & ~np.isfinite(sigma_m)
-    known = ranged & ~bound
-    claimed = known & np.isfinite(sigma_m)
-    at_m = np.where(known, range_m, 1.0)
-    shared = np.where(claimed, np.nan_to_num(common_m) / at_m, 0.0)
-    of_camera2 = np.minimum(CAMERAS_SHARE * shared**2, CAMERAS_MOST**2)
-    of_source2 = shared**2 - of_camera2
-    noise2 = np.where(claimed, np.nan_to_num(sigma_m) / at_m, 0.0) ** 2 - of_source2
-    noise = np.where(claimed, np.sqrt(np.maximum(noise2, LEAST_NOISE**2)), UNCLAIMED_RANGE)
-    common = np.sqrt(of_source2)
-    sigmas_px = np.column_stack([u_sigma_px, v_sigma_px])
-    sigmas_px = np.maximum(np.where(np.isfinite(sigmas_px), sigmas_px, UNCLAIMED_PX), LEAST_PX)
-    places_px, end, turn = np.column_stack([u_px, v_px]), 0, np.empty((len(hits), 2, 3))
-    of_frame = np.empty((len(frames), 7))
-    for row, (taken, found) in enumerate(zip(frames, detections, strict=True)):
-        these, calibration = slice(end, end := end + len(found)), calibrations[taken.camera]
-        if found:
-            turn[these] = pixel_turn(places_px[these], calibration) @ calibration.rotation_body_camera.T
-        of_frame[row, :3] = calibration.position_body_m
-        of_frame[row, 3:] = (
-            taken.time_s + 0.5 * taken.exposure_s,
-            taken.line_time_s,
-            calibration.sigma.get("rotation_body_camera", 0.0),
-            calibration.sigma.get("position_body_m", 0.0),
-        )
-    middle_s, line_s, turned_rad, moved_m = of_frame[frame, 3:].T
-    slope = axes[:, :2] @ np.swapaxes(turn, 1, 2) * sigmas_px[:, None, :]
-    mounting_rad2 = turned_rad**2 + (moved_m / at_m) ** 2
-    origin_m, time_s = of_frame[frame, :3], middle_s + line_s * v_px
-    angular_rad2 = slope @ np.swapaxes(slope, 1, 2) + mounting_rad2[:, None, None] * np.eye(2)
-    rays = Rays(
-        origin_m,
-        axes,
-        angular_rad2,
-        np.where(known, range_m, np.nan),
-        np.where(known, noise, UNKNOWN_RANGE),
-        common,
-        time_s,
-    )
+        ],
+        dtype=np.float64,
+    ).reshape(-1, 10)  # fmt: skip
+    saturated, merged, ghost = np.ascontiguousarray(columns[:, 7:].T > 0.0)
+    cameras = [calibrations[taken.camera] for taken in frames]
+    of_frame = np.array(
+        [
+            (
+                *camera.position_body_m, taken.time_s + 0.5 * taken.exposure_s, taken.line_time_s,
+                camera.sigma.get("rotation_body_camera", 0.0), camera.sigma.get("position_body_m", 0.0),
+            )
+            for taken, camera in zip(frames, cameras, strict=True)
+        ],
+        dtype=np.float64,
+    ).reshape(-1, 7)  # fmt: skip
+    to_camera = np.array([camera.rotation_body_camera.T for camera in cameras]).reshape(-1, 3, 3)
+    turn = pixel_turns(columns[:, :2], cameras, frame) @ to_camera[frame]
+    rays, mounting_rad2, claimed = _rays(columns, frame, of_frame, turn, _bearings(hits, calibrations))
     return Sightings(
         keys=tuple(
             (hit.camera, hit.index, number) for found in detections for number, hit in enumerate(found)
@@ -143,11 +119,69 @@ def sightings_of(
         rays=rays,
         together=rays,
         mounting_rad2=mounting_rad2,
-        claimed=np.isfinite(u_sigma_px + v_sigma_px) & (claimed | ~known),
+        claimed=claimed,
         saturated=saturated,
         merged=merged,
         ghost=ghost,
     )
+
+
+@compiled
+def _rays(
+    columns: Array, frame: Indices, of_frame: Array, turn: Array, bearing: Array
+) -> tuple[Rays, Array, Flags]:
+    """Return sightings as rays, the variance by their cameras' mounting, and whether σ are claimed.
+
+    Parameters
+    ----------
+    columns
+        u, v and their σ, range, its σ and the common part of it, saturated, ..., shape (n, 10).
+    frame
+        Which frame each is of, shape (n,).
+    of_frame
+        Camera's centre, middle of the exposure, time of a line, σ of its rotation and place, (frames, 7).
+    turn
+        How far the direction turns over a pixel along u, and along v, in body axes, shape (n, 2, 3).
+    bearing
+        Unit vectors, shape (n, 3).
+    """
+    n = len(columns)
+    rays = Rays(
+        np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 2, 2)), np.full(n, np.nan),
+        np.full(n, UNKNOWN_RANGE), np.zeros(n), np.empty(n),
+    )  # fmt: skip
+    mounting_rad2, claimed, slope = np.empty(n), np.empty(n, dtype=np.bool_), np.empty((2, 2))
+    for i in range(n):
+        _, v_px, u_sigma_px, v_sigma_px, range_m, sigma_m, common_m, saturated = columns[i, :8]
+        begin_s, line_s, turned_rad, moved_m = of_frame[frame[i], 3:]
+        rays.origin_m[i] = of_frame[frame[i], :3]
+        rays.time_s[i] = begin_s + line_s * v_px
+        # Of a clipped flare that was not recovered the range is but a bound.
+        is_claimed = math.isfinite(sigma_m)
+        is_known = 0.0 < range_m < FARTHEST_KNOWN_M and (is_claimed or saturated == 0.0)
+        if is_known:
+            rays.range_m[i], rays.noise[i] = range_m, UNCLAIMED_RANGE
+        if is_known and is_claimed:
+            common2 = 0.0 if math.isnan(common_m) else (common_m / range_m) ** 2
+            of_source2 = common2 - min(CAMERAS_SHARE * common2, CAMERAS_MOST**2)
+            rays.noise[i] = math.sqrt(max((sigma_m / range_m) ** 2 - of_source2, LEAST_NOISE**2))
+            rays.common[i] = math.sqrt(of_source2)
+        claimed[i] = math.isfinite(u_sigma_px + v_sigma_px) and (is_claimed or not is_known)
+        mounting_rad2[i] = turned_rad**2 + (moved_m / (range_m if is_known else 1.0)) ** 2
+        axes_into(rays.axes[i], bearing[i])
+        for pixel in range(2):
+            sigma_px = u_sigma_px if pixel == 0 else v_sigma_px
+            sigma_px = max(sigma_px if math.isfinite(sigma_px) else UNCLAIMED_PX, LEAST_PX)
+            for a in range(2):
+                along = 0.0
+                for k in range(3):
+                    along += rays.axes[i, a, k] * turn[i, pixel, k]
+                slope[a, pixel] = along * sigma_px
+        for a in range(2):
+            for b in range(2):
+                rays.angular_rad2[i, a, b] = slope[a, 0] * slope[b, 0] + slope[a, 1] * slope[b, 1]
+            rays.angular_rad2[i, a, a] += mounting_rad2[i]
+    return rays, mounting_rad2, claimed
 
 
 def _bearings(hits: Sequence[Detection], calibrations: Mapping[str, Calibration]) -> Array:

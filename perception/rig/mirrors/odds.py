@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.rig.mirrors.fit import fit_plane
 from perception.rig.mirrors.flares import Flares
-from perception.rig.mirrors.model import CONSTANT, fit_plane
+from perception.rig.mirrors.model import CONSTANT, log_determinant
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -53,6 +54,7 @@ def log_chances(flares: Flares, count: int) -> Array:
     return found
 
 
+@compiled
 def log_parameter_prior(parameter: float, sigma: float, kind: int) -> float:
     """Return ln of the density of a mirror's parameter beforehand, no finer than its `sigma` in the fit."""
     if kind != CONSTANT:  # the fit has counted its χ²
@@ -62,34 +64,46 @@ def log_parameter_prior(parameter: float, sigma: float, kind: int) -> float:
     return -0.5 * off**2 - math.log(loss * LOSS_SIGMA * math.sqrt(2.0 * math.pi))
 
 
+@compiled
 def log_symmetry(
     flares: Flares, parents: Indices, images: Indices, plane: Array, log_others: float, log_prior: float
 ) -> float:
     """Return ln of the odds of robots that stand as images would, with all of their light."""
-    precision = np.zeros((4, 4))
-    precision[3, 3] = 1e10
-    log_odds = -math.inf
+    whole, precision = plane.copy(), np.zeros((4, 4))
+    whole[4], precision[3, 3] = 0.0, 1e10
     # Two robots have two fluxes, each with an error of its own.
-    each_own = flares.moved_m[:, :, None] * flares.moved_m[:, None, :]
-    apart = flares._replace(
-        noise=np.hypot(flares.noise, flares.common),
-        common=np.zeros_like(flares.common),
-        moved_m=np.zeros_like(flares.moved_m),
-    )
+    apart_m2, noise = flares.noise_m2.copy(), np.hypot(flares.noise, flares.common)
+    for parent in parents:
+        for k in range(3):
+            for m in range(3):
+                apart_m2[parent, k, m] += flares.moved_m[parent, k] * flares.moved_m[parent, m]
+    log_odds = -np.inf
     for off_m in FORMATION_SIGMAS_M:
-        whole = plane.copy()
-        whole[4] = 0.0
-        loose = apart._replace(noise_m2=flares.noise_m2 + each_own + off_m**2 * np.eye(3))
+        noise_m2 = apart_m2.copy()
+        for k in range(3):
+            noise_m2[:, k, k] += off_m**2
+        loose = Flares(
+            flares.origin_m, flares.place_m, flares.seems_m, flares.axes, flares.angular_rad2, noise,
+            noise_m2, np.zeros_like(flares.common), np.zeros_like(flares.moved_m),
+        )  # fmt: skip
         chi2, log_peak, covariance = fit_plane(
-            loose, parents, images, whole, CONSTANT, whole.copy(), precision
+            loose, parents, images, whole.copy(), CONSTANT, whole, precision
         )
-        if (np.diagonal(covariance)[:3] > 0.0).all():
-            log_volume = 0.5 * float(np.linalg.slogdet(2.0 * math.pi * covariance[:3, :3])[1])
-            log_odds = np.logaddexp(log_odds, log_peak - 0.5 * chi2 + log_volume)
+        if covariance[0, 0] > 0.0 and covariance[1, 1] > 0.0 and covariance[2, 2] > 0.0:
+            log_volume = 0.5 * log_determinant(covariance[:3, :3], 2.0 * math.pi)
+            log_odds = _log_sum(log_odds, log_peak - 0.5 * chi2 + log_volume)
     log_share = math.log(SYMMETRY_PROBABILITY / len(FORMATION_SIGMAS_M))
-    return float(log_odds) + log_share + log_others + log_prior
+    return log_odds + log_share + log_others + log_prior
 
 
+@compiled
+def _log_sum(one: float, other: float) -> float:
+    """Return ln of the sum of what two numbers are ln of."""
+    more, less = max(one, other), min(one, other)
+    return more + math.log1p(math.exp(less - more)) if more > -np.inf else more
+
+
+@compiled
 def log_seen(flares: Flares, robots: Indices, parents: Indices, plane: Array, kind: int, count: int) -> float:
     """Return ln of the probability that these have images and the others none that is bright enough.
 
@@ -115,6 +129,7 @@ def _unseen(flares: Flares, robots: Indices, parents: Indices, plane: Array, kin
     return unseen
 
 
+@compiled
 def log_share(seen: int, unseen: int) -> float:
     """Return ln of the probability of just these, of a share between 0 and 1: ∫ s^k (1 − s)^(n−k) ds."""
     return math.lgamma(seen + 1.0) + math.lgamma(unseen + 1.0) - math.lgamma(seen + unseen + 2.0)

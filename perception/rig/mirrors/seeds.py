@@ -7,7 +7,14 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.rig.mirrors.flares import Flares
-from perception.rig.mirrors.model import CONSTANT, NEAREST_MIRROR_M, ROUNDED, SEED_GATE_CHI2, match_all
+from perception.rig.mirrors.model import (
+    CONSTANT,
+    NEAREST_MIRROR_M,
+    ROUNDED,
+    SEED_GATE_CHI2,
+    match_all,
+    of_dielectric,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -147,6 +154,51 @@ def _roots(seems_m: Array, apart_m: Array, b: int, roots: Array) -> None:
         roots[1, a] = (-middle + root) / (2.0 * bend)
 
 
+@compiled
+def seeds_of_kind(
+    flares: Flares, parents: Indices, images: Indices, kind: int, parameters: tuple[float, ...]
+) -> Array:
+    """Return the plane of each pair for each reflectance of some, shape (seeds, 5)."""
+    total, count = len(parents), 0
+    found = np.empty((total * len(parameters), 5))
+    # The normal is s h + e, h the image as seen, e from the parent to the camera: h², e h, e².
+    seen_m, apart_m, known = np.empty((total, 3)), np.empty((total, 3)), np.zeros((3, total))
+    root, cosine, normal = np.empty(total), np.empty(total), np.empty(3)
+    for pair in range(total):
+        i, j = parents[pair], images[pair]
+        known[0, pair] = flares.seems_m[j] ** 2
+        for k in range(3):
+            seen_m[pair, k] = flares.seems_m[j] * flares.axes[j, 2, k]
+            apart_m[pair, k] = flares.origin_m[j, k] - flares.place_m[i, k]
+            known[1, pair] += seen_m[pair, k] * apart_m[pair, k]
+            known[2, pair] += apart_m[pair, k] ** 2
+    for parameter in parameters:
+        cosine[:] = 0.8
+        for _ in range(5):
+            for pair in range(total):
+                s = math.sqrt(of_dielectric(kind, parameter, cosine[pair]))
+                length2 = s**2 * known[0, pair] + 2.0 * s * known[1, pair] + known[2, pair]
+                root[pair] = s
+                cosine[pair] = (s * known[0, pair] + known[1, pair]) / math.sqrt(length2 * known[0, pair])
+        for pair in range(total):
+            i, j = parents[pair], images[pair]
+            length, c, near, far = 0.0, 0.0, 0.0, 0.0
+            for k in range(3):
+                normal[k] = root[pair] * seen_m[pair, k] + apart_m[pair, k]
+                length += normal[k] ** 2
+                c += normal[k] * (flares.place_m[i, k] + 0.5 * normal[k])
+                near += normal[k] * flares.origin_m[j, k]
+                far += normal[k] * flares.place_m[i, k]
+            length, c = math.sqrt(length), c / math.sqrt(length)
+            if c - near / length > NEAREST_MIRROR_M and far / length < c and cosine[pair] > 0.0:
+                for k in range(3):
+                    found[count, k] = normal[k] / length
+                found[count, 3], found[count, 4] = c, parameter
+                count += 1
+    return found[:count]
+
+
+@compiled
 def best_seeds(
     flares: Flares, parents: Indices, images: Indices, seeds: Array, kind: int, most: int
 ) -> tuple[Array, Indices]:

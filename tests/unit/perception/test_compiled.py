@@ -95,11 +95,16 @@ def test_constants_of_other_files_tell_compiled_functions_apart() -> None:
 def test_a_compiled_function_is_known_by_the_files_of_those_that_it_calls(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is kept of it is not used where one of these has changed, or one that they call themselves."""
+    """What is kept of it is not used where one of these has changed, or one that they call themselves.
+
+    Also where they are called by a helper that its own file defines below it.
+    """
     monkeypatch.syspath_prepend(tmp_path)
     text = "from perception.compiled import compiled\n{}\n@compiled\ndef {}(x):\n    return {}\n"
     (tmp_path / "middle.py").write_text(text.format("from inner import inner", "middle", "inner(x)"))
-    (tmp_path / "outer.py").write_text(text.format("from middle import middle", "outer", "middle(x)"))
+    helper = "\n@compiled\ndef helper(x):\n    return middle(x)\n"
+    outer_text = text.format("from middle import middle", "outer", "helper(x)") + helper
+    (tmp_path / "outer.py").write_text(outer_text)
     held, found = [], []
     for factor in (2.0, 2.0, 3.25):  # of another length, or Python itself may take the old file
         (tmp_path / "inner.py").write_text(text.format("", "inner", f"{factor} * x"))
