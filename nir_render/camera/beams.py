@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
+from nir_render.camera.optics.gaussian import gaussian_blur
 from nir_render.camera.optics.lens import aperture_area_m2, intrinsics_of
 from nir_render.camera.optics.otf import core_of
 from nir_render.camera.optics.psf import Window, source_window
@@ -115,7 +115,7 @@ def blur(camera: Camera, image_e: NDArray[np.float64]) -> NDArray[np.float64]:
     sigma_px = core.gaussian_px
     if sigma_px is None:
         return share * convolve(core, image_e)
-    blurred_e = np.asarray(gaussian_filter(image_e, sigma_px, mode="nearest", truncate=_TRUNCATE))
+    blurred_e = gaussian_blur(image_e, sigma_px, _TRUNCATE)
     return blurred_e if share == 1.0 else share * blurred_e
 
 

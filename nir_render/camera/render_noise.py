@@ -10,6 +10,7 @@ What a render says of itself is its own estimate: paths so rare that no sample f
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import zip_longest
 
 import numpy as np
@@ -20,12 +21,14 @@ from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
 from nir_render.camera.mean_frame import MeanFrame, Rates
 from nir_render.camera.optics.apertures import Aperture, aperture_weights, flare_apertures
 from nir_render.camera.sensor.read_out import dark_variance_e2
-from nir_render.light.enlarge import enlarge, enlarge_variance, without_edges
+from nir_render.light.enlarge import Enlargement, enlarge, enlarge_variance, without_edges
 from nir_render.light.light import Light
 from nir_render.randomness import generator
+from nir_render.scene.documents.camera import Camera
 from nir_render.scene.snapshot import Snapshot
 
 Array = NDArray[np.float64]
+_Parts = list[tuple[Array, Array, Array | None]]
 
 _TINY_E2 = 1e-12  # a noiseless sensor in the dark has no noise to compare with
 _NEARLY_ALL = 0.99
@@ -70,31 +73,64 @@ class RenderNoise:
 
 def render_noise(mean: MeanFrame) -> RenderNoise:
     """Return the render's noise in a frame."""
-    if mean.light.indirect is None:
+    frame = _Frame.of(mean)
+    if frame is None:
         return RenderNoise()
-    apertures = flare_apertures(mean.light, mean.camera)
-    per_s2 = _variance_per_s2(mean.rates)
-    # Light is linear in the exposure, and in what the row of pixels collects of each drive.
-    squares_s2 = (mean.profiles * mean.exposure_s) ** 2
-    noise_e2 = np.einsum("dr,drc->rc", squares_s2, per_s2.of_pixels_e2)
-    sensor_e2 = temporal_variance_e2(mean)
-    reached = noise_e2 > 0.0
-    if not reached.any():
-        return RenderNoise()
-    share = noise_e2[reached] / sensor_e2[reached]
-    of_apertures = [
-        float(_mean_over_rows(one, squares_s2) @ noise) / one.sum(sensor_e2)
-        for noise, one in zip(per_s2.of_apertures_e2.T, apertures, strict=True)
-    ]
+    share, reached = frame.share, frame.reached
+    behind_lens_e2 = (frame.squares_s2 * variance_behind_lens_e2(mean.rates)).sum()
     return RenderNoise(
         median_share=float(np.median(share)),
-        mean_share=float(noise_e2[reached].sum() / sensor_e2[reached].sum()),
-        share_behind_lens=float((squares_s2 * per_s2.behind_lens_e2).sum() / sensor_e2.sum()),
+        mean_share=float(frame.noise_e2[reached].sum() / frame.sensor_e2[reached].sum()),
+        share_behind_lens=float(behind_lens_e2 / frame.sensor_e2.sum()),
         share_of_99_percent=float(np.quantile(share, _NEARLY_ALL)),
         largest_share=float(share.max()),
-        aperture_share=max(of_apertures, default=0.0),
+        aperture_share=frame.aperture_share(mean),
         reached=float(reached.mean()),
     )
+
+
+def share_of_target(mean: MeanFrame) -> float:
+    """Return what `render.noise` bounds: the larger of the median's and the apertures' share (`RenderNoise`).
+
+    It costs a third of `render_noise`.
+    """
+    frame = _Frame.of(mean)
+    return 0.0 if frame is None else max(float(np.median(frame.share)), frame.aperture_share(mean))
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """Variances of rendering and of the sensor in a frame, (rows, columns), and where rendering has any."""
+
+    noise_e2: Array
+    sensor_e2: Array
+    reached: NDArray[np.bool_]
+    squares_s2: Array
+
+    @classmethod
+    def of(cls, mean: MeanFrame) -> "_Frame | None":
+        """Return those of a frame; None where rendering has no noise."""
+        if mean.light.indirect is None:
+            return None
+        # Light is linear in the exposure, and in what the row of pixels collects of each drive.
+        squares_s2 = (mean.profiles * mean.exposure_s) ** 2
+        noise_e2 = np.einsum("dr,drc->rc", squares_s2, _variance_per_s2(mean.rates).of_pixels_e2)
+        reached = noise_e2 > 0.0
+        return cls(noise_e2, temporal_variance_e2(mean), reached, squares_s2) if reached.any() else None
+
+    @cached_property
+    def share(self) -> Array:
+        """The share of pixels with noise, shape (pixels,)."""
+        return np.asarray(self.noise_e2[self.reached] / self.sensor_e2[self.reached])
+
+    def aperture_share(self, mean: MeanFrame) -> float:
+        """Return the largest share of the sum over a flare's aperture."""
+        of_apertures_e2 = _variance_per_s2(mean.rates).of_apertures_e2
+        shares = [
+            float(_mean_over_rows(one, self.squares_s2) @ noise) / one.sum(self.sensor_e2)
+            for noise, one in zip(of_apertures_e2.T, flare_apertures(mean.light, mean.camera), strict=True)
+        ]
+        return max(shares, default=0.0)
 
 
 def _mean_over_rows(aperture: Aperture, of_rows: Array) -> Array:
@@ -106,13 +142,11 @@ def _mean_over_rows(aperture: Aperture, of_rows: Array) -> Array:
 class _Variance:
     """What rendering adds to an exposure of one second of each drive, fully lit.
 
-    To each pixel, shape (drives, rows, columns); to the sums over apertures, shape (drives, apertures);
-    behind the lens to the sums of the squares over rows of pixels, shape (drives, rows).
+    To each pixel, shape (drives, rows, columns); to the sums over apertures, shape (drives, apertures).
     """
 
     of_pixels_e2: NDArray[np.float32]
     of_apertures_e2: Array
-    behind_lens_e2: Array
 
 
 def _variance_per_s2(rates: Rates) -> _Variance:
@@ -124,57 +158,66 @@ def _variance_per_s2(rates: Rates) -> _Variance:
 
 
 def _variance_of(rates: Rates) -> _Variance:
-    light, snapshot = rates.light, rates.snapshot
-    apertures = flare_apertures(light, rates.camera)
-    levels = [np.where(rates.drive == number, 1.0, 0.0) for number in range(len(rates.drives))]
+    light, apertures = rates.light, flare_apertures(rates.light, rates.camera)
     if rates.between:
-        ends = [(weight**2, one, _variance_per_s2(one)) for weight, one in rates.between]
         of_apertures = [
             sum(
-                square * aperture_variances_e2(one.light, one.snapshot, 1.0, apertures, of_drive)
-                for square, one, _ in ends
+                weight**2 * aperture_variances_e2(one.light, one.snapshot, 1.0, apertures, of_drive)
+                for weight, one in rates.between
             )
-            for of_drive in levels
+            for of_drive in _levels(rates)
         ]
         return _Variance(
-            np.sum([np.float32(square) * one.of_pixels_e2 for square, _, one in ends], axis=0),
+            np.sum(
+                [np.float32(weight**2) * _variance_per_s2(one).of_pixels_e2 for weight, one in rates.between],
+                axis=0,
+            ),
             np.stack([np.asarray(of_drive) for of_drive in of_apertures]),
-            np.sum([square * one.behind_lens_e2 for square, _, one in ends], axis=0),
         )
+    parts = [_variances(light, rates.snapshot, 1.0, of_drive) for of_drive in _levels(rates)]
     return _Variance(
-        np.stack(
-            [render_variance_e2(light, snapshot, 1.0, of_drive).astype(np.float32) for of_drive in levels]
-        ),
-        np.stack([aperture_variances_e2(light, snapshot, 1.0, apertures, of_drive) for of_drive in levels]),
-        np.stack([_behind_lens_e2(light, snapshot, of_drive) for of_drive in levels]),
+        np.stack([_of_pixels_e2(light, rates.camera, own).astype(np.float32) for own in parts]),
+        np.stack([_of_apertures_e2(light, rates.camera, own, apertures) for own in parts]),
     )
+
+
+def _levels(rates: Rates) -> list[Array]:
+    """Return of each drive which groups have it, shape (groups,)."""
+    return [np.where(rates.drive == number, 1.0, 0.0) for number in range(len(rates.drives))]
 
 
 def variance_behind_lens_e2(rates: Rates) -> Array:
     """Return the variance per s² that rendering adds behind the lens, fully lit, shape (drives, rows).
 
-    It is the sum over each row of pixels.
+    It is the sum over each row of pixels, and kept with the rates.
     """
-    return _variance_per_s2(rates).behind_lens_e2
+    kept: Array | None = rates.kept.get("render_variance_behind_lens")
+    if kept is None:
+        if rates.between:
+            ends = [weight**2 * variance_behind_lens_e2(one) for weight, one in rates.between]
+            kept = np.asarray(np.sum(ends, axis=0))
+        else:
+            parts = [_variances(rates.light, rates.snapshot, 1.0, of_drive) for of_drive in _levels(rates)]
+            kept = np.stack([_behind_lens_e2(rates.light, rates.camera, own) for own in parts])
+        rates.kept["render_variance_behind_lens"] = kept
+    return kept
 
 
-def _behind_lens_e2(light: Light, snapshot: Snapshot, levels: Array) -> Array:
+def _behind_lens_e2(light: Light, camera: Camera, parts: _Parts) -> Array:
     """Return the variance per s² behind the lens's blur, summed over each row of pixels, shape (rows,).
 
     Noise of the variance that the render states is drawn, block by block, and goes the way of light: it is
     enlarged, weighted with the response, blurred. Its mean square has the expectation of that variance,
     whatever enlarging and blur mix; of 2 million pixels drawn it is off by about 1 %.
     """
-    camera = snapshot.camera(light.camera).camera
     rows, columns = camera.sensor.rows, camera.sensor.columns
-    edges = None if light.indirect is None else light.indirect.edges
-    enlargement = None if edges is None else edges.enlargement
+    enlargement = _enlargement(light)
     draws = int(np.clip(np.ceil(_PIXELS_DRAWN / (rows * columns)), 1, _MOST_DRAWS))
     random = generator(light.seed, "render_noise", light.camera, 0)
     total_e2 = np.zeros(rows)
     for _ in range(draws):
         noise_e = np.zeros((rows, columns))
-        for factor, variance, patch in _variances(light, snapshot, 1.0, levels):
+        for factor, variance, patch in parts:
             of_blocks = np.sqrt(variance) * random.standard_normal(variance.shape)
             of_patch = None if patch is None else np.sqrt(patch) * random.standard_normal(patch.shape)
             noise_e += factor * enlarge(of_blocks, rows, columns, enlargement, of_patch)
@@ -199,11 +242,13 @@ def render_variance_e2(
     sum was 0.93 to 1.0 times the sum of variances.
     """
     camera = snapshot.camera(light.camera).camera
+    return _of_pixels_e2(light, camera, _variances(light, snapshot, exposure_s, levels))
+
+
+def _of_pixels_e2(light: Light, camera: Camera, parts: _Parts) -> Array:
     rows, columns = camera.sensor.rows, camera.sensor.columns
-    total = np.zeros((rows, columns))
-    edges = None if light.indirect is None else light.indirect.edges
-    enlargement = None if edges is None else edges.enlargement
-    for factor, variance, patch in _variances(light, snapshot, exposure_s, levels):
+    total, enlargement = np.zeros((rows, columns)), _enlargement(light)
+    for factor, variance, patch in parts:
         total += factor**2 * enlarge_variance(variance, rows, columns, enlargement, patch)
     return total
 
@@ -221,13 +266,15 @@ def aperture_variances_e2(
     is that of `render_variance_e2`.
     """
     camera = snapshot.camera(light.camera).camera
+    return _of_apertures_e2(light, camera, _variances(light, snapshot, exposure_s, levels), apertures)
+
+
+def _of_apertures_e2(light: Light, camera: Camera, parts: _Parts, apertures: list[Aperture]) -> Array:
     total = np.zeros(len(apertures))
     if light.indirect is None or not apertures:
         return total
-    edges = light.indirect.edges
-    sensor = camera.sensor
-    enlargement = without_edges(sensor.rows, sensor.columns) if edges is None else edges.enlargement
-    for factor, variance, patch in _variances(light, snapshot, exposure_s, levels):
+    enlargement = _enlargement(light) or without_edges(camera.sensor.rows, camera.sensor.columns)
+    for factor, variance, patch in parts:
         of_blocks, of_patch = aperture_weights(apertures, factor, light.indirect.scale, enlargement)
         total += of_blocks.multiply(of_blocks) @ variance.ravel()
         if patch is not None:
@@ -262,9 +309,14 @@ def variance_by_spectrum(
     return [(factor, part.values) for factor, part in zip(factors, parts, strict=True)]
 
 
-def _variances(
-    light: Light, snapshot: Snapshot, exposure_s: float, levels: Array | None
-) -> list[tuple[Array, Array, Array | None]]:
+def _enlargement(light: Light) -> Enlargement | None:
+    """Return how blocks become pixels along edges; None where they do as everywhere."""
+    return (
+        None if light.indirect is None or light.indirect.edges is None else light.indirect.edges.enlargement
+    )
+
+
+def _variances(light: Light, snapshot: Snapshot, exposure_s: float, levels: Array | None) -> _Parts:
     """Return, by spectrum, electrons per radiance (rows, columns), variances of blocks and of the patch."""
     if light.indirect is None:
         return []

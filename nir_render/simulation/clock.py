@@ -5,6 +5,7 @@ Light is rendered once for a geometry; exposing it is arithmetic.
 
 from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ SceneOrSnapshot = Scene | Snapshot
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame, its light, the truth about sources and lamps, its mean without noise, the render's noise.
+    """A frame, its light, the truth about sources and lamps, its mean without noise.
 
     `exposure` is what the camera's automatic exposure knows after it; None without one. `refresh` is what was
     measured on the way to it of the error of interpolated light. `kind` is what the frame is for.
@@ -65,10 +66,14 @@ class Shot:
     truth: tuple[SourceTruth, ...]
     lamps: tuple[LampTruth, ...]
     mean: MeanFrame
-    noise: RenderNoise
     exposure: ExposureState | None = None
     refresh: tuple[RefreshError, ...] = ()
     kind: str = SCENE_KIND
+
+    @cached_property
+    def noise(self) -> RenderNoise:
+        """How much noise rendering adds; reckoned where it is asked for."""
+        return render_noise(self.mean)
 
 
 @dataclass(frozen=True)
@@ -224,7 +229,6 @@ def _shot(light: Light, rates: Rates, setting: Setting, time_s: float, key: Rand
         truth=tuple(truth_of(mean, frame)),
         lamps=tuple(lamp_truth(rates.snapshot, key.camera, key.frame)),
         mean=mean,
-        noise=render_noise(mean),
     )
 
 

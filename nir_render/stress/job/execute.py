@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 
+from nir_render.camera.render_noise import share_of_target
 from nir_render.evaluate.metrics import Evaluation, Score, angle_deg, evaluate
 from nir_render.scene.scene import Scene
 from nir_render.simulation.calibration import calibration
@@ -109,10 +110,12 @@ def _rows(
     key = (frame.camera, frame.index)
     result = evaluate([key], shot.truth, {frame.camera: known}, found, shot.lamps)
     at = {"camera": frame.camera, "index": frame.index, "time_s": frame.time_s}
+    noise_share = share_of_target(shot.mean)
     rows: list[Row] = []
     for name in found:
         estimator_fields = {**at, "estimator": name}
-        rows.append({**estimator_fields, "kind": "frame", **_frame_fields(scene, shot, result, name)})
+        of_frame = _frame_fields(scene, shot, result, name, noise_share)
+        rows.append({**estimator_fields, "kind": "frame", **of_frame})
         for kind, scores in (("source", result.scores), ("ghost", result.ghosts)):
             rows += [{**estimator_fields, "kind": kind, **_source_fields(score, name)} for score in scores]
         rows += [
@@ -122,7 +125,7 @@ def _rows(
     return rows
 
 
-def _frame_fields(scene: Scene, shot: Shot, result: Evaluation, name: str) -> Row:
+def _frame_fields(scene: Scene, shot: Shot, result: Evaluation, name: str, noise_share: float) -> Row:
     counts = result.summary["estimators"][name]
     return {
         "exposure_s": shot.frame.exposure_s,
@@ -130,7 +133,7 @@ def _frame_fields(scene: Scene, shot: Shot, result: Evaluation, name: str) -> Ro
         "frame_false_alarms": len(result.false_alarms[name]),
         "frame_ghosts_reported": counts["ghosts_reported"],
         "frame_lamps_reported": counts["lamps_reported"],
-        "render_noise_share": max(shot.noise.median_share, shot.noise.aperture_share),
+        "render_noise_share": noise_share,
         "render_noise_target": scene.document.render.noise,
     }
 
