@@ -6,6 +6,7 @@ loaded within it, so that `--help` is there at once.
 Exit status: 0 done, 1 the work failed or a check did not hold, 2 the input was wrong.
 """
 
+import os
 import signal
 import sys
 from typing import Annotated
@@ -61,6 +62,9 @@ def main() -> None:
     """Run the command; turn errors that a user can mend into their text and exit status 2."""
     # Asked to end, it ends as by Ctrl-C: what was written aside goes.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    # NumPy's library is told as it is loaded: on matrices as small as these its threads wait for each other,
+    # and its sums depend on how many they are.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app(prog_name="nir-render")
     except InputError as error:
