@@ -7,8 +7,9 @@ would fail; all else of a check follows from no seed, and is held once (`holds`,
 `sensor`: defects behind the light, on the reference's own light: that needs no render, and no repetition.
 `light`: defects of the light alone, each `trials` times with seeds of its own, judged in the family of the
 whole suite, the direct table left out: what is caught is caught by the indirect light. A wall's albedo is 5 %
-lower; where several walls share a material, one of them gets its own. `-P` keeps this folder off Python's
-path.
+lower; where several walls share a material, one of them gets its own. `code`: the same as faults of the
+code, whose random numbers are those of the clean scene; of each trial's seed both are rendered, and compared
+path by path, too. `-P` keeps this folder off Python's path.
 """
 
 import argparse
@@ -17,8 +18,11 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from nir_render.light.light import Light
 from nir_render.regress import FALSE_ALARM_RATE, check
@@ -32,25 +36,45 @@ from nir_render.regress.store import read_reference
 from nir_render.scene.scene import Scene
 from nir_render.simulation.clock import render
 from nir_render.transport.cache import LightCache
+from tests.planted_faults import random_numbers_of
 
 SUITE = Path(__file__).parents[1] / "scenes" / "regression"
 SHIFT_PX = 0.1
 Changes = dict[str, Any]
 
 
-def tests_of(scene: Scene, reference: Reference, seed: int) -> tuple[list[PartTests], bool]:
-    """Return the tests of a scene's lights, rendered with a seed; and whether one fails without any test."""
+def part_tests(
+    scene: Scene, reference: Reference, seed: int, own_samples: int = 0
+) -> tuple[list[PartTests], bool]:
+    """Return the tests of a scene's lights, rendered with a seed; and whether one fails without any test.
+
+    `own_samples` are those of `compare_indirect`.
+    """
     tests, certain = [], False
     for known in reference.lights:
         if known.light.indirect is None:
             continue
         light = render(scene, known.light.camera, known.light.time_s, seed)
-        findings, pending = compare_indirect(known, light, "", alike=True)
+        findings, pending = compare_indirect(known, light, "", alike=True, own_samples=own_samples)
         calibration = reference.calibrations[light.camera]
         findings.append(compare_view(scene, light.time_s, calibration, ""))
         certain |= any(finding.verdict == "fail" for finding in findings)
         tests += [group.parts for group in pending]
     return tests, certain
+
+
+def part_tests_in_code(
+    scene: Scene, faulty: Scene, reference: Reference, seed: int
+) -> tuple[list[PartTests], bool]:
+    """As `part_tests`, the fault in the code: faulty light has the paths of the reference's own."""
+    lights, samples = [], 0
+    for known in reference.lights:
+        clean = render(scene, known.light.camera, known.light.time_s, seed).indirect
+        if clean is not None:
+            known, samples = replace(known, own_radiance_per_w=clean.radiance_per_w), clean.samples
+        lights.append(known)
+    with random_numbers_of(scene):
+        return part_tests(faulty, replace(reference, lights=tuple(lights)), seed, samples)
 
 
 def alarm(tests: list[PartTests]) -> bool:
@@ -129,7 +153,7 @@ def main() -> None:
 
     alarms = 0
     for number in range(asked.clean):
-        seen = [tests_of(scenes[name], references[name], 10_000 + number) for name in scenes]
+        seen = [part_tests(scenes[name], references[name], 10_000 + number) for name in scenes]
         alarms += alarm([one for tests, _ in seen for one in tests]) or any(certain for _, certain in seen)
         print(f"{alarms} false alarms in {number + 1} suites", file=sys.stderr)
     told["clean"] = {"suites": asked.clean, "alarms": alarms}
@@ -140,17 +164,22 @@ def main() -> None:
         for defect, changes in sensor_defects(scenes[name])
     }
 
-    told["light"] = {}
-    clean = {name: tests_of(scenes[name], references[name], 1)[0] for name in scenes} if asked.trials else {}
+    told["light"], told["code"] = {}, {}
+    clean = (
+        {name: part_tests(scenes[name], references[name], 1)[0] for name in scenes} if asked.trials else {}
+    )
     for name in tried if asked.trials else ():
         others = [one for other in scenes if other != name for one in clean[other]]
         for defect, changes in light_defects(scenes[name]):
-            faulty, caught = scenes[name].with_(changes), 0
+            faulty, caught, in_code = scenes[name].with_(changes), 0, 0
             for trial in range(asked.trials):
-                own, certain = tests_of(faulty, references[name], 20_000 + trial)
+                own, certain = part_tests(faulty, references[name], 20_000 + trial)
                 caught += certain or alarm([*own, *others])
+                own, certain = part_tests_in_code(scenes[name], faulty, references[name], 20_000 + trial)
+                in_code += certain or alarm([*own, *others])
             told["light"][f"{name}: {defect}"] = f"{caught} of {asked.trials}"
-            print(f"{name}: {defect}: {caught} of {asked.trials}", file=sys.stderr)
+            told["code"][f"{name}: {defect}"] = f"{in_code} of {asked.trials}"
+            print(f"{name}: {defect}: {caught}, {in_code} of {asked.trials}", file=sys.stderr)
     print(json.dumps(told))
 
 

@@ -51,9 +51,9 @@ def _with_constants(function: types.FunctionType) -> types.FunctionType:
     These are constants, and the files of compiled functions, with all that these take.
     """
     held = tuple(
-        (name, value.tobytes() if isinstance(value, np.ndarray) else getattr(value, "_fields", value))
+        (name, _told(value))
         for name, value in sorted(function.__globals__.items())
-        if name.upper() == name or hasattr(value, "_fields")
+        if name.upper() == name or (isinstance(value, type) and hasattr(value, "_fields"))
     )
     # Of a helper that the same file defines below nothing is known here: so all that the file imports.
     taken = tuple(
@@ -62,7 +62,8 @@ def _with_constants(function: types.FunctionType) -> types.FunctionType:
         if isinstance(value, Dispatcher)
         and (own := value.py_func).__code__.co_filename != function.__code__.co_filename
     )
-    known = hashlib.sha256(repr((held, taken)).encode()).hexdigest()
+    # Numba itself does not tell apart what it was asked for here.
+    known = hashlib.sha256(repr((held, taken, _file_digest(__file__))).encode()).hexdigest()
     code = function.__code__
     code = code.replace(co_freevars=(*code.co_freevars, "constants"))
     closure = (*(function.__closure__ or ()), types.CellType(known))
@@ -74,6 +75,13 @@ def _with_constants(function: types.FunctionType) -> types.FunctionType:
     )
     made.__annotations__ = function.__annotations__
     return made
+
+
+def _told(value: object) -> object:
+    """Return what tells a constant, or a named tuple, from others."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    return value._fields if isinstance(value, type) and hasattr(value, "_fields") else value
 
 
 @lru_cache(maxsize=64)

@@ -212,7 +212,11 @@ def _light_findings(case: _SceneCase, step: Callable[[], None], rendered: Render
                 raise
             found.findings.append(Finding("transport", f"{label}light", "skipped", str(error)))
             continue
-        findings, tests = compare_indirect(reference, light, label, alike=before == after)
+        many = reference.light.indirect
+        own_samples = 0 if many is None or not case.same_seed else many.samples // case.reference.renders
+        findings, tests = compare_indirect(
+            reference, light, label, alike=before == after, own_samples=own_samples
+        )
         calibration = case.reference.calibrations[setting.camera]
         if light.indirect is not None and not after:
             found.findings.append(compare_view(scene, setting.middle_s, calibration, label))

@@ -202,7 +202,8 @@ def _reference_light(
         )
         third_edges = tile_sums(edge_image(by_group_and_node(edges.third())), TILE_PX) * samples**2
     third = tile_sums(by_group_and_node(film.third()), TILE_PX) * samples**2
-    return ReferenceLight(replace(own, indirect=many), third, third_edges, light_hash(own))
+    radiance = own.indirect.radiance_per_w
+    return ReferenceLight(replace(own, indirect=many), third, third_edges, light_hash(own), radiance)
 
 
 class _Moments:

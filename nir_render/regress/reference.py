@@ -42,12 +42,15 @@ class ReferenceLight:
         The same of the pixels along edges, as `edge_image` has them; None where there are none.
     own_hash
         SHA-256 of the light that the scene renders with its own samples and seed, which is none of these.
+    own_radiance_per_w
+        The indirect light of that, shape as of `light`'s; None without, and in older references.
     """
 
     light: Light
     third: NDArray[np.float64] | None
     third_edges: NDArray[np.float64] | None
     own_hash: str
+    own_radiance_per_w: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,12 @@ TILE_PX = 8
 POWER = 0.95
 """The chance with which a drift that a comparison "could have seen" is found."""
 
+ROUNDING = 1e-4
+"""Pixels that differ relatively by less are the same: sums of float32 and changed order of sums."""
+
 _FEWEST_EVENTS = 100.0
+_FEWEST_UNLIKE = 20
+_OTHER_PATHS = 0.1
 _TINY = 1e-300
 
 
@@ -168,6 +173,48 @@ def compare_parts(
         skewness=skewness,
         p=np.where(judged, np.minimum(2.0 * tail, 1.0), 1.0),
         judged=judged,
+        tiles=stacks[0][0].size,
+    )
+
+
+def compare_paths(reference: Array, render: Array, noise: Array) -> PartTests | None:
+    """Test two renders with the same random numbers, part by part, by the signs of their differences.
+
+    Their paths are the same but for some that rounding sends elsewhere: these bring more as often as less,
+    pixel by pixel, whatever they bring. So of the pixels that differ the brighter ones are binomial, and a
+    wall that is darker shows in few of them. Parts where fewer than 20 differ are not judged.
+
+    Parameters
+    ----------
+    reference, render
+        Means of the samples of each pixel, as many in both, shape (rows, columns).
+    noise
+        Variance of the difference of two renders with seeds of their own, same shape.
+
+    Returns
+    -------
+    None where all pixels are the same, and where most paths are others (differences have a tenth of that
+    variance): nothing is then known of how they come.
+    """
+    apart = render - reference
+    unlike = np.abs(apart) > ROUNDING * np.maximum(reference, render)
+    apart = np.where(unlike, apart, 0.0)
+    if not unlike.any() or (apart**2).sum() > _OTHER_PATHS * noise.sum():
+        return None
+    rows, columns = reference.shape
+    fine = tile_sums(np.stack([reference, render, apart**2, unlike, apart > 0.0]), TILE_PX)
+    sizes = (TILE_PX, 2 * TILE_PX, max(rows, columns))
+    stacks = [fine, tile_sums(fine, 2), fine.sum(axis=(1, 2), keepdims=True)]
+    before, after, squares, count, brighter = np.concatenate([one.reshape(5, -1) for one in stacks], axis=1)
+    fewer = np.minimum(brighter, count - brighter)
+    return PartTests(
+        parts=np.concatenate([_places(rows, columns, size) for size in sizes]),
+        before=before,
+        after=after,
+        error=np.sqrt(squares),
+        skewness=np.zeros(len(count)),
+        p=np.minimum(2.0 * stats.binom.cdf(fewer, count, 0.5), 1.0),
+        judged=count >= _FEWEST_UNLIKE,
         tiles=stacks[0][0].size,
     )
 

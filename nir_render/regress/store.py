@@ -1,8 +1,8 @@
 """References on disk: a folder for each scene, which is also a recording that any stack can read.
 
-reference.json (the scene, seed, versions, history), light.N.npz, third.npz, expected.npz, frames.jsonl with
-frames/, calibration.json, detections.NAME.jsonl; of sequences odometry.jsonl, and tracks and messages of NAME
-in .jsonl; and above all scenes manifest.json with every file's hash.
+reference.json (the scene, seed, versions, history), light.N.npz, third.npz, own.npz, expected.npz,
+frames.jsonl with frames/, calibration.json, detections.NAME.jsonl; of sequences odometry.jsonl, and tracks
+and messages of NAME in .jsonl; and above all scenes manifest.json with every file's hash.
 """
 
 import hashlib
@@ -126,13 +126,18 @@ def write_references(
 def _write(folder: Path, reference: Reference) -> None:
     lights = []
     thirds: dict[str, NDArray[Any]] = {}
+    own: dict[str, NDArray[Any]] = {}
     for number, one in enumerate(reference.lights):
         write_light(folder / f"light.{number}.npz", one.light, compressed=True)
         lights.append({"file": f"light.{number}.npz", "own_sha256": one.own_hash})
+        if one.own_radiance_per_w is not None:
+            own[str(number)] = one.own_radiance_per_w
         parts = {"film": one.third, "edges": one.third_edges}
         thirds |= {f"{part}.{number}": array for part, array in parts.items() if array is not None}
     if thirds:
         run_folder.write_file(folder / "third.npz", _archive(thirds))
+    if own:
+        run_folder.write_file(folder / "own.npz", _archive(own))
     records = []
     for shot in reference.shots:
         file = f"frames/{shot.frame.camera}/{shot.frame.index:06d}.png"
@@ -168,13 +173,16 @@ def _read(folder: Path) -> Reference:
     facts = run_folder.read_json(folder / _FILE)
     if facts["format"] != FORMAT:
         raise ValueError(f"format {facts['format']!r}, this version reads {FORMAT}")
-    thirds = _arrays(folder / "third.npz") if (folder / "third.npz").is_file() else {}
+    thirds, own = (
+        _arrays(folder / name) if (folder / name).is_file() else {} for name in ("third.npz", "own.npz")
+    )
     lights = [
         ReferenceLight(
             light=read_light(folder / one["file"]),
             third=thirds.get(f"film.{number}"),
             third_edges=thirds.get(f"edges.{number}"),
             own_hash=one["own_sha256"],
+            own_radiance_per_w=own.get(str(number)),
         )
         for number, one in enumerate(facts["lights"])
     ]

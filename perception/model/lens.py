@@ -70,11 +70,12 @@ def unproject_each(points_px: Array, calibrations: Sequence[Calibration], camera
 
     `camera`, shape (n,), says by number in whose picture each point lies.
     """
-    intrinsics = np.array([(each.cx_px, each.cy_px, each.fx_px, each.fy_px) for each in calibrations])[camera]
+    intrinsics = np.array([(each.cx_px, each.cy_px, each.fx_px, each.fy_px) for each in calibrations])
+    intrinsics = intrinsics.reshape(-1, 4)[camera]
     point = (points_px - intrinsics[:, :2]) / intrinsics[:, 2:]
     lenses = [distortion_of(each) for each in calibrations]
-    direction = lenses[0].direction(point) if lenses else np.empty((0, 3))
-    for lens in set(lenses[1:]) - {lenses[0]} if lenses else ():
+    direction = np.empty((len(point), 3))
+    for lens in dict.fromkeys(lenses):
         own = np.array([each == lens for each in lenses])[camera]
         direction[own] = lens.direction(point[own])
     return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))

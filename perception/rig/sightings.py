@@ -108,8 +108,8 @@ def sightings_of(
         ],
         dtype=np.float64,
     ).reshape(-1, 7)  # fmt: skip
-    to_camera = np.array([camera.rotation_body_camera.T for camera in cameras]).reshape(-1, 3, 3)
-    turn = pixel_turns(columns[:, :2], cameras, frame) @ to_camera[frame]
+    to_body = np.array([camera.rotation_body_camera.T for camera in cameras]).reshape(-1, 3, 3)
+    turn = pixel_turns(columns[:, :2], cameras, frame) @ to_body[frame]
     rays, mounting_rad2, claimed = _rays(columns, frame, of_frame, turn, _bearings(hits, calibrations))
     return Sightings(
         keys=tuple(
@@ -135,11 +135,13 @@ def _rays(
     Parameters
     ----------
     columns
-        u, v and their σ, range, its σ and the common part of it, saturated, ..., shape (n, 10).
+        u, v and their σ in px, range, its σ and the common part of it in m, saturated, merged, ghost,
+        shape (n, 10).
     frame
         Which frame each is of, shape (n,).
     of_frame
-        Camera's centre, middle of the exposure, time of a line, σ of its rotation and place, (frames, 7).
+        Camera's centre in m, middle of the exposure and time of a line in s, σ of its rotation in rad and of
+        its place in m, shape (frames, 7).
     turn
         How far the direction turns over a pixel along u, and along v, in body axes, shape (n, 2, 3).
     bearing
@@ -153,9 +155,9 @@ def _rays(
     mounting_rad2, claimed, slope = np.empty(n), np.empty(n, dtype=np.bool_), np.empty((2, 2))
     for i in range(n):
         _, v_px, u_sigma_px, v_sigma_px, range_m, sigma_m, common_m, saturated = columns[i, :8]
-        begin_s, line_s, turned_rad, moved_m = of_frame[frame[i], 3:]
+        middle_s, line_s, turned_rad, moved_m = of_frame[frame[i], 3:]
         rays.origin_m[i] = of_frame[frame[i], :3]
-        rays.time_s[i] = begin_s + line_s * v_px
+        rays.time_s[i] = middle_s + line_s * v_px
         # Of a clipped flare that was not recovered the range is but a bound.
         is_claimed = math.isfinite(sigma_m)
         is_known = 0.0 < range_m < FARTHEST_KNOWN_M and (is_claimed or saturated == 0.0)

@@ -7,9 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.light.light import Edges, Indirect, Light
-from nir_render.regress.findings import Finding, ImagePair, percent
+from nir_render.regress.findings import Finding, ImagePair, Word, percent
 from nir_render.regress.reference import ReferenceLight, by_group_and_node, edge_image
-from nir_render.regress.statistics import TILE_PX, Judgement, MonteCarloImage, PartTests, compare_parts
+from nir_render.regress.statistics import (
+    TILE_PX,
+    Judgement,
+    MonteCarloImage,
+    PartTests,
+    compare_parts,
+    compare_paths,
+)
 
 # Which pixels lie on an edge is traced in float32: of some hundred, one may be told otherwise elsewhere.
 _EDGE_PIXELS = 3
@@ -22,7 +29,8 @@ UNIT = "1/(m² sr) per W"
 class GroupTests:
     """The tests of one group's array, to be judged with all others of the suite.
 
-    `scale` is how many pixels of the camera its pixels have on a side.
+    `scale` is how many pixels of the camera its pixels have on a side; `same_paths` tells that they compare
+    renders of the same random numbers.
     """
 
     what: str
@@ -30,10 +38,11 @@ class GroupTests:
     scale: int
     pair: ImagePair | None
     along_edges: bool = False
+    same_paths: bool = False
 
 
 def compare_indirect(
-    reference: ReferenceLight, light: Light, label: str, *, alike: bool
+    reference: ReferenceLight, light: Light, label: str, *, alike: bool, own_samples: int = 0
 ) -> tuple[list[Finding], list[GroupTests]]:
     """Compare the indirect light of a render with the reference's.
 
@@ -43,6 +52,8 @@ def compare_indirect(
     ----------
     alike
         Whether the same integrator made both.
+    own_samples
+        Of the reference's own render, where this one has its seed: then their paths are compared, too.
     """
     before, after = reference.light.indirect, light.indirect
     if before is None or after is None:
@@ -58,6 +69,8 @@ def compare_indirect(
     if old != new:
         return [_failed(f"{label}film", f"{old[-1]} × {old[-2]} → {new[-1]} × {new[-2]} pixels")], []
     tests = list(_film_tests(reference, before, after, _names(light), label, alike))
+    if alike and after.samples == own_samples:
+        tests += _path_tests(reference, before, after, _names(light), label)
     findings: list[Finding] = []
     if before.edges is not None and after.edges is not None:
         finding, edge_tests = _edge_tests(reference, before, after, _names(light), label, alike)
@@ -76,23 +89,25 @@ def finding_of(
     """Return what a judgement says of a group; light whose bits are the reference's own render passes."""
     if judgement.same or same_bits:
         seen = f"frame {percent(judgement.frame_change, signed=True)}"
-        outcome = "pass"
+        outcome: Word = "pass"
     else:
         place = _place_text(tests, judgement)
         seen = f"{percent(judgement.change, signed=True)} {place}"
         if place.startswith("in "):
             seen += f"; frame {percent(judgement.frame_change, signed=True)}"
         outcome = "fail"
-    if must_be_same and not same_bits:
+    if must_be_same and not same_bits and not tests.same_paths:
         outcome = "fail"
         seen = f"other bits than by the same versions; {seen}"
+    if tests.same_paths:
+        return Finding("transport", tests.what, outcome, seen, "where pixels differ one way")
     tile = judgement.tile_drift if np.isfinite(judgement.tile_drift) else None
     frame = judgement.frame_drift if np.isfinite(judgement.frame_drift) else None
     tile_text = f"tile {_drift(tile)} ({judgement.judged_tiles} of {judgement.tiles}), "
     return Finding(
         "transport",
         tests.what,
-        "pass" if outcome == "pass" else "fail",
+        outcome,
         seen,
         f"all {_drift(frame)}" if tests.along_edges else f"{tile_text}frame {_drift(frame)}",
         same_bits=same_bits,
@@ -139,6 +154,21 @@ def _film_tests(
         error = parts.error[: parts.tiles].reshape(tiles[0], tiles[1])
         pair = ImagePair(f"{label}{name}", UNIT, one.mean, other.mean, error)
         yield GroupTests(f"{label}{name}", parts, before.scale, pair)
+
+
+def _path_tests(
+    reference: ReferenceLight, before: Indirect, after: Indirect, names: list[str], label: str
+) -> Iterator[GroupTests]:
+    """Compare with the reference's own render, where random numbers are the same."""
+    if reference.own_radiance_per_w is None:
+        return
+    # Of the reference's many samples the variance is known best.
+    noise = 2.0 * by_group_and_node(before.variance).astype(np.float64) * (before.samples / after.samples)
+    own, now = by_group_and_node(reference.own_radiance_per_w), by_group_and_node(after.radiance_per_w)
+    for group, name in enumerate(names):
+        parts = compare_paths(own[group].astype(np.float64), now[group].astype(np.float64), noise[group])
+        if parts is not None:
+            yield GroupTests(f"{label}{name}, same paths", parts, before.scale, None, same_paths=True)
 
 
 def _edge_tests(

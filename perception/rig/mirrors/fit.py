@@ -108,7 +108,7 @@ def fit_matched(
     Returns
     -------
     Whom each image shows: parents and images, shape (pairs,), none where fewer than two (one of a known
-    plane) make a plane; χ², ln of density and covariance, as of `fit_plane`.
+    plane) make a plane, or the pairs do not settle; χ², ln of density and covariance, as of `fit_plane`.
     """
     none, least = np.empty(0, dtype=np.int64), 1 if precision[0, 0] > 0.0 else 2
     trial = plane.reshape((1, 5))

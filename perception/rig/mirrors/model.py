@@ -18,7 +18,7 @@ Indices = NDArray[np.int64]
 CONSTANT, SURFACE, PANE = 0, 1, 2
 """Kinds of reflectance: a constant, of one side of a dielectric, of both sides of a sheet of it."""
 
-NEAREST_MIRROR_M, GATE_CHI2, SEED_GATE_CHI2 = 0.05, 25.0, 200.0
+NEAREST_MIRROR_M, GATE_CHI2 = 0.05, 25.0
 SEED_LOG_RANGE, SEED_RAD = 0.3, 0.1
 SEED_COSINE2 = 1.0 - 2.0 * SEED_RAD**2
 SEED_TANGENT = math.tan(SEED_RAD)
@@ -148,9 +148,9 @@ def pair_covariance(
 @compiled
 def invert(matrix: Array) -> float:
     """Invert a small positive definite matrix in place; returns the logarithm of its determinant."""
-    size, log_determinant = len(matrix), 0.0
+    size, log_size = len(matrix), 0.0
     for pivot in range(size):
-        log_determinant += math.log(max(matrix[pivot, pivot], 1e-300))
+        log_size += math.log(max(matrix[pivot, pivot], 1e-300))
         scale = 1.0 / matrix[pivot, pivot]
         matrix[pivot, pivot] = 1.0
         for column in range(size):
@@ -161,7 +161,7 @@ def invert(matrix: Array) -> float:
                 matrix[row, pivot] = 0.0
                 for column in range(size):
                     matrix[row, column] -= factor * matrix[pivot, column]
-    return log_determinant
+    return log_size
 
 
 @compiled
@@ -178,7 +178,10 @@ def _chi2(covariance: Array, left: float, up: float, off: float) -> float:
 
 @compiled
 def log_determinant(matrix: Array, scale: float) -> float:
-    """Return ln of the determinant of a small positive definite matrix times a number."""
+    """Return ln of the determinant of a small positive definite matrix times a number.
+
+    Where it is not positive definite, as of a fit that has failed, some hundred too low.
+    """
     return invert(scale * matrix)
 
 

@@ -92,15 +92,17 @@ def log_symmetry(
         if covariance[0, 0] > 0.0 and covariance[1, 1] > 0.0 and covariance[2, 2] > 0.0:
             log_volume = 0.5 * log_determinant(covariance[:3, :3], 2.0 * math.pi)
             log_odds = _log_sum(log_odds, log_peak - 0.5 * chi2 + log_volume)
-    log_share = math.log(SYMMETRY_PROBABILITY / len(FORMATION_SIGMAS_M))
-    return log_odds + log_share + log_others + log_prior
+    log_each = math.log(SYMMETRY_PROBABILITY / len(FORMATION_SIGMAS_M))
+    return log_odds + log_each + log_others + log_prior
 
 
 @compiled
 def _log_sum(one: float, other: float) -> float:
-    """Return ln of the sum of what two numbers are ln of."""
+    """Return ln of the sum of what two numbers are ln of; what is none counts 0."""
+    if not other > -np.inf:
+        return one
     more, less = max(one, other), min(one, other)
-    return more + math.log1p(math.exp(less - more)) if more > -np.inf else more
+    return more + math.log1p(math.exp(less - more))
 
 
 @compiled

@@ -49,7 +49,7 @@ def check_planes(planes: Sequence[MirrorPlane]) -> None:
 def prior_of(plane: MirrorPlane) -> tuple[Array, int, Array]:
     """Return a mirror as the search has it, shape (5,), its kind, and the precision of it, shape (4, 4)."""
     kind = KINDS.index(plane.kind)
-    known = np.array([*plane.normal_body, plane.distance_m, plane.parameter])
+    known = np.array([*plane.normal_body, plane.distance_m, plane.parameter], dtype=np.float64)
     covariance = np.asarray(plane.covariance, dtype=np.float64)
     if kind == CONSTANT:  # R → −½ ln R
         known[4] = -0.5 * math.log(plane.parameter)

@@ -18,6 +18,7 @@ from perception.rig.mirrors.odds import (
     log_symmetry,
     one_of_each,
 )
+from perception.rig.mirrors.planes import KINDS
 from perception.rig.mirrors.seeds import (
     best_seeds,
     dim_pairs,
@@ -32,7 +33,7 @@ Indices = NDArray[np.int64]
 MIRROR_PROBABILITY = 0.1
 """That a set shows a flat mirror at all, before it is looked at."""
 
-LOG_OF_KIND = math.log(MIRROR_PROBABILITY / 3.0)
+LOG_OF_KIND = math.log(MIRROR_PROBABILITY / len(KINDS))
 """ln of the probability of a mirror of one kind of reflectance."""
 
 MOST_PLANE_DISTANCE_M = 20.0
@@ -74,7 +75,10 @@ class Explanation(NamedTuple):
 
 @compiled
 def best_plane(flares: Flares, robots: Indices, images: Indices, log_chance: Array) -> Explanation:
-    """Return what the plane explains, of none that is known, that makes what is seen the most probable."""
+    """Return what the most probable plane explains, none being known; NaN and −∞ where there is none.
+
+    `robots`, `images` and `log_chance` as for `fit_and_weigh`.
+    """
     planes, explained, kinds = _seeds(flares, robots, images)
     none = np.empty(0, dtype=np.int64)
     best = Explanation(-np.inf, np.full(5, np.nan), CONSTANT, none, none, np.full((4, 4), np.nan))
@@ -119,6 +123,8 @@ def fit_and_weigh(
 
     Parameters
     ----------
+    robots, images
+        Which flares may be shown, and which may be images.
     plane, kind, prior, precision
         As for `fit_plane`.
     log_chance

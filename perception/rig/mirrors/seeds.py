@@ -1,4 +1,4 @@
-"""Where a mirror may be, by two pairs that are reflected alike: a compiled loop of the search for mirrors."""
+"""Where a mirror may be, by pairs of a flare and its image: compiled loops of the search for mirrors."""
 
 import math
 
@@ -11,7 +11,6 @@ from perception.rig.mirrors.model import (
     CONSTANT,
     NEAREST_MIRROR_M,
     ROUNDED,
-    SEED_GATE_CHI2,
     match_all,
     of_dielectric,
 )
@@ -22,6 +21,7 @@ Indices = NDArray[np.int64]
 LEAST_ROOT, MOST_ROOT = 0.1, 1.03
 """√R of a mirror worth looking for, and a margin for noise."""
 
+SEED_GATE_CHI2 = 200.0
 DIM_RATIO = 1.5
 PARALLEL_RAD = 0.08
 PARALLEL_COSINE = 1.0 - 0.5 * PARALLEL_RAD**2
@@ -149,7 +149,7 @@ def _roots(seems_m: Array, apart_m: Array, b: int, roots: Array) -> None:
         bend = bend_z if larger else bend
         last = last_z if larger else last
         # The root of less than 0 is NaN, and so is 0 over 0: neither is between any bounds.
-        root = math.sqrt(middle**2 - 4.0 * bend * last)
+        root = np.sqrt(middle**2 - 4.0 * bend * last)
         roots[0, a] = (-middle - root) / (2.0 * bend)
         roots[1, a] = (-middle + root) / (2.0 * bend)
 
