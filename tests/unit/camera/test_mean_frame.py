@@ -10,7 +10,7 @@ from nir_render import InputError, Scene, load_scene
 from nir_render.camera.beams import blur
 from nir_render.camera.mean_frame import mean_frame
 from nir_render.camera.optics.lens import aperture_area_m2
-from nir_render.camera.render_noise import RenderNoise, render_noise
+from nir_render.camera.render_noise import RenderNoise, render_noise, share_of_target
 from nir_render.light.light import NO_SOURCES, DirectTable, Indirect, Light
 from nir_render.run.manifest import (
     group_noise_facts,
@@ -100,7 +100,8 @@ def test_the_share_of_render_noise_in_the_frame(scene: Scene) -> None:
     assert noise.reached == pytest.approx(1.0 / 3.0)
     upper = (noise_e2 / (signal_e + 100.0))[:320]
     assert noise.median_share == pytest.approx(float(np.median(upper)), rel=0.005)
-    assert render_noise(mean_frame(_light(0.0, 0.0), scene.at(0.0), 1e-3)) == RenderNoise()
+    none = mean_frame(_light(0.0, 0.0), scene.at(0.0), 1e-3)
+    assert (render_noise(none), share_of_target(none)) == (RenderNoise(), 0.0)
 
 
 def test_a_target_is_kept_by_frame_and_flares() -> None:
@@ -141,7 +142,10 @@ def test_the_share_of_render_noise_in_a_flare(scene: Scene, scale: int) -> None:
     single = np.eye((32 // scale) ** 2).reshape(-1, 32 // scale, 32 // scale)
     counts = [cv2.resize(block, (32, 32), interpolation=cv2.INTER_LINEAR)[disc].sum() for block in single]
     noise_e2 = np.square(counts).sum() * 2.0 * _electrons_on_axis(0.2 * 1e-3, 1e-3) ** 2
-    assert render_noise(mean).aperture_share == pytest.approx(noise_e2 / temporal_e2, rel=0.005)
+    noise = render_noise(mean)
+    assert noise.aperture_share == pytest.approx(noise_e2 / temporal_e2, rel=0.005)
+    # What a target bounds is the larger one: here the median of pixels, and of a bright frame's flare.
+    assert share_of_target(mean) == max(noise.aperture_share, noise.median_share) > 0.0
     assert render_noise(mean_frame(light, scene.at(0.0), 1e-3)).aperture_share == 0.0
 
 
