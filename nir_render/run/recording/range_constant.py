@@ -20,6 +20,7 @@ _NEAR_PX = 12
 _LEAST_OTHER = 0.005  # of the brightest's light: a source so faint is fourteen times as far
 _MOST_TOLD = 6
 _MOST_SIGMAS = 3.0
+_FEWEST_TO_AGREE = 3
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,14 @@ def from_known_ranges(flares: Sequence[KnownFlare], calibration: Calibration) ->
 
 
 def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> Iterator[str]:
-    """Yield which known ranges do not come out again, flux and size taken together, by more than their σ."""
+    """Yield which known ranges do not come out again, flux and size taken together, by more than their σ.
+
+    Of three or more the one that the light of all others contradicts, which agree, is told alone: it has
+    moved the range constant, and with it the others.
+    """
+    if (odd := _odd_one(flares, calibration)) is not None:
+        yield odd
+        return
     for flare in flares:
         wanted = f"{flare.range_m.value:g} m was measured of {flare.name}"
         check = (
@@ -131,6 +139,32 @@ def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> It
                 f"{hit.range_m:.3f} ± {hit.range_sigma_m:.3f} m: its light, its size and what other frames "
                 f"say do not fit one range. {check}"
             )
+
+
+def _odd_one(flares: Sequence[KnownFlare], calibration: Calibration) -> str | None:
+    """Return what to tell of the one known range whose K the others, agreeing among each other, exclude."""
+    if len(flares) < _FEWEST_TO_AGREE:
+        return None
+    try:
+        known = replace(
+            calibration, sigma={**calibration.sigma, "source_radius_m": calibration.source_radius_m}
+        )
+        values, sigmas = np.array([_constant_of(flare, known) for flare in flares]).T
+    except ValueError:
+        return None
+    told = []
+    for number, flare in enumerate(flares):
+        others, weights = np.delete(values, number), 1.0 / np.delete(sigmas, number) ** 2
+        constant = float(np.average(others, weights=weights))
+        agree = np.all(np.abs(others - constant) <= _MOST_SIGMAS * np.delete(sigmas, number))
+        sigma = math.hypot(sigmas[number], 1.0 / math.sqrt(weights.sum()))
+        if agree and abs(values[number] - constant) > _MOST_SIGMAS * sigma:
+            range_m = flare.range_m.value * math.sqrt(constant / values[number])
+            told.append(
+                f"{flare.range_m.value:g} m was measured of {flare.name}, and by the light of the other "
+                f"{len(others)}, which agree, it would be {range_m:.3g} m. Check it: all ranges lean on it"
+            )
+    return told[0] if len(told) == 1 else None
 
 
 def _flare_of(flare: KnownFlare, known: Calibration) -> Detection:

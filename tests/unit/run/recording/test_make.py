@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -353,6 +354,30 @@ def test_a_known_range_that_does_not_come_out_again_is_told(tmp_path: Path, pict
         (said,) = import_recording(wrong, overwrite=False)["r1.front"].warnings
         assert told in said
         assert "Check the range that was measured, and of which source, focal_length" in said
+
+
+def test_of_several_known_ranges_the_odd_one_is_told_with_what_the_others_say(
+    tmp_path: Path, pictures: Path
+) -> None:
+    """1.5 m written where it was 1.2 m: that one alone, and 1.2 m within 5 %. As they should be, nothing."""
+    for wrong, count in ((1.2, 0), (1.5, 1)):
+        (tmp_path / str(count)).mkdir()
+        ranges_m = [*RANGES_M[:3], wrong, *RANGES_M[4:6]]
+        known = [
+            {"camera": "r1.front", "frame": number, "range": f"{range_m} m ± 5 mm"}
+            for number, range_m in enumerate(ranges_m)
+        ]
+        folder = _folder(tmp_path / str(count), pictures, {"known_ranges": known})
+        warnings = import_recording(folder, overwrite=False)["r1.front"].warnings
+        assert len(warnings) == count, warnings
+    (said,) = warnings
+    found = re.fullmatch(
+        r"1.5 m was measured of img11.png, and by the light of the other 5, which agree, it would be "
+        r"([\d.]+) m. Check it: all ranges lean on it",
+        said,
+    )
+    assert found is not None, said
+    assert float(found[1]) == pytest.approx(1.2, rel=0.05)
 
 
 def test_the_field_of_view_of_a_part_beside_the_axis(tmp_path: Path, pictures: Path) -> None:
