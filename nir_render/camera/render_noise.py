@@ -160,7 +160,7 @@ def _variance_per_s2(rates: Rates) -> _Variance:
 def _variance_of(rates: Rates) -> _Variance:
     light, apertures = rates.light, flare_apertures(rates.light, rates.camera)
     if rates.between:
-        of_apertures = [
+        between = [
             sum(
                 weight**2 * aperture_variances_e2(one.light, one.snapshot, 1.0, apertures, of_drive)
                 for weight, one in rates.between
@@ -172,13 +172,14 @@ def _variance_of(rates: Rates) -> _Variance:
                 [np.float32(weight**2) * _variance_per_s2(one).of_pixels_e2 for weight, one in rates.between],
                 axis=0,
             ),
-            np.stack([np.asarray(of_drive) for of_drive in of_apertures]),
+            np.stack([np.asarray(of_drive) for of_drive in between]),
         )
-    parts = [_variances(light, rates.snapshot, 1.0, of_drive) for of_drive in _levels(rates)]
-    return _Variance(
-        np.stack([_of_pixels_e2(light, rates.camera, own).astype(np.float32) for own in parts]),
-        np.stack([_of_apertures_e2(light, rates.camera, own, apertures) for own in parts]),
-    )
+    of_pixels, of_apertures = [], []
+    for of_drive in _levels(rates):  # one at a time: each is as large as some frames
+        parts = _variances(light, rates.snapshot, 1.0, of_drive)
+        of_pixels.append(_of_pixels_e2(light, rates.camera, parts).astype(np.float32))
+        of_apertures.append(_of_apertures_e2(light, rates.camera, parts, apertures))
+    return _Variance(np.stack(of_pixels), np.stack(of_apertures))
 
 
 def _levels(rates: Rates) -> list[Array]:
@@ -197,7 +198,7 @@ def variance_behind_lens_e2(rates: Rates) -> Array:
             ends = [weight**2 * variance_behind_lens_e2(one) for weight, one in rates.between]
             kept = np.asarray(np.sum(ends, axis=0))
         else:
-            parts = [_variances(rates.light, rates.snapshot, 1.0, of_drive) for of_drive in _levels(rates)]
+            parts = (_variances(rates.light, rates.snapshot, 1.0, of_drive) for of_drive in _levels(rates))
             kept = np.stack([_behind_lens_e2(rates.light, rates.camera, own) for own in parts])
         rates.kept["render_variance_behind_lens"] = kept
     return kept

@@ -213,7 +213,9 @@ def _light_findings(case: _SceneCase, step: Callable[[], None], rendered: Render
             found.findings.append(Finding("transport", f"{label}light", "skipped", str(error)))
             continue
         many = reference.light.indirect
-        own_samples = 0 if many is None or not case.same_seed else many.samples // case.reference.renders
+        # Another document may be another sampler of the same random numbers.
+        own = many is not None and case.same_seed and not case.changes
+        own_samples = many.samples // case.reference.renders if many is not None and own else 0
         findings, tests = compare_indirect(
             reference, light, label, alike=before == after, own_samples=own_samples
         )

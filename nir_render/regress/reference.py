@@ -43,7 +43,8 @@ class ReferenceLight:
     own_hash
         SHA-256 of the light that the scene renders with its own samples and seed, which is none of these.
     own_radiance_per_w
-        The indirect light of that, shape as of `light`'s; None without, and in older references.
+        The indirect light of that, shape as of `light`'s, pixels along edges apart; None without, and in
+        older references.
     """
 
     light: Light

@@ -11,6 +11,7 @@ variate does, and at the small p-values that many tiles ask for a normal tail wo
 upper tail is that of a shifted gamma (Pearson III) of the skewness that the reference has measured.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,8 +31,9 @@ ROUNDING = 1e-4
 """Pixels that differ relatively by less are the same: sums of float32 and changed order of sums."""
 
 _FEWEST_EVENTS = 100.0
-_FEWEST_UNLIKE = 20
-_OTHER_PATHS = 0.1
+_OTHER_PATHS = 0.1  # of the variance of independent renders: rounding leaves some 1e-6 of it
+_FEWEST_UNLIKE = 20  # fewer that differ one way are chance too often, with as many tests as a suite has
+_UNCANCELLED = 4.25
 _TINY = 1e-300
 
 
@@ -177,12 +179,34 @@ def compare_parts(
     )
 
 
-def compare_paths(reference: Array, render: Array, noise: Array) -> PartTests | None:
+@dataclass(frozen=True, eq=False)
+class PathComparison:
+    """Two renders with the same random numbers.
+
+    Attributes
+    ----------
+    unlike, pixels
+        How many pixels differ by more than rounding, of how many.
+    others
+        Whether most paths are others, so that the renders are as good as independent.
+    parts
+        Tests of the pixels that differ: `before` and `after` are their sums; None where nothing is asked.
+    """
+
+    unlike: int
+    pixels: int
+    others: bool
+    parts: PartTests | None
+
+
+def compare_paths(reference: Array, render: Array, noise: Array) -> PathComparison:
     """Test two renders with the same random numbers, part by part, by the signs of their differences.
 
     Their paths are the same but for some that rounding sends elsewhere: these bring more as often as less,
     pixel by pixel, whatever they bring. So of the pixels that differ the brighter ones are binomial, and a
-    wall that is darker shows in few of them. Parts where fewer than 20 differ are not judged.
+    wall that is darker shows in few of them. A sampler that is another on some paths is unbiased, too, but
+    its differences are many small ones one way and few large ones the other: so signs count only where the
+    differences do not cancel over the frame, Σd² being what they would cancel to.
 
     Parameters
     ----------
@@ -190,33 +214,33 @@ def compare_paths(reference: Array, render: Array, noise: Array) -> PartTests | 
         Means of the samples of each pixel, as many in both, shape (rows, columns).
     noise
         Variance of the difference of two renders with seeds of their own, same shape.
-
-    Returns
-    -------
-    None where all pixels are the same, and where most paths are others (differences have a tenth of that
-    variance): nothing is then known of how they come.
     """
     apart = render - reference
-    unlike = np.abs(apart) > ROUNDING * np.maximum(reference, render)
-    apart = np.where(unlike, apart, 0.0)
-    if not unlike.any() or (apart**2).sum() > _OTHER_PATHS * noise.sum():
-        return None
+    unlike = np.abs(apart) > ROUNDING * np.maximum(np.abs(reference), np.abs(render))
+    count, squares = int(unlike.sum()), float((apart[unlike] ** 2).sum())
+    others = bool(squares > _OTHER_PATHS * noise.sum())
+    # ±1 σ of a sum whose terms have any signs; 4.25 of them come once in 50 000 unbiased groups.
+    if others or abs(apart[unlike].sum()) < _UNCANCELLED * math.sqrt(squares) or not count:
+        return PathComparison(count, unlike.size, others, None)
     rows, columns = reference.shape
-    fine = tile_sums(np.stack([reference, render, apart**2, unlike, apart > 0.0]), TILE_PX)
+    images = np.stack([reference, render, apart**2, np.ones_like(apart), apart > 0.0]) * unlike
+    fine = tile_sums(images, TILE_PX)
     sizes = (TILE_PX, 2 * TILE_PX, max(rows, columns))
     stacks = [fine, tile_sums(fine, 2), fine.sum(axis=(1, 2), keepdims=True)]
-    before, after, squares, count, brighter = np.concatenate([one.reshape(5, -1) for one in stacks], axis=1)
-    fewer = np.minimum(brighter, count - brighter)
-    return PartTests(
+    before, after, error2, differ, brighter = np.concatenate([one.reshape(5, -1) for one in stacks], axis=1)
+    judged = differ >= _FEWEST_UNLIKE
+    fewer = np.minimum(brighter, differ - brighter)
+    parts = PartTests(
         parts=np.concatenate([_places(rows, columns, size) for size in sizes]),
         before=before,
         after=after,
-        error=np.sqrt(squares),
-        skewness=np.zeros(len(count)),
-        p=np.minimum(2.0 * stats.binom.cdf(fewer, count, 0.5), 1.0),
-        judged=count >= _FEWEST_UNLIKE,
+        error=np.sqrt(error2),
+        skewness=np.zeros(len(differ)),
+        p=np.where(judged, np.minimum(2.0 * stats.binom.cdf(fewer, differ, 0.5), 1.0), 1.0),
+        judged=judged,
         tiles=stacks[0][0].size,
     )
+    return PathComparison(count, unlike.size, others, parts)
 
 
 def judge(images: Sequence[PartTests], significance: float) -> list[Judgement]:

@@ -25,10 +25,12 @@ def pixel_shares(edges_px: Array, sigma_px: float) -> Array:
 def gaussian_blur(image: Array, sigma_px: float, truncate: float) -> Array:
     """Return an image, shape (rows, columns), spread by a Gaussian, its outermost pixels continued outside.
 
-    To the bit what `scipy.ndimage.gaussian_filter` makes of it (mode `nearest`), several times as fast.
+    To the bit what `scipy.ndimage.gaussian_filter` makes of float64 (mode `nearest`), in half of the time.
 
     Parameters
     ----------
+    sigma_px
+        Above 0.
     truncate
         Where the Gaussian is cut off, in σ.
     """

@@ -69,9 +69,11 @@ def compare_indirect(
     if old != new:
         return [_failed(f"{label}film", f"{old[-1]} × {old[-2]} → {new[-1]} × {new[-2]} pixels")], []
     tests = list(_film_tests(reference, before, after, _names(light), label, alike))
-    if alike and after.samples == own_samples:
-        tests += _path_tests(reference, before, after, _names(light), label)
     findings: list[Finding] = []
+    if alike and own_samples:
+        finding, path_tests = _path_tests(reference, before, after, _names(light), label, own_samples)
+        findings.append(finding)
+        tests += path_tests
     if before.edges is not None and after.edges is not None:
         finding, edge_tests = _edge_tests(reference, before, after, _names(light), label, alike)
         findings.append(finding)
@@ -100,7 +102,8 @@ def finding_of(
         outcome = "fail"
         seen = f"other bits than by the same versions; {seen}"
     if tests.same_paths:
-        return Finding("transport", tests.what, outcome, seen, "where pixels differ one way")
+        seen = f"of the pixels that differ: {seen}"
+        return Finding("transport", tests.what, outcome, seen, "20 pixels that differ one way")
     tile = judgement.tile_drift if np.isfinite(judgement.tile_drift) else None
     frame = judgement.frame_drift if np.isfinite(judgement.frame_drift) else None
     tile_text = f"tile {_drift(tile)} ({judgement.judged_tiles} of {judgement.tiles}), "
@@ -157,18 +160,40 @@ def _film_tests(
 
 
 def _path_tests(
-    reference: ReferenceLight, before: Indirect, after: Indirect, names: list[str], label: str
-) -> Iterator[GroupTests]:
-    """Compare with the reference's own render, where random numbers are the same."""
+    reference: ReferenceLight,
+    before: Indirect,
+    after: Indirect,
+    names: list[str],
+    label: str,
+    own_samples: int,
+) -> tuple[Finding, list[GroupTests]]:
+    """Compare the film with the reference's own render, where random numbers are the same."""
+    what = f"{label}paths"
     if reference.own_radiance_per_w is None:
-        return
+        words = "the reference has none: 'nir-render regress update --all' adds them"
+        return Finding("transport", what, "skipped", words), []
+    if after.samples != own_samples:
+        words = f"{own_samples} → {after.samples} samples in a pixel"
+        return Finding("transport", what, "skipped", words), []
     # Of the reference's many samples the variance is known best.
-    noise = 2.0 * by_group_and_node(before.variance).astype(np.float64) * (before.samples / after.samples)
-    own, now = by_group_and_node(reference.own_radiance_per_w), by_group_and_node(after.radiance_per_w)
-    for group, name in enumerate(names):
-        parts = compare_paths(own[group].astype(np.float64), now[group].astype(np.float64), noise[group])
-        if parts is not None:
-            yield GroupTests(f"{label}{name}, same paths", parts, before.scale, None, same_paths=True)
+    noise = 2.0 * by_group_and_node(before.variance).astype(np.float64) * (before.samples / own_samples)
+    own, now = (
+        by_group_and_node(array).astype(np.float64)
+        for array in (reference.own_radiance_per_w, after.radiance_per_w)
+    )
+    compared = [compare_paths(*images) for images in zip(own, now, noise, strict=True)]
+    tests = [
+        GroupTests(f"{label}{name}, same paths", one.parts, before.scale, None, same_paths=True)
+        for name, one in zip(names, compared, strict=True)
+        if one.parts is not None
+    ]
+    others = [name for name, one in zip(names, compared, strict=True) if one.others]
+    unlike, pixels = (sum(getattr(one, part) for one in compared) for part in ("unlike", "pixels"))
+    if others:
+        words = f"most are others of {', '.join(others)}: another sampler; judged by statistics alone"
+        return Finding("transport", what, "skipped", words), tests
+    words = f"{unlike} of {pixels} pixels differ" if unlike else "all the same"
+    return Finding("transport", what, "pass", words, "20 pixels that differ one way"), tests
 
 
 def _edge_tests(

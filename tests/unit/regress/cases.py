@@ -97,7 +97,7 @@ def reference(of: Scene) -> Reference:
         seed=3,
         renders=16,
         made_by={"transport": {"variant": "llvm_ad_mono"}, "other": {"python": "3"}},
-        lights=(ReferenceLight(many, np.zeros((1, 3, 4)), None, "a" * 64),),
+        lights=(ReferenceLight(many, np.zeros((1, 3, 4)), None, "a" * 64, mean.indirect.radiance_per_w),),
         shots=(ReferenceShot(0, electrons, frame),),
         calibrations=calibrations,
         detections={"robust": (detection(), detection(u_px=3.5, range_sigma_m=float("nan"))), "paper": ()},

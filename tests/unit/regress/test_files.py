@@ -39,6 +39,8 @@ def test_a_reference_comes_back_as_it_was(stored: Path, tmp_path: Path) -> None:
     before = cases.reference(cases.scene(tmp_path))
     after = read_reference(stored / "references", "small", stored)
     assert light_hash(after.lights[0].light) == light_hash(before.lights[0].light)
+    assert before.lights[0].own_radiance_per_w is not None
+    assert np.array_equal(after.lights[0].own_radiance_per_w, before.lights[0].own_radiance_per_w)
     assert np.array_equal(after.shots[0].electrons, before.shots[0].electrons)
     assert np.array_equal(after.shots[0].frame.data_dn, before.shots[0].frame.data_dn)
     assert after.shots[0].frame.exposure_s == before.shots[0].frame.exposure_s
@@ -46,6 +48,15 @@ def test_a_reference_comes_back_as_it_was(stored: Path, tmp_path: Path) -> None:
     assert after.detections["paper"] == ()
     for name in ("document", "seed", "renders", "made_by", "history"):
         assert getattr(after, name) == getattr(before, name)
+
+
+def test_an_older_reference_has_no_light_of_its_own_seed(stored: Path) -> None:
+    folder = stored / "references"
+    (folder / "small" / "own.npz").unlink()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["sha256"]["small/own.npz"]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert read_reference(folder, "small", stored).lights[0].own_radiance_per_w is None
 
 
 def test_what_follows_from_it_comes_back_with_its_bits(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import nir_render as nr
-from nir_render.light.light import DirectTable, Indirect
+from nir_render.light.light import DirectTable, Indirect, Light
+from nir_render.regress.checking import check_scenes
 from nir_render.regress.findings import percent
 from nir_render.regress.make import detections_of, electrons_of, frame_of, frame_settings
 from nir_render.regress.reference import ReferenceLight, changes_of, document_of
@@ -19,6 +20,7 @@ from nir_render.regress.stages.direct import allowed_flips, compare_tables
 from nir_render.regress.stages.light import compare_indirect, finding_of
 from nir_render.regress.stages.perception import compare_detections
 from nir_render.regress.statistics import judge
+from nir_render.scene.scene import Scene
 from tests.unit.regress import cases
 
 
@@ -99,6 +101,48 @@ def test_light_with_the_references_own_bits_passes_and_must_where_it_is_owed() -
     assert _light_finding(0.0505, same_bits=True, must_be_same=True).startswith("pass")
     assert _light_finding(0.05, same_bits=False, must_be_same=True).startswith("fail: other bits")
     assert _light_finding(0.05, same_bits=False).startswith("pass")
+
+
+def test_light_of_the_same_random_numbers_is_compared_by_paths(tmp_path: Path) -> None:
+    """0.2 % less in 200 of 768 pixels of 2 % of noise: by its paths it fails, by statistics it would not."""
+    scene = cases.scene(tmp_path)
+    own = cases.light(noise=0.02, seed=5)
+    assert own.indirect is not None
+    known = cases.reference(scene)
+    kept = replace(known.lights[0], own_radiance_per_w=own.indirect.radiance_per_w)
+    radiance = own.indirect.radiance_per_w.copy()
+    radiance[..., :8, :25] *= 0.998
+    darker = replace(own, indirect=replace(own.indirect, radiance_per_w=radiance))
+
+    def said(
+        light: Light, kept: ReferenceLight = kept, seed: int | None = None, scene: Scene = scene
+    ) -> dict[str, str]:
+        check = check_scenes(
+            "suite", {"small": scene}, {"small": replace(known, lights=(kept,))}, seed=seed,
+            rendered=lambda *_: light,
+        )  # fmt: skip
+        found = check.scenes[0].findings
+        return {
+            one.what: f"{one.verdict}: {one.seen}"
+            for one in found
+            if "paths" in one.what or one.what == "r2.top"
+        }
+
+    assert said(own) == {"r2.top": "pass: frame +0.0060 %", "paths": "pass: all the same"}
+    told = said(darker)
+    assert told.pop("r2.top").startswith("pass")
+    assert told.pop("paths") == "pass: 200 of 768 pixels differ"
+    (worst,) = told.values()
+    assert list(told) == ["r2.top, same paths"]
+    assert worst.startswith(
+        "fail: of the pixels that differ: −0.20 % in rows 0–15, columns 0–15; frame −0.20 %"
+    )
+    without = said(darker, replace(kept, own_radiance_per_w=None))
+    assert without["paths"].startswith("skipped: the reference has none: 'nir-render regress update --all'")
+    others = said(cases.light(noise=0.02, seed=6))
+    assert others["paths"].startswith("skipped: most are others of r2.top")
+    assert list(said(darker, seed=99)) == ["r2.top"]
+    assert list(said(darker, scene=scene.with_({"materials.paint.reflectance": 0.6}))) == ["r2.top"]
 
 
 def test_other_groups_or_another_film_fail_at_once() -> None:
