@@ -195,14 +195,16 @@ def main() -> None:
         rounded = scenes[name].with_(
             {f"robots.{robot}.rig.cameras.{own_camera}.orientation.yaw": "0.00001 deg"}
         )
-        alarms = {"rounding": 0, "another sampler": 0}
+        harmless = {"rounding": 0, "another sampler": 0}
         for trial in range(asked.trials):
             seed = 30_000 + trial
-            alarms["rounding"] += alarm(part_tests_in_code(scenes[name], rounded, references[name], seed)[0])
+            harmless["rounding"] += alarm(
+                part_tests_in_code(scenes[name], rounded, references[name], seed)[0]
+            )
             known = own_lights(scenes[name], references[name], seed)
             with patch.object(guide, "_GROUP_SHARE", guide._GROUP_SHARE + 0.002):
-                alarms["another sampler"] += alarm(part_tests(scenes[name], *known)[0])
-        told["harmless"] |= {f"{name}: {one}": f"{n} of {asked.trials}" for one, n in alarms.items()}
+                harmless["another sampler"] += alarm(part_tests(scenes[name], *known)[0])
+        told["harmless"] |= {f"{name}: {one}": f"{n} of {asked.trials}" for one, n in harmless.items()}
     print(json.dumps(told))
 
 
