@@ -209,14 +209,12 @@ def take_frame(
     seed = snapshot.seed if seed is None else seed
     device = snapshot.camera(camera).camera
     own = own_setting(device, index)
-    setting = Setting(
-        own.exposure_s if exposure_s is None else exposure_s, own.gain if gain is None else gain
-    )
+    exposure_s = own.exposure_s if exposure_s is None else exposure_s
+    setting = Setting(exposure_s, own.gain if gain is None else gain)
     light = render(snapshot, camera, seed=seed, cache=cache)
     begin_s = snapshot.time_s - mid_exposure_s(device, setting.exposure_s)
-    return _shot(
-        light, electron_rates(light, snapshot), setting, begin_s, RandomKey(seed, "read_out", camera, index)
-    )
+    key = RandomKey(seed, "read_out", camera, index)
+    return _shot(light, electron_rates(light, snapshot), setting, begin_s, key)
 
 
 def _shot(light: Light, rates: Rates, setting: Setting, time_s: float, key: RandomKey) -> Shot:

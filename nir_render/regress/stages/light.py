@@ -193,7 +193,8 @@ def _path_tests(
         words = f"most are others of {', '.join(others)}: another sampler; judged by statistics alone"
         return Finding("transport", what, "skipped", words), tests
     words = f"{unlike} of {pixels} pixels differ" if unlike else "all the same"
-    return Finding("transport", what, "pass", words, "20 pixels that differ one way"), tests
+    detectable = "20 pixels that differ one way"
+    return Finding("transport", what, "pass", words, detectable, np.array_equal(own, now)), tests
 
 
 def _edge_tests(
