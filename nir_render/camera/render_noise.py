@@ -84,7 +84,7 @@ def render_noise(mean: MeanFrame) -> RenderNoise:
         share_behind_lens=float(behind_lens_e2 / frame.sensor_e2.sum()),
         share_of_99_percent=float(np.quantile(share, _NEARLY_ALL)),
         largest_share=float(share.max()),
-        aperture_share=frame.aperture_share(mean),
+        aperture_share=frame.aperture_share(),
         reached=float(reached.mean()),
     )
 
@@ -95,13 +95,14 @@ def share_of_target(mean: MeanFrame) -> float:
     It costs a third of `render_noise`.
     """
     frame = _Frame.of(mean)
-    return 0.0 if frame is None else max(float(np.median(frame.share)), frame.aperture_share(mean))
+    return 0.0 if frame is None else max(float(np.median(frame.share)), frame.aperture_share())
 
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
     """Variances of rendering and of the sensor in a frame, (rows, columns), and where rendering has any."""
 
+    mean: MeanFrame
     noise_e2: Array
     sensor_e2: Array
     reached: NDArray[np.bool_]
@@ -116,19 +117,22 @@ class _Frame:
         squares_s2 = (mean.profiles * mean.exposure_s) ** 2
         noise_e2 = np.einsum("dr,drc->rc", squares_s2, _variance_per_s2(mean.rates).of_pixels_e2)
         reached = noise_e2 > 0.0
-        return cls(noise_e2, temporal_variance_e2(mean), reached, squares_s2) if reached.any() else None
+        if not reached.any():
+            return None
+        return cls(mean, noise_e2, temporal_variance_e2(mean), reached, squares_s2)
 
     @cached_property
     def share(self) -> Array:
         """The share of pixels with noise, shape (pixels,)."""
         return np.asarray(self.noise_e2[self.reached] / self.sensor_e2[self.reached])
 
-    def aperture_share(self, mean: MeanFrame) -> float:
+    def aperture_share(self) -> float:
         """Return the largest share of the sum over a flare's aperture."""
-        of_apertures_e2 = _variance_per_s2(mean.rates).of_apertures_e2
+        of_apertures_e2 = _variance_per_s2(self.mean.rates).of_apertures_e2
+        apertures = flare_apertures(self.mean.light, self.mean.camera)
         shares = [
             float(_mean_over_rows(one, self.squares_s2) @ noise) / one.sum(self.sensor_e2)
-            for noise, one in zip(of_apertures_e2.T, flare_apertures(mean.light, mean.camera), strict=True)
+            for noise, one in zip(of_apertures_e2.T, apertures, strict=True)
         ]
         return max(shares, default=0.0)
 

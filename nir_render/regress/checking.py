@@ -212,10 +212,9 @@ def _light_findings(case: _SceneCase, step: Callable[[], None], rendered: Render
                 raise
             found.findings.append(Finding("transport", f"{label}light", "skipped", str(error)))
             continue
-        many = reference.light.indirect
         # Another document may be another sampler of the same random numbers.
-        own = many is not None and case.same_seed and not case.changes
-        own_samples = many.samples // case.reference.renders if many is not None and own else 0
+        comparable = case.same_seed and not case.changes
+        own_samples = case.reference.own_samples(reference) if comparable else 0
         findings, tests = compare_indirect(
             reference, light, label, alike=before == after, own_samples=own_samples
         )

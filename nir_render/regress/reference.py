@@ -103,6 +103,11 @@ class Reference:
     history: tuple[Mapping[str, str], ...]
     following: Following | None = None
 
+    def own_samples(self, light: ReferenceLight) -> int:
+        """Return the samples in a pixel of the render with the scene's own seed; 0 without indirect light."""
+        many = light.light.indirect
+        return 0 if many is None else many.samples // self.renders
+
 
 def document_of(scene: Scene) -> dict[str, Any]:
     """Return a scene with everything expanded as plain data.

@@ -153,10 +153,7 @@ def compare_parts(
     rows, columns = reference.mean.shape
     fine = tile_sums(np.stack([reference.mean, render.mean, variance]), TILE_PX)
     cumulant = np.zeros(fine.shape[1:]) if third is None else third * (1.0 / n**2 - 1.0 / m**2)
-    every = np.concatenate([fine, cumulant[None]])
-    sizes = (TILE_PX, 2 * TILE_PX, max(rows, columns))
-    stacks = [every, tile_sums(every, 2), every.sum(axis=(1, 2), keepdims=True)]
-    before, after, variance, cumulant = np.concatenate([one.reshape(4, -1) for one in stacks], axis=1)
+    before, after, variance, cumulant = _sums_of_parts(np.concatenate([fine, cumulant[None]]))
     rounding = min(n, m) * 2.0**-24 * np.maximum(before, after)
     error = np.sqrt(variance + rounding**2)
     pooled = (m * before + n * after) / (n + m)
@@ -168,14 +165,14 @@ def compare_parts(
     z = (after - before) / unit
     tail = np.where(z > 0.0, stats.pearson3.sf(z, skewness), stats.norm.cdf(z))
     return PartTests(
-        parts=np.concatenate([_places(rows, columns, size) for size in sizes]),
+        parts=_places_of_parts(rows, columns),
         before=before,
         after=after,
         error=error,
         skewness=skewness,
         p=np.where(judged, np.minimum(2.0 * tail, 1.0), 1.0),
         judged=judged,
-        tiles=stacks[0][0].size,
+        tiles=fine[0].size,
     )
 
 
@@ -225,20 +222,18 @@ def compare_paths(reference: Array, render: Array, noise: Array) -> PathComparis
     rows, columns = reference.shape
     images = np.stack([reference, render, apart**2, np.ones_like(apart), apart > 0.0]) * unlike
     fine = tile_sums(images, TILE_PX)
-    sizes = (TILE_PX, 2 * TILE_PX, max(rows, columns))
-    stacks = [fine, tile_sums(fine, 2), fine.sum(axis=(1, 2), keepdims=True)]
-    before, after, error2, differ, brighter = np.concatenate([one.reshape(5, -1) for one in stacks], axis=1)
+    before, after, error2, differ, brighter = _sums_of_parts(fine)
     judged = differ >= _FEWEST_UNLIKE
     fewer = np.minimum(brighter, differ - brighter)
     parts = PartTests(
-        parts=np.concatenate([_places(rows, columns, size) for size in sizes]),
+        parts=_places_of_parts(rows, columns),
         before=before,
         after=after,
         error=np.sqrt(error2),
         skewness=np.zeros(len(differ)),
         p=np.where(judged, np.minimum(2.0 * stats.binom.cdf(fewer, differ, 0.5), 1.0), 1.0),
         judged=judged,
-        tiles=stacks[0][0].size,
+        tiles=fine[0].size,
     )
     return PathComparison(count, unlike.size, others, parts)
 
@@ -306,6 +301,18 @@ def tile_sums(image: Array, tile_px: int) -> Array:
     rows = np.arange(0, image.shape[-2], tile_px)
     columns = np.arange(0, image.shape[-1], tile_px)
     return np.asarray(np.add.reduceat(np.add.reduceat(image, rows, axis=-2), columns, axis=-1))
+
+
+def _sums_of_parts(fine: Array) -> Array:
+    """Return sums over all parts, tiles of 8 pixels first, of images of such tiles, shape (images, parts)."""
+    stacks = (fine, tile_sums(fine, 2), fine.sum(axis=(1, 2), keepdims=True))
+    return np.concatenate([one.reshape(len(fine), -1) for one in stacks], axis=1)
+
+
+def _places_of_parts(rows: int, columns: int) -> NDArray[np.int64]:
+    """Return where the parts are whose sums these are, shape (parts, 4)."""
+    sizes = (TILE_PX, 2 * TILE_PX, max(rows, columns))
+    return np.concatenate([_places(rows, columns, size) for size in sizes])
 
 
 def _places(rows: int, columns: int, tile_px: int) -> NDArray[np.int64]:

@@ -55,6 +55,7 @@ def told_ghosts(
     usable = usable[np.argsort(joined.seems_m[usable], kind="stable")]
     if not len(usable) or len(usable) + len(own_sources_body_m) < 2:
         return probability, ()
+    # Writable and in C's order: for other arrays Numba would compile anew.
     flares = flares_of(joined, usable, np.array(own_sources_body_m, dtype=np.float64, order="C"))
     log_chance = log_chances(flares, len(usable))
     # The search is among the nearest; what it finds tells the others, too.
@@ -121,5 +122,6 @@ def _lone_probability(count: int, own: int, has_mirror: bool) -> Array:
     Nothing speaks for or against it but that other robots before that mirror have no image (`log_share`).
     """
     others = max(count + own - 2, 0)
+    # In closed form: one of its values is a bound of `called`, and logarithms round to either side of it.
     odds = 0.0 if has_mirror else MIRROR_PROBABILITY / ((others + 1) * (others + 2) * count)
     return np.asarray(np.minimum(odds * (np.arange(count) + own), 0.5))

@@ -301,11 +301,10 @@ def test_a_small_wall_that_the_code_makes_darker_is_seen_by_the_same_paths(
     faulty = scenes[name].with_({f"shapes.{shape}.material": "its_own", "materials.its_own": darker})
     tests = []
     for known in reference.lights:
-        assert known.light.indirect is not None
         with random_numbers_of(scenes[name]):
             light = render(faulty, known.light.camera, known.light.time_s, reference.seed)
-        samples = known.light.indirect.samples // reference.renders
-        tests += compare_indirect(known, light, "", alike=True, own_samples=samples)[1]
+        own_samples = reference.own_samples(known)
+        tests += compare_indirect(known, light, "", alike=True, own_samples=own_samples)[1]
     verdicts = judge([*(one.parts for one in tests), *_others(name)], FALSE_ALARM_RATE)
     by_paths = [found for test, found in zip(tests, verdicts, strict=False) if test.same_paths]
     told = ", ".join(f"{found.frame_change:+.2%} p {found.smallest_p:.0e}" for found in by_paths)
@@ -323,11 +322,9 @@ def test_another_sampler_of_the_same_random_numbers_raises_no_alarm() -> None:
     scenes, references = _suite()
     reference = references["room"]
     (known,) = reference.lights
-    assert known.light.indirect is not None
     with patch.object(guide, "_GROUP_SHARE", guide._GROUP_SHARE + 0.002):
         light = render(scenes["room"], known.light.camera, known.light.time_s, reference.seed)
-    samples = known.light.indirect.samples // reference.renders
-    _, tests = compare_indirect(known, light, "", alike=True, own_samples=samples)
+    _, tests = compare_indirect(known, light, "", alike=True, own_samples=reference.own_samples(known))
     assert light_hash(light) != known.own_hash
     assert all(found.same for found in judge([one.parts for one in tests], FALSE_ALARM_RATE))
 

@@ -92,9 +92,8 @@ def from_known_ranges(flares: Sequence[KnownFlare], calibration: Calibration) ->
         A frame shows no flare that can be measured, none where it should be, or several and not which is
         meant: by its number.
     """
-    sigma = {**calibration.sigma, "source_radius_m": calibration.source_radius_m}
     first = _rough_constant(flares[0], calibration)
-    known = replace(calibration, range_constant_dn_m2_per_s=first, sigma=sigma)
+    known = replace(_by_light_alone(calibration), range_constant_dn_m2_per_s=first)
     for _ in range(_MOST_PASSES):
         single = [_constant_of(flare, known) for flare in flares]
         weights = np.array([1.0 / sigma**2 for _, sigma in single])
@@ -110,6 +109,12 @@ def from_known_ranges(flares: Sequence[KnownFlare], calibration: Calibration) ->
     spread = math.hypot(spread, _response_share(calibration) * constant)
     count = len(flares)
     return Constant(constant, spread, f"{count} flare{'s' if count > 1 else ''} at known range")
+
+
+def _by_light_alone(calibration: Calibration) -> Calibration:
+    """Return a calibration to which the size of a flare says nothing."""
+    sigma = {**calibration.sigma, "source_radius_m": calibration.source_radius_m}
+    return replace(calibration, sigma=sigma)
 
 
 def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> Iterator[str]:
@@ -146,9 +151,7 @@ def _odd_one(flares: Sequence[KnownFlare], calibration: Calibration) -> str | No
     if len(flares) < _FEWEST_TO_AGREE:
         return None
     try:
-        known = replace(
-            calibration, sigma={**calibration.sigma, "source_radius_m": calibration.source_radius_m}
-        )
+        known = _by_light_alone(calibration)
         values, sigmas = np.array([_constant_of(flare, known) for flare in flares]).T
     except ValueError:
         return None
