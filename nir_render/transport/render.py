@@ -218,7 +218,7 @@ class _Rendering:
     def _enlargement(self) -> Enlargement:
         site = self.site
         scale = site.snapshot.render.indirect.scale
-        enlargement = enlargement_of(self._built, self._rays, scale)
+        enlargement = enlargement_of(site.snapshot, self._built, self._rays, scale)
         reach_px = halo_reach_px(site.snapshot, self._rays, scale)
         if reach_px == 0.0:
             return enlargement

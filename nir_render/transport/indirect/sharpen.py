@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.light.enlarge import Enlargement, without_edges
+from nir_render.light.enlarge import Enlargement, with_patch, without_edges
 from nir_render.light.light import Edges, Indirect
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.indirect import groups
-from nir_render.transport.indirect.enlargement import fit_enlargement
+from nir_render.transport.indirect.enlargement import Labels, fit_enlargement
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.labels import labels_of
 from nir_render.transport.world.medium import medium
@@ -18,13 +18,58 @@ FLARE_PILOT_SAMPLES = 256
 # Fog that throws more than this of the light scattered once, over straight light and optical depth, within
 # half a block of a source has halos that blocks smear: so many blocks about each are rendered by the pixel.
 _SHARP_SHARE, _HALO_BLOCKS = 0.04, 3.0
+# A source lights what is near it as 1/r²: where a surface is nearer than so many blocks are wide there, light
+# changes within a block.
+_GLOW_BLOCKS = 6.0
 
 
-def enlargement_of(built: DeviceScene, rays: groups.Rays, scale: int) -> Enlargement:
-    """Return how light in blocks of scale × scale pixels is enlarged; of scale 1 nothing is."""
+def enlargement_of(snapshot: Snapshot, built: DeviceScene, rays: groups.Rays, scale: int) -> Enlargement:
+    """Return how light in blocks of scale × scale pixels is enlarged; of scale 1 nothing is.
+
+    Where sources shine on surfaces close by pixels are rendered one by one.
+    """
     if scale == 1:
         return without_edges(*(count - 1 for count in rays.corners.shape[:2]))
-    return fit_enlargement(labels_of(built, rays.origin_m, rays.corners), scale)
+    labels = labels_of(built, rays.origin_m, rays.corners)
+    enlargement, glowing = fit_enlargement(labels, scale), pixels_in_glow(snapshot, labels, rays, scale)
+    return with_patch(enlargement, glowing) if len(glowing) else enlargement
+
+
+def pixels_in_glow(snapshot: Snapshot, labels: Labels, rays: groups.Rays, scale: int) -> NDArray[np.int64]:
+    """Return the numbers, row by row, of pixels that show surfaces close to a source: blocks smear its light.
+
+    A wall at the distance h behind a source shines as (1 + ρ²/h²)^(-3/2) about its foot. What a mirror shows
+    of such surfaces is not looked for.
+    """
+    rows, columns = labels.middle.shape
+    grid = rays.corners[::scale, ::scale]
+    blocks = _unit(grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:])
+    glowing = np.zeros((rows // scale, columns // scale), dtype=np.bool_)
+    for source in snapshot.sources.values():
+        offset_m = source.pose.position_m - rays.origin_m
+        cosine = blocks @ (offset_m / max(float(np.linalg.norm(offset_m)), 1e-12))
+        row, column = np.unravel_index(np.argmax(cosine), cosine.shape)
+        left, right = _unit(grid[row, column : column + 2])
+        block_rad = float(np.linalg.norm(right - left))
+        near_row, near_column = np.nonzero(cosine > np.cos((_GLOW_BLOCKS + 1.0) * block_rad))
+        if not len(near_row):
+            continue
+        block = np.s_[near_row.min() : near_row.max() + 1, near_column.min() : near_column.max() + 1]
+        at = tuple(slice(one.start * scale, one.stop * scale) for one in block)
+        corners = rays.corners[at[0].start : at[0].stop + 1, at[1].start : at[1].stop + 1]
+        direction = _unit(corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1] + corners[1:, 1:])
+        nearness_per_m = labels.nearness_per_m[at]
+        seen = nearness_per_m > 0.0
+        along_m = 1.0 / np.where(seen, nearness_per_m, 1.0)
+        apart_m = np.linalg.norm(direction * along_m[..., None] - offset_m, axis=-1)
+        # What shows the source itself is none of its surroundings.
+        seen &= (apart_m > 1.01 * source.source.radius_m) & (apart_m < _GLOW_BLOCKS * block_rad * along_m)
+        glowing[block] |= seen.reshape(-1, scale, seen.shape[1] // scale, scale).any(axis=(1, 3))
+    return np.flatnonzero(np.kron(glowing, np.ones((scale, scale), dtype=np.bool_)))
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def halo_reach_px(snapshot: Snapshot, rays: groups.Rays, scale: int) -> float:
