@@ -76,7 +76,8 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         divisible = [
             one if other or _may_be_several(one) else None for one, other in zip(plain, may_be, strict=True)
         ]
-        parted = _parted(divisible, prepared.shape, camera, cut_short)
+        halos = _with_halo(plain, camera)
+        parted = _parted(divisible, halos, prepared.shape, camera, cut_short)
         pairs, rivals = eclipses(found, plain, parted, may_be, camera)
         _take_up(pairs, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
@@ -84,7 +85,8 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         without = _without_spill(plain, prepared, camera)
         for index, line in moving(plain, camera).items():
             spills = index in without and without[index].left_over.share < MOST_LEFT
-            if line.motion_px is None or line.left_over.is_good or not spills:
+            haloed = index in halos and halos[index].cost < line.cost
+            if not haloed and (line.motion_px is None or line.left_over.is_good or not spills):
                 chosen[index] = line
         _drop_beside_lines(chosen, parted, prepared.shape, camera, cut_short)
     _retry_without_spill(chosen, parted, prepared, camera)
@@ -95,9 +97,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         for index, more in parted.items()
         if (one := chosen[index]) is not None and more.count > one.count + 1
     }
-    for index in _retry_with_halo(chosen, camera):
-        one = chosen[index]
-        uneven_e[index] = 0.0 if one is None else one.left_over.structure_e
+    for index, one in _with_halo(chosen, camera).items():
+        chosen[index] = one
+        uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     _retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
@@ -192,7 +194,7 @@ def _drop_beside_lines(
     for index, one in lines.items():
         if index not in parted or parted[index].count > one.count + 1:
             poor[index] = one
-    for index, several in _parted(poor, shape, camera, cut_short).items():
+    for index, several in _parted(poor, {}, shape, camera, cut_short).items():
         if index not in parted or several.cost < parted[index].cost:
             parted[index] = several
 
@@ -209,7 +211,11 @@ def _may_be_several(one: Solution | None) -> bool:
 
 
 def _parted(
-    plain: Sequence[Solution | None], shape: tuple[int, int], camera: Camera, cut_short: set[int]
+    plain: Sequence[Solution | None],
+    halos: Mapping[int, Solution],
+    shape: tuple[int, int],
+    camera: Camera,
+    cut_short: set[int],
 ) -> dict[int, Solution]:
     """Deblend, and return by index what explains all that is seen: enough flares explain anything by half.
 
@@ -218,7 +224,8 @@ def _parted(
     be more than were looked for.
     """
     tried = [(index, one) for index, one in enumerate(plain) if one is not None]
-    more = deblend([one for _, one in tried], camera)
+    beside = {at: halos[index] for at, (index, _) in enumerate(tried) if index in halos}
+    more = deblend([one for _, one in tried], camera, beside)
     cut_short.update(index for (index, _), several in zip(tried, more, strict=True) if several.may_be_more)
     divided: list[Solution | None] = [
         several if several.count > one.count and not _is_oval(one, several, camera) else None
@@ -251,10 +258,10 @@ def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:
     return left.is_good and left.structure_e == 0.0 and not any(hardly_seen)
 
 
-def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
+def _with_halo(best: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
     """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it.
 
-    Returns which have one.
+    Returns by index those that have one.
     """
     tried: list[tuple[int, Solution]] = []
     problems = []
@@ -270,15 +277,15 @@ def _retry_with_halo(best: list[Solution | None], camera: Camera) -> list[int]:
         )  # fmt: skip
         if seems < HALO_SEEMS_SIGMAS:
             continue
-        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e)
+        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e, solution.flares_e / flux_e)
         tried.append((index, solution))
         problems.append(solution.again(replace(window, structure=joined(window.structure, halo))))
-    having = []
-    for (index, without), again in zip(tried, solve(problems, camera), strict=True):
-        if again is not None and without.deviance - again.deviance > HALO_GAIN:
-            best[index] = again
-            having.append(index)
-    return having
+    fits = zip(tried, solve(problems, camera), strict=True)
+    return {
+        index: again
+        for (index, without), again in fits
+        if again is not None and without.deviance - again.deviance > HALO_GAIN
+    }
 
 
 def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:

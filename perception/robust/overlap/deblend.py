@@ -32,7 +32,9 @@ _WIDTH_FREE = 0.3
 _LEAST_RADIUS_PX = 1.0
 
 
-def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
+def deblend(
+    solutions: Sequence[Solution], camera: Camera, halos: Mapping[int, Solution] | None = None
+) -> list[Solution]:
     """Explain windows by as many flares as their likelihoods ask for.
 
     Adds one flare at a time where the residual is brightest (or, close to a flare, along the axis in which it
@@ -40,12 +42,25 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
     one whose image is wider or narrower than the point spread says, so that a calibration that is wrong by
     some per cent splits nothing.
 
+    Parameters
+    ----------
+    solutions, camera
+        What explains each window so far, and the frame's camera.
+    halos
+        By index lone flares with the light that a wall behind them throws back: where that leaves nothing to
+        explain no other flare is looked for, and where it explains more than a second flare further ones are
+        looked for beside it.
+
     Returns
     -------
     The windows' solutions, those given where nothing is gained; where the search was cut short they say so.
     """
-    found = list(solutions)
-    asking = [index for index, each in enumerate(found) if asks_for_more(each)]
+    found, beside = list(solutions), dict(halos or {})
+    asking = [
+        index
+        for index, each in enumerate(found)
+        if asks_for_more(each) and not (index in beside and _explains_all(beside[index]))
+    ]
     if not asking:
         return found
     by_flux = sorted(asking, key=lambda index: -float(found[index].flux_e.max()))
@@ -62,14 +77,21 @@ def deblend(solutions: Sequence[Solution], camera: Camera) -> list[Solution]:
         null |= _eased({index: found[index] for index in gaining if found[index].count == 1}, camera)
         asking = []
         for index in gaining:
-            fit = best[index]
+            fit, halo = best[index], beside.pop(index, None)
             if gain(null[index], fit) >= LEAST_GAIN:
+                if halo is not None and halo.cost < fit.cost:
+                    fit = halo
                 found[index] = null[index] = fit
                 if asks_for_more(fit):
                     (asking if fit.count < MOST_FLARES else late).append(index)
     for index in late:
         found[index] = replace(found[index], may_be_more=True)
     return found
+
+
+def _explains_all(halo: Solution) -> bool:
+    """Tell whether a flare and its halo leave nothing to another flare, nor around them."""
+    return halo.left_over.is_good and halo.left_over.structure_e == 0.0 and not asks_for_more(halo)
 
 
 def _eased(lone: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:

@@ -109,13 +109,16 @@ def halo_widths_px(image_radius_px: float) -> tuple[float, ...]:
     return tuple(narrowest_px * factor for factor in HALO_WIDTHS)
 
 
-def halo_of(box: PixelBox, u_px: float, v_px: float, image_radius_px: float, flux_e: float) -> Structure:
+def halo_of(
+    box: PixelBox, u_px: float, v_px: float, image_radius_px: float, flux_e: float, image: Array
+) -> Structure:
     """Return the light that a wall close behind a source throws back around its flare.
 
     A wall at a distance h behind an isotropic source is lit as (1 + ρ²/h²)^(-3/2), ρ from the foot of the
-    source: seen from the front that is a halo of width f h / d, wider than the source's image by h / r. Of
-    three widths each may have up to about half of the flare's own light (a white wall throws back as much as
-    twice that, over a hemisphere); narrower ones cannot be told from the flare itself.
+    source: seen from the front that is a halo of width f h / d, wider than the source's image by h / r. What
+    the source hides of it, 1 - (1 + r²/h²)^(-1/2), is missing where its image is. Of three widths each may
+    have up to about half of the flare's own light (a white wall throws back as much as twice that, over a
+    hemisphere); narrower ones cannot be told from the flare itself.
 
     Parameters
     ----------
@@ -123,11 +126,17 @@ def halo_of(box: PixelBox, u_px: float, v_px: float, image_radius_px: float, flu
         The window.
     u_px, v_px, image_radius_px, flux_e
         The flare.
+    image
+        The share of its flux in each pixel of the window, shape (rows, columns).
     """
     rows, columns = np.ogrid[box.top : box.top + box.height, box.left : box.left + box.width]
     distance2 = (columns - u_px) ** 2 + (rows - v_px) ** 2
     widths2 = [width_px**2 for width_px in halo_widths_px(image_radius_px)]
-    profiles = [(1.0 + distance2 / w2) ** -1.5 / (2.0 * np.pi * w2) for w2 in widths2]
+    hidden = [1.0 - (1.0 + image_radius_px**2 / w2) ** -0.5 for w2 in widths2]
+    profiles = [
+        (1.0 + distance2 / w2) ** -1.5 / (2.0 * np.pi * w2) - share * image
+        for w2, share in zip(widths2, hidden, strict=True)
+    ]
     return Structure(
         np.stack([profile.ravel() for profile in profiles]),
         np.eye(len(widths2)) / (_MOST_HALO_SHARE * flux_e) ** 2,
