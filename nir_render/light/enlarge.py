@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
+from perception.compiled import compiled
+
 Array = NDArray[np.float64]
 
 
@@ -95,13 +97,34 @@ def enlarge_variance(
         return variance
     sides = zip((rows, columns), variance.shape, strict=True)
     down, across = (_linear(np.arange(count), count, blocks) for count, blocks in sides)
-    taller = down.multiply(down) @ variance
-    image: Array = np.ascontiguousarray((across.multiply(across) @ taller.T).T)
+    image = _of_pairs(
+        np.ascontiguousarray(variance, dtype=np.float64),
+        down.indices.reshape(-1, 2),
+        down.data.reshape(-1, 2) ** 2,
+        across.indices.reshape(-1, 2),
+        across.data.reshape(-1, 2) ** 2,
+    )
     if enlargement is not None:
         weights = enlargement.matrix(variance.size)
         image.ravel()[enlargement.pixels] = weights.multiply(weights) @ variance.ravel()
         if patch is not None:
             image.ravel()[enlargement.patch] = patch
+    return image
+
+
+@compiled
+def _of_pairs(
+    values: Array, row: NDArray[np.int32], row_weight: Array, column: NDArray[np.int32], column_weight: Array
+) -> Array:
+    """Return for each pixel the weighted sum of two rows and two columns, shape (rows, columns)."""
+    image, line = np.empty((len(row), len(column))), np.empty(values.shape[1])
+    for at in range(len(row)):
+        first, second = values[row[at, 0]], values[row[at, 1]]
+        for block in range(len(line)):
+            line[block] = row_weight[at, 0] * first[block] + row_weight[at, 1] * second[block]
+        for pixel in range(len(column)):
+            one, other = line[column[pixel, 0]], line[column[pixel, 1]]
+            image[at, pixel] = column_weight[pixel, 0] * one + column_weight[pixel, 1] * other
     return image
 
 
