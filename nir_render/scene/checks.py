@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.errors import shown
 from nir_render.scene.bodies import Solid, bounding_sphere, contains, solid_around, solids
+from nir_render.scene.documents.base import Same
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import Robot, SceneDocument
 from nir_render.scene.documents.materials import Dielectric, Pane, texture_of
@@ -24,7 +26,7 @@ from nir_render.scene.motion import (
     robot_positions_m,
     robot_rotations,
 )
-from nir_render.spectra.curve import Curve, constant_curve
+from nir_render.spectra.curve import constant_curve, range_nm
 from nir_render.spectra.illuminants import SILICON_M
 from nir_render.spectra.nodes import BAND_M
 
@@ -217,40 +219,45 @@ def _uncovered_curves(document: SceneDocument) -> list[str]:
         if not spectrum.low_m - _SLACK_M <= BAND_M <= spectrum.high_m + _SLACK_M:
             problems.append(f"{place}: covers {spectrum.range_nm()}, not 940 nm")
     # Of spectra that cover the same the first one tells of all.
-    unlike = {(one.low_m, one.high_m): place for place, one in reversed(spectra.items())}
-    spectra = {place: one for place, one in spectra.items() if place == unlike[one.low_m, one.high_m]}
-    for name, robot in document.robots.items():
-        for camera_name, camera in robot.rig.cameras.items():
-            efficiency = camera.sensor.efficiency()
-            key = f"robots.{name}.rig.cameras.{camera_name}"
-            # At grazing incidence a passband lies farthest to the blue; beyond it the filter blocks.
-            band_m = (0.0, math.inf) if camera.filter is None else camera.filter.band_m(0.0)
-            for place, spectrum in spectra.items():
-                low_m, high_m = max(spectrum.low_m, band_m[0]), min(spectrum.high_m, band_m[1])
-                if efficiency.low_m > low_m + _SLACK_M or efficiency.high_m < high_m - _SLACK_M:
-                    problems.append(
-                        f"{key}.sensor.quantum_efficiency: covers "
-                        f"{efficiency.range_nm()}, but {place} shines from "
-                        f"{spectrum.range_nm()}; give data for it all"
-                        + ("" if camera.filter is None else ", or for all that the filter passes")
-                    )
-                    break
-            problems += _beyond_the_table(key, camera, spectra)
-    return problems
+    unlike: dict[tuple[float, float], str] = {}
+    for place, spectrum in spectra.items():
+        unlike.setdefault((spectrum.low_m, spectrum.high_m), place)
+    shining = tuple((place, *limits_m) for limits_m, place in unlike.items())
+    return problems + [
+        f"robots.{name}.rig.cameras.{camera_name}.{problem}"
+        for name, robot in document.robots.items()
+        for camera_name, camera in robot.rig.cameras.items()
+        for problem in _uncovered_by(Same(camera), shining)
+    ]
 
 
-def _beyond_the_table(key: str, camera: Camera, spectra: Mapping[str, Curve]) -> list[str]:
-    """Tell of light that a filter's table says nothing of."""
+@lru_cache(maxsize=256)
+def _uncovered_by(same: Same[Camera], shining: tuple[tuple[str, float, float], ...]) -> tuple[str, ...]:
+    """Tell of light that a camera's curves say nothing of: of each place that shines, from and to in m."""
+    camera = same.part
+    efficiency = camera.sensor.efficiency()
+    problems = []
+    # At grazing incidence a passband lies farthest to the blue; beyond it the filter blocks.
+    band_m = (0.0, math.inf) if camera.filter is None else camera.filter.band_m(0.0)
+    for place, *shining_m in shining:
+        low_m, high_m = max(shining_m[0], band_m[0]), min(shining_m[1], band_m[1])
+        if efficiency.low_m > low_m + _SLACK_M or efficiency.high_m < high_m - _SLACK_M:
+            problems.append(
+                f"sensor.quantum_efficiency: covers {efficiency.range_nm()}, but {place} shines from "
+                f"{range_nm(*shining_m)}; give data for it all"
+                + ("" if camera.filter is None else ", or for all that the filter passes")
+            )
+            break
     known_m = None if camera.filter is None else camera.filter.unblocked_m()
-    if known_m is None:
-        return []
-    return [
-        f"{key}.filter.table: covers {known_m[0] * 1e9:.4g} to {known_m[1] * 1e9:.4g} nm, but {place} shines "
-        f"from {spectrum.range_nm()}; give data for it all, or 'blocking_od', the least optical density "
-        "beyond the table"
-        for place, spectrum in spectra.items()
-        if spectrum.low_m < known_m[0] - _SLACK_M or spectrum.high_m > known_m[1] + _SLACK_M
-    ][:1]
+    if known_m is not None:
+        problems += [
+            f"filter.table: covers {known_m[0] * 1e9:.4g} to {known_m[1] * 1e9:.4g} nm, but {place} shines "
+            f"from {range_nm(*shining_m)}; give data for it all, or 'blocking_od', the least optical density "
+            "beyond the table"
+            for place, *shining_m in shining
+            if shining_m[0] < known_m[0] - _SLACK_M or shining_m[1] > known_m[1] + _SLACK_M
+        ][:1]
+    return tuple(problems)
 
 
 def _cameras_inside_solids(document: SceneDocument) -> list[str]:

@@ -31,7 +31,7 @@ class Curve:
 
     def range_nm(self) -> str:
         """Return the range that the curve covers, as text."""
-        return f"{self.low_m * 1e9:.4g} to {self.high_m * 1e9:.4g} nm"
+        return range_nm(self.low_m, self.high_m)
 
     def __call__(self, wavelength_m: ArrayLike) -> NDArray[np.float64]:
         """Return the curve at wavelengths of any shape.
@@ -66,6 +66,11 @@ def curve_from_points(points: tuple[tuple[float, float], ...], name: str) -> Cur
     """Return the curve through (wavelength_m, value) points."""
     wavelength_m, value = np.array(points, dtype=np.float64).T
     return Curve(wavelength_m, value, name)
+
+
+def range_nm(low_m: float, high_m: float) -> str:
+    """Return a range of wavelengths as text."""
+    return f"{low_m * 1e9:.4g} to {high_m * 1e9:.4g} nm"
 
 
 def constant_curve(value: float, low_m: float, high_m: float, name: str) -> Curve:

@@ -13,8 +13,10 @@ from typing import Any
 from nir_render.errors import InputError
 from nir_render.run.manifest import versions as run_versions
 from nir_render.run.perceive import estimators_in_process
+from nir_render.scene.documents.base import Same
 from nir_render.scene.documents.camera import Rig
 from nir_render.scene.documents.document import SceneDocument
+from nir_render.scene.documents.shapes import ShapeDocument
 from nir_render.scene.scene import Scene
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.design.points import Point, points_of
@@ -84,25 +86,26 @@ def plan(
         known.setdefault(job.point.written, []).append(job)
     jobs: list[Job] = []
     problems: list[str] = []
-    place_of_scene: dict[str, str] = {}
+
+    def place_of(point: Point) -> str:
+        named = zip(campaign.axes, point.labels, strict=True)
+        return ", ".join(f"{axis.name} = {label}" for axis, label in named)
+
+    point_of_scene: dict[str, Point] = {}
     hashes = _hashes(campaign.scene, [point.settings for point in points if point.written not in known])
     for built, point in enumerate(points):
         progress(built, number)
         if point.written in known:
             jobs += [replace(job, point=point) for job in known[point.written]]
             continue
-        place = ", ".join(
-            f"{axis.name} = {label}" for axis, label in zip(campaign.axes, point.labels, strict=True)
-        )
         found = next(hashes)
-        problems += [f"{campaign.path}: at {place}: {problem}" for problem in found.problems]
+        problems += [f"{campaign.path}: at {place_of(point)}: {problem}" for problem in found.problems]
         if found.problems:
             continue
-        if found.scene in place_of_scene:
-            problems.append(
-                f"{campaign.path}: at {place}: the same scene as at {place_of_scene[found.scene]}"
-            )
-        place_of_scene[found.scene] = place
+        if found.scene in point_of_scene:
+            same = place_of(point_of_scene[found.scene])
+            problems.append(f"{campaign.path}: at {place_of(point)}: the same scene as at {same}")
+        point_of_scene[found.scene] = point
         for seed in campaign.seeds:
             jobs.append(
                 Job(
@@ -174,31 +177,20 @@ def is_same(job: Job, scene: Scene, made_by: Sequence[str], processor: str) -> b
 
 
 def _scene_hash(document: SceneDocument) -> str:
-    """Return the hash of a resolved scene; what robots carry is written once, however many carry the same."""
+    """Return the hash of a resolved scene; what scenes share, as they were read once, is written once."""
     # Scattered robots are among the others.
-    without: dict[str, Any] = {"robots": {"__all__": {"rig"}}, "scatter": True}
+    without: dict[str, Any] = {"robots": {"__all__": {"rig"}}, "shapes": True, "scatter": True}
     hashed = hashlib.sha256(document.model_dump_json(exclude=without).encode())
+    for name, shape in document.shapes.items():
+        hashed.update(f"\0{name}\0".encode() + _text(Same(shape)))
     for robot in document.robots.values():
-        hashed.update(b"\0" + _rig_text(_Same(robot.rig)))
+        hashed.update(b"\0" + _text(Same(robot.rig)))
     return hashed.hexdigest()
 
 
-@dataclass(frozen=True)
-class _Same:
-    """A rig as itself: two are equal where they are one object."""
-
-    rig: Rig
-
-    def __hash__(self) -> int:
-        return id(self.rig)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.rig is self.rig
-
-
-@lru_cache(maxsize=256)
-def _rig_text(same: _Same) -> bytes:
-    return same.rig.model_dump_json().encode()
+@lru_cache(maxsize=1024)
+def _text(same: Same[Rig | ShapeDocument]) -> bytes:
+    return same.part.model_dump_json().encode()
 
 
 def _geometry(scene: Scene) -> str:

@@ -27,6 +27,7 @@ from pydantic import BaseModel
 
 from nir_render.camera.optics.lens import corner_directions
 from nir_render.scene.documents.ambient.sun import Skylight, Sun
+from nir_render.scene.documents.base import Same
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.fog import Fog
 from nir_render.scene.documents.materials import MaterialDocument
@@ -177,12 +178,30 @@ def versions(variant: str, compiler: str) -> tuple[str, ...]:
     return (variant, compiler, *_versions())
 
 
-def _shape(shape: ShapeDocument) -> tuple[str, dict[str, Any]]:
+@dataclass(frozen=True)
+class _Written:
+    """What has been written already."""
+
+    text: bytes
+
+
+def _shape(shape: ShapeDocument) -> _Written:
     """Return a shape without the name of its material, and a mesh by what its file holds."""
-    fields = {name: getattr(shape, name) for name in type(shape).model_fields if name not in _ELSEWHERE}
     if isinstance(shape, Mesh):
-        fields["file"] = _file(shape.file)
-    return type(shape).__name__, fields
+        return _of_fields(shape, file=_file(shape.file))
+    return _plain_shape(Same(shape))
+
+
+@lru_cache(maxsize=1024)  # those of a campaign's scenes are the same objects
+def _plain_shape(same: Same[ShapeDocument]) -> _Written:
+    return _of_fields(same.part)
+
+
+def _of_fields(shape: ShapeDocument, **others: object) -> _Written:
+    fields = {name: getattr(shape, name) for name in type(shape).model_fields if name not in _ELSEWHERE}
+    parts: list[bytes] = []
+    _write((type(shape).__name__, fields | others), parts.append)
+    return _Written(b"".join(parts))
 
 
 def _material(material: MaterialDocument) -> tuple[str, dict[str, Any]]:
@@ -241,30 +260,51 @@ def digest(value: Any) -> str:
 
 def _write(value: Any, write: Callable[[bytes], None]) -> None:
     """Write the canonical bytes of plain data, arrays and models; what is most is asked for first."""
-    if isinstance(value, str):
-        text = value.encode()
-        write(b"s%d;%b" % (len(text), text))
-    elif isinstance(value, float):
+    kind = type(value)
+    if kind is float:
         write(b"d" + _DOUBLE.pack(value))
-    elif isinstance(value, tuple | list):
+    elif kind is str:
+        write(_text(value))
+    elif kind is tuple or kind is list:
         write(b"l%d;" % len(value))
         for item in value:
             _write(item, write)
     elif value is None:
         write(b"n")
+    elif kind is dict:
+        write(b"m%d;" % len(value))
+        for key, item in value.items():
+            _write(key, write)
+            _write(item, write)
+    elif kind is _Written:
+        write(value.text)
+    elif isinstance(value, BaseModel):
+        fields = {name: getattr(value, name) for name in kind.model_fields}
+        _write((kind.__name__, fields), write)
     elif isinstance(value, bool | int | np.integer):
         write(b"i%d;" % int(value))
     elif isinstance(value, np.ndarray):
         array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
         write(f"a{array.dtype.str}{array.shape};".encode())
         write(array.tobytes())
-    elif isinstance(value, BaseModel):
-        fields = {name: getattr(value, name) for name in type(value).model_fields}
-        _write((type(value).__name__, fields), write)
-    elif isinstance(value, Mapping):
-        write(b"m%d;" % len(value))
-        for key, item in value.items():
-            _write(key, write)
-            _write(item, write)
     else:
-        raise TypeError(f"{type(value).__name__} has no canonical bytes")
+        _write(_plain(value), write)
+
+
+def _plain(value: object) -> str | float | tuple[Any, ...] | dict[Any, Any]:
+    """Return what is some kind of plain data as such."""
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, float):
+        return float(value)
+    if isinstance(value, tuple | list):
+        return tuple(value)
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"{type(value).__name__} has no canonical bytes")
+
+
+@lru_cache(maxsize=4096)
+def _text(value: str) -> bytes:
+    text = value.encode()
+    return b"s%d;%b" % (len(text), text)

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -29,6 +29,10 @@ from nir_render.scene.text.units import (
     parse_vector,
     wanted,
 )
+
+Part = TypeVar("Part")
+
+_MAY_HOLD_TRUTH = (bool, list, tuple)
 
 _UNIT_SUFFIXES = (
     "_m_per_k",
@@ -65,6 +69,24 @@ def document_key(field: str) -> str:
         if field.endswith(suffix):
             return field.removesuffix(suffix)
     return field
+
+
+@dataclass(frozen=True)
+class Same(Generic[Part]):
+    """A part of a document as itself: two are equal where they are one object, whatever they hold.
+
+    What follows from a part that is read once (`files.PresetDocument`) can be kept by it.
+    """
+
+    part: Part
+
+    def __hash__(self) -> int:
+        """Return the hash of the object."""
+        return id(self.part)
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether it is the same object."""
+        return isinstance(other, Same) and other.part is self.part
 
 
 class Document(BaseModel):
@@ -109,6 +131,11 @@ class Document(BaseModel):
         if not isinstance(data, Mapping):
             like = f"such as {cls.example}" if cls.example else f"known keys: {', '.join(sorted(known))}"
             raise ValueError(f"{shown(data)} stands where keys with values are wanted, {like}")
+        for key, value in data.items():
+            if key not in known or isinstance(value, _MAY_HOLD_TRUTH):
+                break
+        else:
+            return []
         found = (_key_problem(key, value, known) for key, value in data.items())
         return [problem for problem in found if problem is not None]
 

@@ -17,7 +17,7 @@ from nir_render.scene.documents.base import Document
 from nir_render.scene.text.yaml_text import parse_yaml, read_yaml
 
 _MOST_READ = 1024
-_READ: dict[tuple[type, bytes], "PresetDocument"] = {}
+_READ: dict[tuple[type, bytes], "ReadOnceDocument"] = {}
 _FILES_FOUND: ContextVar[int] = ContextVar("_FILES_FOUND", default=0)  # by this thread so far
 _MOST_NAME_BYTES = 255  # of a file, in the file systems in use
 # Keys of which a document has one: a change that writes another replaces the first.
@@ -44,17 +44,14 @@ _GOES_WITH = {
     "quantum_efficiency": {"efficiency_envelope", "efficiency_taken"},
     "droplets": {"albedo"},  # which they tell
 }
+_WITH_ALTERNATIVES = frozenset(_GOES_WITH).union(*_ALTERNATIVES)
 
 
-class PresetDocument(Document):
-    """A part that may be named instead of written: a preset of `data/`, or a `.yaml` file beside the scene.
+class ReadOnceDocument(Document):
+    """A part that, written alike, is read once: thirty robots with one rig, or a campaign's scenes, share it.
 
-    `sensor: mt9m031` takes a preset whole; `sensor: {preset: mt9m031, read_noise: 5 e}` changes a part. Parts
-    that are written alike are read once: thirty robots with one rig, or a campaign's scenes, share them. Not
-    so what follows from a file beside the scene, however it is named there: it may have changed since.
+    Not so what follows from a file beside the scene, however it is named there: it may have changed since.
     """
-
-    preset_folder: ClassVar[str]
 
     @model_validator(mode="wrap")
     @classmethod
@@ -74,6 +71,15 @@ class PresetDocument(Document):
             _READ[key] = known
         assert isinstance(known, cls)
         return known
+
+
+class PresetDocument(ReadOnceDocument):
+    """A part that may be named instead of written: a preset of `data/`, or a `.yaml` file beside the scene.
+
+    `sensor: mt9m031` takes a preset whole; `sensor: {preset: mt9m031, read_noise: 5 e}` changes a part.
+    """
+
+    preset_folder: ClassVar[str]
 
     @model_validator(mode="before")
     @classmethod
@@ -174,6 +180,8 @@ def merge(base: Any, change: Any) -> Any:
 def without_alternatives(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
     """Return `base` without the keys that stand for the same thing as those which `change` sets."""
     kept = dict(base)
+    if change.keys().isdisjoint(_WITH_ALTERNATIVES):
+        return kept
     for forms in _ALTERNATIVES:
         if any(change[key] is not None for key in forms & change.keys()):
             kept = {key: value for key, value in kept.items() if key not in forms}

@@ -20,7 +20,7 @@ from nir_render.scene.documents.base import (
     typed,
     usable_direction,
 )
-from nir_render.scene.documents.files import resolve_file
+from nir_render.scene.documents.files import ReadOnceDocument, resolve_file
 from nir_render.scene.documents.times.motion import Moving
 from nir_render.scene.meshes.mesh import MeshPart
 from nir_render.scene.meshes.read import SUFFIXES, read_mesh
@@ -28,7 +28,7 @@ from nir_render.scene.meshes.read import SUFFIXES, read_mesh
 _FARTHEST_M = 10_000.0
 
 
-class _Shape(Moving):
+class _Shape(ReadOnceDocument, Moving):
     """What all shapes have: the name of a material of the scene, or of a preset; and how they move.
 
     What moves is written as it is in a frame that a motion carries: the hinge of a door, the feet of one who
