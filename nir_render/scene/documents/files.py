@@ -51,6 +51,7 @@ class ReadOnceDocument(Document):
     """A part that, written alike, is read once: thirty robots with one rig, or a campaign's scenes, share it.
 
     Not so what follows from a file beside the scene, however it is named there: it may have changed since.
+    It is made by `model_validate` alone: a constructor would return what it has not filled.
     """
 
     @model_validator(mode="wrap")

@@ -107,10 +107,10 @@ def described(
         shine = {"emitter": _area_light(1.0 / (4.0 * np.pi**2 * radius_m**2))} if name in emitting else {}
         bodies[f"source_{index}"] = {**sphere, **shine}
     for name, lamp in snapshot.lamps.items():
-        panel = Rectangle(
-            type="rectangle", material="", center=format_vector(lamp.center_m, LENGTH),
-            size=format_vector(lamp.size_m, LENGTH), normal=lamp.normal,
-        )  # fmt: skip
+        center, size = (format_vector(vector_m, LENGTH) for vector_m in (lamp.center_m, lamp.size_m))
+        panel = Rectangle.model_validate(
+            {"type": "rectangle", "material": "", "center": center, "size": size, "normal": lamp.normal}
+        )
         # One watt from one side: L = 1 / (π A).
         area_m2 = lamp.size_m[0] * lamp.size_m[1]
         shine = {"emitter": _area_light(1.0 / (np.pi * area_m2))} if f"lamps.{name}" in emitting else {}
