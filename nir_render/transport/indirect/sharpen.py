@@ -19,8 +19,9 @@ FLARE_PILOT_SAMPLES = 256
 # half a block of a source has halos that blocks smear: so many blocks about each are rendered by the pixel.
 _SHARP_SHARE, _HALO_BLOCKS = 0.04, 3.0
 # A source lights what is near it as 1/r²: where a surface is nearer than so many blocks are wide there, light
-# changes within a block.
-_GLOW_BLOCKS = 6.0
+# changes within a block. In the blocks beside the source, some of which it cuts, that shows where the surface
+# is farther, too.
+_GLOW_BLOCKS, _GLOW_BESIDE_BLOCKS, _BESIDE_BLOCKS = 6.0, 24.0, 2.0
 
 
 def enlargement_of(snapshot: Snapshot, built: DeviceScene, rays: groups.Rays, scale: int) -> Enlargement:
@@ -47,7 +48,8 @@ def pixels_in_glow(snapshot: Snapshot, labels: Labels, rays: groups.Rays, scale:
     glowing = np.zeros((rows // scale, columns // scale), dtype=np.bool_)
     for source in snapshot.sources.values():
         offset_m = source.pose.position_m - rays.origin_m
-        cosine = blocks @ (offset_m / max(float(np.linalg.norm(offset_m)), 1e-12))
+        towards = offset_m / max(float(np.linalg.norm(offset_m)), 1e-12)
+        cosine = blocks @ towards
         row, column = np.unravel_index(np.argmax(cosine), cosine.shape)
         left, right = _unit(grid[row, column : column + 2])
         block_rad = float(np.linalg.norm(right - left))
@@ -63,7 +65,10 @@ def pixels_in_glow(snapshot: Snapshot, labels: Labels, rays: groups.Rays, scale:
         along_m = 1.0 / np.where(seen, nearness_per_m, 1.0)
         apart_m = np.linalg.norm(direction * along_m[..., None] - offset_m, axis=-1)
         # What shows the source itself is none of its surroundings.
-        seen &= (apart_m > 1.01 * source.source.radius_m) & (apart_m < _GLOW_BLOCKS * block_rad * along_m)
+        seen &= apart_m > 1.01 * source.source.radius_m
+        beside = direction @ towards > np.cos(_BESIDE_BLOCKS * block_rad)
+        near_blocks = np.where(beside, _GLOW_BESIDE_BLOCKS, _GLOW_BLOCKS)
+        seen &= apart_m < near_blocks * block_rad * along_m
         glowing[block] |= seen.reshape(-1, scale, seen.shape[1] // scale, scale).any(axis=(1, 3))
     return np.flatnonzero(np.kron(glowing, np.ones((scale, scale), dtype=np.bool_)))
 
