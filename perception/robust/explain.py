@@ -1,5 +1,6 @@
 """What explains a cluster best: flares at rest or drawn out, one or several, a halo, uneven ground, spill."""
 
+import functools
 import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
@@ -36,6 +37,10 @@ HALO_SEEMS_SIGMAS = 1.5
 HALO_GAIN = 10.0
 """2 Δ ln L that a halo must bring: noise gives χ² of three degrees of freedom, 10 twice in a hundred."""
 
+_THIRD = 2.0 ** (1.0 / 3.0)
+_HALO_ROUNDS = ((1.0,), (_THIRD**-2, _THIRD**-1, 1.0, _THIRD, _THIRD**2), (_THIRD**-1, 1.0, _THIRD))
+"""Of widths so many times the likeliest so far, round by round."""
+
 _ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
 MOST_LEFT = 0.25
@@ -69,6 +74,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     parted: dict[int, Solution] = {}
     rivals: dict[int, Solution] = {}
     cut_short: set[int] = set()
+    halos: dict[int, Solution] = {}
     plain: list[Solution | None] = [None] * len(found)
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
@@ -97,7 +103,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         for index, more in parted.items()
         if (one := chosen[index]) is not None and more.count > one.count + 1
     }
-    for index, one in _with_halo(chosen, camera).items():
+    others = [None if one is before else one for one, before in zip(chosen, plain, strict=True)]
+    kept = {index: one for index, one in halos.items() if others[index] is None}
+    for index, one in (kept | _with_halo(others, camera)).items():
         chosen[index] = one
         uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
@@ -261,31 +269,58 @@ def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:
 def _with_halo(best: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
     """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it.
 
-    Returns by index those that have one.
+    What a source hides of its halo goes by its size, and that by its range: so they are fitted once more as
+    these have come out, with widths nearer to the likeliest.
+
+    Returns by index those that have one, sigmas knowing of other widths of it.
     """
-    tried: list[tuple[int, Solution]] = []
-    problems = []
-    for index, solution in enumerate(best):
-        if solution is None or solution.count != 1:
-            continue
-        u_px, v_px, _ = solution.starts[0]
-        radius_px, flux_e = float(solution.image_radius_px[0]), float(solution.flux_e[0])
-        window = solution.window
-        seems = halo_sigmas(
-            window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
-            (u_px - window.box.left, v_px - window.box.top), halo_widths_px(radius_px),
-        )  # fmt: skip
-        if seems < HALO_SEEMS_SIGMAS:
-            continue
-        halo = halo_of(window.box, u_px, v_px, radius_px, flux_e, solution.flares_e / flux_e)
-        tried.append((index, solution))
-        problems.append(solution.again(replace(window, structure=joined(window.structure, halo))))
-    fits = zip(tried, solve(problems, camera), strict=True)
-    return {
-        index: again
-        for (index, without), again in fits
-        if again is not None and without.deviance - again.deviance > HALO_GAIN
-    }
+    found: dict[int, Solution] = {}
+    plain = {index: one for index, one in enumerate(best) if one is not None and _seems_haloed(one)}
+    known = {index: (one, _widths_px(one)) for index, one in plain.items()}
+    for factors in _HALO_ROUNDS:
+        tried = [
+            (index, factor * width_px)
+            for index, (_, widths_px) in known.items()
+            for width_px in widths_px
+            for factor in factors
+        ]
+        problems = [_haloed(plain[index], known[index][0], width_px) for index, width_px in tried]
+        fits: dict[int, list[tuple[Solution, float]]] = {}
+        for (index, width_px), again in zip(tried, solve(problems, camera), strict=True):
+            if again is not None and plain[index].deviance - again.deviance > HALO_GAIN:
+                fits.setdefault(index, []).append((again, width_px))
+        known = {}
+        for index, several in fits.items():
+            several.sort(key=lambda each: each[0].cost)
+            likeliest, width_px = several[0]
+            known[index] = likeliest, (width_px,)
+            found[index] = functools.reduce(weighed, [one for one, _ in several])
+    return found
+
+
+def _seems_haloed(solution: Solution) -> bool:
+    """Tell whether what a lone flare's fit leaves over looks as if it had a halo."""
+    if solution.count != 1:
+        return False
+    window, (u_px, v_px, _) = solution.window, solution.starts[0]
+    seems = halo_sigmas(
+        window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
+        (u_px - window.box.left, v_px - window.box.top), _widths_px(solution),
+    )  # fmt: skip
+    return bool(seems > HALO_SEEMS_SIGMAS)
+
+
+def _widths_px(solution: Solution) -> tuple[float, ...]:
+    return halo_widths_px(float(solution.image_radius_px[0]), solution.window.box.height)
+
+
+def _haloed(plain: Solution, known: Solution, width_px: float) -> Problem:
+    """Return the problem of a flare with a halo, of which is hidden what its known image hides."""
+    (u_px, v_px, _), flux_e = known.starts[0], float(known.flux_e[0])
+    flare = u_px, v_px, float(known.image_radius_px[0]), flux_e
+    halo = halo_of(plain.window.box, flare, known.flares_e / flux_e, width_px, known.psf_sigma_px)
+    window = replace(plain.window, structure=joined(plain.window.structure, halo))
+    return Problem(window, known.starts, known.background_e, known.motions)
 
 
 def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:

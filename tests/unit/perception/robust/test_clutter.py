@@ -1,6 +1,7 @@
 """Frames that are hard to read: what is no source stays unsaid, and what is one is measured as light allows."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from perception.robust.search.frame import Pixels
 from perception.robust.search.limit import point_kernel
 from perception.robust.search.prepare import bad_pixels
 from perception.robust.search.structure import autocorrelation, structure_of
-from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, frame_of, textured
-from tests.unit.perception.simulation import random
+from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, cell_centres, frame_of, textured
+from tests.unit.perception.simulation import expected_e, expose, random
 
 EMPTY = (
     "60 stuck pixels",
@@ -138,4 +139,47 @@ def test_a_wall_behind_a_source_does_not_draw_it_nearer() -> None:
         errors.append(hit.range_m / true_m - 1.0)
         pulls.append((hit.range_m - true_m) / hit.range_sigma_m)
     assert abs(np.mean(errors)) < 0.006
+    assert float(np.sqrt(np.mean(np.square(pulls)))) < 1.0 + 4.0 / math.sqrt(50)
+
+
+@pytest.mark.parametrize(("gap_m", "range_m"), [(0.03, 2.0), (0.03, 3.4), (0.08, 6.0)])
+def test_a_ball_close_before_a_white_wall_is_ranged_as_well_as_it_claims(
+    gap_m: float, range_m: float
+) -> None:
+    """25 balls of 10 mm, each before a wall of 85 % across the line of sight: none is told as two.
+
+    Ray by ray: a point of the wall at the distance a from the ball shines with 0.85 I h / (π a³), but where the
+    ball hides it. With light behind the ball in the model, too, ranges came out 5 to 7 % too far at 3.4 m.
+    """
+    camera, albedo, fine, half = replace(POINT, source_radius_m=0.01), 0.85, 8, 40
+    exposure_s = 4e-5 * range_m**2
+    flux_at_1_m_e = camera.range_constant_dn_m2_per_s / camera.system_gain_dn_per_e * exposure_s
+    shifts = random(46).random((25, 2))
+    places = [(u + du, v + dv) for (u, v), (du, dv) in zip(cell_centres(2), shifts, strict=True)]
+    mean_e = expected_e(camera, [(*place, range_m) for place in places], exposure_s, BACKGROUND_E)
+    for u_px, v_px in places:
+        left, top, side = round(u_px) - half, round(v_px) - half, 2 * half + 1
+        grid_px = (np.arange(side * fine) + 0.5) / fine - 0.5
+        x, y = np.meshgrid(left + grid_px - camera.cx_px, top + grid_px - camera.cy_px)
+        ray = np.stack([x / camera.fx_px, y / camera.fy_px, np.ones_like(x)], axis=-1)
+        length = np.linalg.norm(ray, axis=-1)
+        centre = np.array([(u_px - camera.cx_px) / camera.fx_px, (v_px - camera.cy_px) / camera.fy_px, 1.0])
+        centre /= np.linalg.norm(centre)
+        along = ray @ centre / length
+        on_wall_m = ray * ((range_m + gap_m) / (along * length))[..., None]
+        apart_m = np.linalg.norm(on_wall_m - range_m * centre, axis=-1)
+        light = flux_at_1_m_e * albedo * gap_m / (np.pi * apart_m**3) / (length**4 * camera.fx_px**2)
+        light[range_m * np.sqrt(1.0 - along**2) < camera.source_radius_m] = 0.0
+        light = gaussian_filter(light, camera.psf_sigma_px * fine)
+        glow_e = light.reshape(side, fine, side, fine).mean(axis=(1, 3))
+        mean_e[top : top + side, left : left + side] += glow_e
+    hits = perception.detect(expose(mean_e, camera, random(47), exposure_s), camera)
+    assert len(hits) == len(places)
+    nearest = [
+        min(hits, key=lambda hit, at=place: math.hypot(hit.u_px - at[0], hit.v_px - at[1]))  # type: ignore[misc]
+        for place in places
+    ]
+    errors_m = np.array([hit.range_m for hit in nearest]) - range_m
+    pulls = errors_m / np.array([hit.range_sigma_m for hit in nearest])
+    assert abs(np.mean(errors_m)) < 0.003 * range_m
     assert float(np.sqrt(np.mean(np.square(pulls)))) < 1.0 + 4.0 / math.sqrt(50)
