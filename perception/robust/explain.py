@@ -305,7 +305,7 @@ def _seems_haloed(solution: Solution) -> bool:
     window, (u_px, v_px, _) = solution.window, solution.starts[0]
     seems = halo_sigmas(
         window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
-        (u_px - window.box.left, v_px - window.box.top), _widths_px(solution),
+        (u_px - window.box.left, v_px - window.box.top), np.array(_widths_px(solution)),
     )  # fmt: skip
     return bool(seems > HALO_SEEMS_SIGMAS)
 

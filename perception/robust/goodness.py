@@ -289,7 +289,7 @@ def drawn_out(
 @compiled
 def halo_sigmas(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, floor_e2: float, prnu: float,
-    place: tuple[float, float], widths_px: tuple[float, ...],
+    place: tuple[float, float], widths_px: Array,
 ) -> float:  # fmt: skip
     """Return by how many standard deviations, at least, light around a flare shows in what its fit leaves.
 
