@@ -34,7 +34,8 @@ class Enlargement:
         Numbers of blocks, and what they weigh, shape (m,).
     patch
         Numbers of the pixels that no block tells of well enough, or that the edge of a lamp cuts, or that lie
-        in a flare's halo sharper than blocks, shape (p,): they are rendered one by one.
+        in a flare's halo sharper than blocks, or show what is close to a source, shape (p,): they are
+        rendered one by one.
     left_out
         How many more of these there are than may be rendered one by one: they are interpolated.
     """

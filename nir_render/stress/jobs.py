@@ -188,7 +188,7 @@ def _scene_hash(document: SceneDocument) -> str:
     return hashed.hexdigest()
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=8192)
 def _text(same: Same[Rig | ShapeDocument]) -> bytes:
     return same.part.model_dump_json().encode()
 

@@ -192,7 +192,7 @@ def _shape(shape: ShapeDocument) -> _Written:
     return _plain_shape(Same(shape))
 
 
-@lru_cache(maxsize=1024)  # those of a campaign's scenes are the same objects
+@lru_cache(maxsize=8192)  # those of a campaign's scenes are the same objects
 def _plain_shape(same: Same[ShapeDocument]) -> _Written:
     return _of_fields(same.part)
 
@@ -294,7 +294,7 @@ def _write(value: Any, write: Callable[[bytes], None]) -> None:
 def _plain(value: object) -> str | float | tuple[Any, ...] | dict[Any, Any]:
     """Return what is some kind of plain data as such."""
     if isinstance(value, str):
-        return str(value)
+        return str.__str__(value)
     if isinstance(value, float):
         return float(value)
     if isinstance(value, tuple | list):

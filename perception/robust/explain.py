@@ -1,6 +1,5 @@
 """What explains a cluster best: flares at rest or drawn out, one or several, a halo, uneven ground, spill."""
 
-import functools
 import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +10,6 @@ from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
-from perception.robust.goodness import halo_sigmas
 from perception.robust.motion import moving
 from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import (
@@ -22,6 +20,7 @@ from perception.robust.overlap.deblend import (
     of_free_width,
 )
 from perception.robust.overlap.eclipse import eclipses
+from perception.robust.overlap.halo import with_halo
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
@@ -29,17 +28,9 @@ from perception.robust.overlap.rivals import weighed
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.search.structure import EDGES, halo_of, halo_widths_px, joined, structure_of
+from perception.robust.search.structure import EDGES, structure_of
 from perception.robust.solve import Solution, solve, start_costs
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
-
-HALO_SEEMS_SIGMAS = 1.5
-HALO_GAIN = 10.0
-"""2 Δ ln L that a halo must bring: noise gives χ² of three degrees of freedom, 10 twice in a hundred."""
-
-_THIRD = 2.0 ** (1.0 / 3.0)
-_HALO_ROUNDS = ((1.0,), (_THIRD**-2, _THIRD**-1, 1.0, _THIRD, _THIRD**2), (_THIRD**-1, 1.0, _THIRD))
-"""Of widths so many times the likeliest so far, round by round."""
 
 _ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
@@ -82,19 +73,27 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         divisible = [
             one if other or _may_be_several(one) else None for one, other in zip(plain, may_be, strict=True)
         ]
-        halos = _with_halo(plain, camera)
+        halos = with_halo(plain, camera)
         parted = _parted(divisible, halos, prepared.shape, camera, cut_short)
         pairs, rivals = eclipses(found, plain, parted, may_be, camera)
         _take_up(pairs, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
         # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
         without = _without_spill(plain, prepared, camera)
-        for index, line in moving(plain, camera).items():
+        lines = moving(plain, camera)
+        # What moves before a wall has both.
+        drawn_out = {index: one for index, one in lines.items() if one.motion_px is not None}
+        of_lines = with_halo({index: one for index, one in drawn_out.items() if index in halos}, camera)
+        for index, line in lines.items():
             spills = index in without and without[index].left_over.share < MOST_LEFT
-            haloed = index in halos and halos[index].cost < line.cost
-            if not haloed and (line.motion_px is None or line.left_over.is_good or not spills):
+            if index in drawn_out and index in halos:
+                rival = of_lines.get(index, line)
+                if halos[index].cost < rival.cost:
+                    halos[index] = weighed(halos[index], rival)
+                    continue
+            if line.motion_px is None or line.left_over.is_good or not spills:
                 chosen[index] = line
-        _drop_beside_lines(chosen, parted, prepared.shape, camera, cut_short)
+        _drop_beside_lines(chosen, parted, of_lines, prepared.shape, camera, cut_short)
     _retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
@@ -105,7 +104,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     }
     others = [None if one is before else one for one, before in zip(chosen, plain, strict=True)]
     kept = {index: one for index, one in halos.items() if others[index] is None}
-    for index, one in (kept | _with_halo(others, camera)).items():
+    for index, one in (kept | with_halo(others, camera)).items():
         chosen[index] = one
         uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
@@ -179,6 +178,7 @@ def _beside_rival(one: Solution | None, pair: Solution) -> Solution | None:
 def _drop_beside_lines(
     chosen: list[Solution | None],
     parted: dict[int, Solution],
+    halos: Mapping[int, Solution],
     shape: tuple[int, int],
     camera: Camera,
     cut_short: set[int],
@@ -202,7 +202,7 @@ def _drop_beside_lines(
     for index, one in lines.items():
         if index not in parted or parted[index].count > one.count + 1:
             poor[index] = one
-    for index, several in _parted(poor, {}, shape, camera, cut_short).items():
+    for index, several in _parted(poor, halos, shape, camera, cut_short).items():
         if index not in parted or several.cost < parted[index].cost:
             parted[index] = several
 
@@ -264,63 +264,6 @@ def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:
     left = several.left_over
     hardly_seen = (is_hardly_seen(several, k, shape) for k in range(several.count))
     return left.is_good and left.structure_e == 0.0 and not any(hardly_seen)
-
-
-def _with_halo(best: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
-    """Fit lone flares again that seem to have a halo: a wall behind a source shines around it, and in it.
-
-    What a source hides of its halo goes by its size, and that by its range: so they are fitted once more as
-    these have come out, with widths nearer to the likeliest.
-
-    Returns by index those that have one, sigmas knowing of other widths of it.
-    """
-    found: dict[int, Solution] = {}
-    plain = {index: one for index, one in enumerate(best) if one is not None and _seems_haloed(one)}
-    known = {index: (one, _widths_px(one)) for index, one in plain.items()}
-    for factors in _HALO_ROUNDS:
-        tried = [
-            (index, factor * width_px)
-            for index, (_, widths_px) in known.items()
-            for width_px in widths_px
-            for factor in factors
-        ]
-        problems = [_haloed(plain[index], known[index][0], width_px) for index, width_px in tried]
-        fits: dict[int, list[tuple[Solution, float]]] = {}
-        for (index, width_px), again in zip(tried, solve(problems, camera), strict=True):
-            if again is not None and plain[index].deviance - again.deviance > HALO_GAIN:
-                fits.setdefault(index, []).append((again, width_px))
-        known = {}
-        for index, several in fits.items():
-            several.sort(key=lambda each: each[0].cost)
-            likeliest, width_px = several[0]
-            known[index] = likeliest, (width_px,)
-            found[index] = functools.reduce(weighed, [one for one, _ in several])
-    return found
-
-
-def _seems_haloed(solution: Solution) -> bool:
-    """Tell whether what a lone flare's fit leaves over looks as if it had a halo."""
-    if solution.count != 1:
-        return False
-    window, (u_px, v_px, _) = solution.window, solution.starts[0]
-    seems = halo_sigmas(
-        window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
-        (u_px - window.box.left, v_px - window.box.top), np.array(_widths_px(solution)),
-    )  # fmt: skip
-    return bool(seems > HALO_SEEMS_SIGMAS)
-
-
-def _widths_px(solution: Solution) -> tuple[float, ...]:
-    return halo_widths_px(float(solution.image_radius_px[0]), solution.window.box.height)
-
-
-def _haloed(plain: Solution, known: Solution, width_px: float) -> Problem:
-    """Return the problem of a flare with a halo, of which is hidden what its known image hides."""
-    (u_px, v_px, _), flux_e = known.starts[0], float(known.flux_e[0])
-    flare = u_px, v_px, float(known.image_radius_px[0]), flux_e
-    halo = halo_of(plain.window.box, flare, known.flares_e / flux_e, width_px, known.psf_sigma_px)
-    window = replace(plain.window, structure=joined(plain.window.structure, halo))
-    return Problem(window, known.starts, known.background_e, known.motions)
 
 
 def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:

@@ -240,7 +240,7 @@ def test_the_glow_of_a_wall_close_behind_a_source_keeps_its_peak(
     """A source of 1 W, 10 mm, before a white wall 3.43 m away, in blocks of 4 × 4: rings about it, to 0.8 %.
 
     By hand: I = 1/4π, and at the foot's distance a the wall shines with ρ I h / (π (h² + a²)^(3/2)), but where the
-    source hides it. Its image is 4 to 60 px wide. In blocks alone the inmost ring of the nearest lost 57 %.
+    source hides it. That glow is 4 to 60 px wide. In blocks alone the inmost ring of the nearest lost 57 %.
     """
     columns, rows, focal_px, wall_m, radius_m, reflectance = 96, 80, 490.0, 3.43, 0.01, 0.8
     centre_m = np.array([wall_m - gap_m, *place])

@@ -75,7 +75,7 @@ def document_key(field: str) -> str:
 class Same(Generic[Part]):
     """A part of a document as itself: two are equal where they are one object, whatever they hold.
 
-    What follows from a part that is read once (`files.PresetDocument`) can be kept by it.
+    What follows from a part that is read once (`files.ReadOnceDocument`) can be kept by it.
     """
 
     part: Part

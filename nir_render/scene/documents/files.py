@@ -16,8 +16,7 @@ from nir_render.errors import shown
 from nir_render.scene.documents.base import Document
 from nir_render.scene.text.yaml_text import parse_yaml, read_yaml
 
-_MOST_READ = 1024
-_READ: dict[tuple[type, bytes], "ReadOnceDocument"] = {}
+_READ: dict[type, dict[bytes, "ReadOnceDocument"]] = {}
 _FILES_FOUND: ContextVar[int] = ContextVar("_FILES_FOUND", default=0)  # by this thread so far
 _MOST_NAME_BYTES = 255  # of a file, in the file systems in use
 # Keys of which a document has one: a change that writes another replaces the first.
@@ -51,25 +50,29 @@ class ReadOnceDocument(Document):
     """A part that, written alike, is read once: thirty robots with one rig, or a campaign's scenes, share it.
 
     Not so what follows from a file beside the scene, however it is named there: it may have changed since.
-    It is made by `model_validate` alone: a constructor would return what it has not filled.
+    It is made by `model_validate` alone: a constructor would return what it has not filled. So many of a kind
+    are kept.
     """
+
+    most_kept: ClassVar[int] = 8192
 
     @model_validator(mode="wrap")
     @classmethod
     def _read_once(cls, data: Any, read: ModelWrapValidatorHandler[Self]) -> Self:
         try:
-            key = cls, marshal.dumps(data, 2)  # by type: {None: 1} is not {"null": 1}
+            key = marshal.dumps(data, 2)  # by type: {None: 1} is not {"null": 1}
         except ValueError:  # of more than plain data
             return read(data)
-        known = _READ.get(key)
+        kept = _READ.setdefault(cls, {})
+        known = kept.get(key)
         if known is None:
             before = _FILES_FOUND.get()
             known = read(data)
             if _FILES_FOUND.get() != before:
                 return known
-            if len(_READ) >= _MOST_READ:
-                _READ.pop(next(iter(_READ)), None)
-            _READ[key] = known
+            if len(kept) >= cls.most_kept:
+                kept.pop(next(iter(kept)), None)
+            kept[key] = known
         assert isinstance(known, cls)
         return known
 
@@ -81,6 +84,7 @@ class PresetDocument(ReadOnceDocument):
     """
 
     preset_folder: ClassVar[str]
+    most_kept: ClassVar[int] = 1024
 
     @model_validator(mode="before")
     @classmethod

@@ -20,8 +20,10 @@ FLARE_PILOT_SAMPLES = 256
 _SHARP_SHARE, _HALO_BLOCKS = 0.04, 3.0
 # A source lights what is near it as 1/r²: where a surface is nearer than so many blocks are wide there, light
 # changes within a block. In the blocks beside the source, some of which it cuts, that shows where the surface
-# is farther, too.
+# is farther, too. As many pixels as there are blocks are rendered one by one for it at most, the nearest; in
+# small images so many.
 _GLOW_BLOCKS, _GLOW_BESIDE_BLOCKS, _BESIDE_BLOCKS = 6.0, 24.0, 2.0
+_GLOW_PIXELS = 10_000
 
 
 def enlargement_of(snapshot: Snapshot, built: DeviceScene, rays: groups.Rays, scale: int) -> Enlargement:
@@ -32,28 +34,38 @@ def enlargement_of(snapshot: Snapshot, built: DeviceScene, rays: groups.Rays, sc
     if scale == 1:
         return without_edges(*(count - 1 for count in rays.corners.shape[:2]))
     labels = labels_of(built, rays.origin_m, rays.corners)
-    enlargement, glowing = fit_enlargement(labels, scale), pixels_in_glow(snapshot, labels, rays, scale)
-    return with_patch(enlargement, glowing) if len(glowing) else enlargement
+    enlargement = fit_enlargement(labels, scale)
+    glowing, left_out = pixels_in_glow(snapshot, labels, rays, scale)
+    if not len(glowing):
+        return enlargement
+    return replace(with_patch(enlargement, glowing), left_out=enlargement.left_out + left_out)
 
 
-def pixels_in_glow(snapshot: Snapshot, labels: Labels, rays: groups.Rays, scale: int) -> NDArray[np.int64]:
+def pixels_in_glow(
+    snapshot: Snapshot, labels: Labels, rays: groups.Rays, scale: int
+) -> tuple[NDArray[np.int64], int]:
     """Return the numbers, row by row, of pixels that show surfaces close to a source: blocks smear its light.
 
     A wall at the distance h behind a source shines as (1 + ρ²/h²)^(-3/2) about its foot. What a mirror shows
-    of such surfaces is not looked for.
+    of such surfaces, and what is behind a pane, is not looked for. Beside them, how many more there are.
     """
     rows, columns = labels.middle.shape
     grid = rays.corners[::scale, ::scale]
     blocks = _unit(grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:])
-    glowing = np.zeros((rows // scale, columns // scale), dtype=np.bool_)
+    # How near each block's nearest surface is to a source, over what counts as near there.
+    nearest = np.full((rows // scale, columns // scale), np.inf)
     for source in snapshot.sources.values():
         offset_m = source.pose.position_m - rays.origin_m
-        towards = offset_m / max(float(np.linalg.norm(offset_m)), 1e-12)
+        distance_m = max(float(np.linalg.norm(offset_m)), 1e-12)
+        towards, radius_m = offset_m / distance_m, source.source.radius_m
+        radius_rad = float(np.arcsin(min(radius_m / distance_m, 1.0)))
         cosine = blocks @ towards
         row, column = np.unravel_index(np.argmax(cosine), cosine.shape)
-        left, right = _unit(grid[row, column : column + 2])
-        block_rad = float(np.linalg.norm(right - left))
-        near_row, near_column = np.nonzero(cosine > np.cos((_GLOW_BLOCKS + 1.0) * block_rad))
+        corner, right, below = _unit(grid[[row, row, row + 1], [column, column + 1, column]])
+        chord = max(float(np.linalg.norm(right - corner)), float(np.linalg.norm(below - corner)))
+        block_rad = 2.0 * float(np.arcsin(min(0.5 * chord, 1.0)))
+        reach_rad = radius_rad + (max(_GLOW_BLOCKS, _BESIDE_BLOCKS) + 1.0) * block_rad
+        near_row, near_column = np.nonzero(cosine > np.cos(min(reach_rad, np.pi)))
         if not len(near_row):
             continue
         block = np.s_[near_row.min() : near_row.max() + 1, near_column.min() : near_column.max() + 1]
@@ -61,16 +73,22 @@ def pixels_in_glow(snapshot: Snapshot, labels: Labels, rays: groups.Rays, scale:
         corners = rays.corners[at[0].start : at[0].stop + 1, at[1].start : at[1].stop + 1]
         direction = _unit(corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1] + corners[1:, 1:])
         nearness_per_m = labels.nearness_per_m[at]
-        seen = nearness_per_m > 0.0
-        along_m = 1.0 / np.where(seen, nearness_per_m, 1.0)
-        apart_m = np.linalg.norm(direction * along_m[..., None] - offset_m, axis=-1)
-        # What shows the source itself is none of its surroundings.
-        seen &= apart_m > 1.01 * source.source.radius_m
-        beside = direction @ towards > np.cos(_BESIDE_BLOCKS * block_rad)
+        along_m = 1.0 / np.maximum(nearness_per_m, 1e-12)
+        apart_m = np.linalg.norm(direction * along_m[..., None] - offset_m, axis=-1) - radius_m
+        beside = direction @ towards > np.cos(min(radius_rad + _BESIDE_BLOCKS * block_rad, np.pi))
         near_blocks = np.where(beside, _GLOW_BESIDE_BLOCKS, _GLOW_BLOCKS)
-        seen &= apart_m < near_blocks * block_rad * along_m
-        glowing[block] |= seen.reshape(-1, scale, seen.shape[1] // scale, scale).any(axis=(1, 3))
-    return np.flatnonzero(np.kron(glowing, np.ones((scale, scale), dtype=np.bool_)))
+        off = apart_m / (near_blocks * block_rad * along_m)
+        # What shows the source itself is none of its surroundings.
+        off[(nearness_per_m == 0.0) | (apart_m < 0.01 * radius_m)] = np.inf
+        of_blocks = off.reshape(-1, scale, off.shape[1] // scale, scale).min(axis=(1, 3))
+        nearest[block] = np.minimum(nearest[block], of_blocks)
+    glowing = np.flatnonzero(nearest < 1.0)
+    most = max(nearest.size, _GLOW_PIXELS) // scale**2
+    kept = glowing[np.argsort(nearest.ravel()[glowing], kind="stable")[:most]]
+    is_kept = np.zeros(nearest.shape, dtype=np.bool_)
+    is_kept.ravel()[kept] = True
+    pixels = np.flatnonzero(np.kron(is_kept, np.ones((scale, scale), dtype=np.bool_)))
+    return pixels, (len(glowing) - len(kept)) * scale**2
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

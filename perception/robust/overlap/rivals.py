@@ -17,26 +17,34 @@ NO_RIVAL = -2.0 * math.log(_LEAST_SHARE)
 """What costs so much more changes nothing."""
 
 
-def weighed(solution: Solution, other: Solution) -> Solution:
-    """Return a solution, its sigmas wider by what differs in another, weighted by how likely that one is.
+def weighed(solution: Solution, *others: Solution) -> Solution:
+    """Return a solution, its sigmas wider by what differs in others, weighted by how likely each is.
 
     Of another number of flares the nearest counts; where it is likelier than a hundredth, that is doubtful.
     """
-    odds = math.exp(-0.5 * min(max(other.cost - solution.cost, -_MOST_COST), _MOST_COST))
-    share = odds / (1.0 + odds)
+    costs = [min(max(other.cost - solution.cost, -_MOST_COST), _MOST_COST) for other in others]
+    odds = [math.exp(-0.5 * cost) for cost in costs]
+    wider = solution
+    for other, own_odds in zip(others, odds, strict=True):
+        wider = _wider(wider, solution, other, own_odds / (1.0 + sum(odds)))
+    return wider
+
+
+def _wider(wider: Solution, solution: Solution, other: Solution, share: float) -> Solution:
+    """Return a solution as wide as it is so far, and wider by what differs in another of a share."""
     if share < _LEAST_SHARE:
-        return solution
+        return wider
     apart = np.hypot(solution.u_px[:, None] - other.u_px, solution.v_px[:, None] - other.v_px)
     nearest = np.argmin(apart, axis=1)
 
-    def wider(sigma: Array, own: Array, others: Array) -> Array:
+    def and_by(sigma: Array, own: Array, others: Array) -> Array:
         return np.asarray(np.hypot(sigma, math.sqrt(share) * (others[nearest] - own)))
 
     return replace(
-        solution,
-        u_sigma_px=wider(solution.u_sigma_px, solution.u_px, other.u_px),
-        v_sigma_px=wider(solution.v_sigma_px, solution.v_px, other.v_px),
-        flux_sigma_e=wider(solution.flux_sigma_e, solution.flux_e, other.flux_e),
-        log_range_sigma=wider(solution.log_range_sigma, solution.log_range, other.log_range),
-        is_doubtful=solution.is_doubtful or (solution.count != other.count and share > _DOUBTFUL_SHARE),
+        wider,
+        u_sigma_px=and_by(wider.u_sigma_px, solution.u_px, other.u_px),
+        v_sigma_px=and_by(wider.v_sigma_px, solution.v_px, other.v_px),
+        flux_sigma_e=and_by(wider.flux_sigma_e, solution.flux_e, other.flux_e),
+        log_range_sigma=and_by(wider.log_range_sigma, solution.log_range, other.log_range),
+        is_doubtful=wider.is_doubtful or (solution.count != other.count and share > _DOUBTFUL_SHARE),
     )

@@ -6,22 +6,14 @@ window that is a handful of cosines whose amplitudes have a prior (`model.layout
 knows which backgrounds are likely under a flare, and its sigmas know that it does not see them.
 """
 
-import math
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.flare import PixelBox
 from perception.model.layout import Structure
 
 Array = NDArray[np.float64]
-
-_HALO_WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0)
-_LEAST_HALO_PX, _LEAST_HALO_RADII = 1.5, 1.2
-_MOST_HALO_SIDES = 0.6
-_HALO_SHARE, _SHAPE_SHARE = 1.0, 0.1
-"""What a wall throws back of the light of a source before it, and how far that differs in shape, a priori."""
 
 EDGES = tuple(np.exp(-np.arange(16) / 4.0).round(3).tolist())
 """Autocorrelation of what has edges, as shadows and panels do: it falls at once, and its spectrum slowly."""
@@ -104,60 +96,6 @@ def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array
     values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
     basis = np.einsum("nr,mc->nmrc", waves, waves).reshape(number, side_px**2)[order]
     return basis, np.asarray((vectors / values) @ vectors.T)
-
-
-def halo_widths_px(image_radius_px: float, side_px: int) -> tuple[float, ...]:
-    """Return how wide the light may be that a wall close behind a source throws back around its flare.
-
-    A ball is before its wall: h > r. Wider ones than a window of that side are even ground in it.
-    """
-    narrowest_px = max(_LEAST_HALO_PX, _LEAST_HALO_RADII * image_radius_px)
-    widths_px = (narrowest_px * factor for factor in _HALO_WIDTHS)
-    return tuple(width_px for width_px in widths_px if width_px < _MOST_HALO_SIDES * side_px)
-
-
-def halo_of(
-    box: PixelBox,
-    flare: tuple[float, float, float, float],
-    image: Array,
-    width_px: float,
-    psf_sigma_px: float,
-) -> Structure:
-    """Return the light that a wall close behind a source throws back around its flare.
-
-    A wall at a distance h behind an isotropic source is lit as (1 + ρ²/h²)^(-3/2), ρ from the foot of the
-    source: seen from the front that is a halo of width f h / d, wider than the source's image by h / r. What
-    the source hides of it, 1 - (1 + r²/h²)^(-1/2), is missing where its image is. A white wall throws back as
-    much as twice the flare's own light, over a hemisphere. The second part is what another width changes.
-
-    Parameters
-    ----------
-    box
-        The window.
-    flare
-        Its place u and v and the radius of its image, in pixels, and its flux.
-    image
-        The share of its flux in each pixel of the window, shape (rows, columns).
-    width_px, psf_sigma_px
-        Of the halo, and of the point spread.
-    """
-    from scipy.ndimage import gaussian_filter
-
-    u_px, v_px, radius_px, flux_e = flare
-    smooth_px = math.hypot(psf_sigma_px, 12**-0.5)
-    rows, columns = np.ogrid[box.top : box.top + box.height, box.left : box.left + box.width]
-    distance2 = (columns - u_px) ** 2 + (rows - v_px) ** 2
-
-    def profile(w_px: float) -> Array:
-        hidden = 1.0 - (1.0 + (radius_px / w_px) ** 2) ** -0.5
-        sharp = (1.0 + distance2 / w_px**2) ** -1.5 / (2.0 * np.pi * w_px**2)
-        return np.asarray(gaussian_filter(sharp, smooth_px, mode="nearest") - hidden * image)
-
-    wider, narrower = profile(width_px * math.exp(0.1)), profile(width_px * math.exp(-0.1))
-    return Structure(
-        np.stack([profile(width_px).ravel(), ((wider - narrower) / 0.2).ravel()]),
-        np.diag([_HALO_SHARE**-2, _SHAPE_SHARE**-2]) / flux_e**2,
-    )
 
 
 def joined(one: Structure | None, other: Structure) -> Structure:

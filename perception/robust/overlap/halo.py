@@ -1,0 +1,161 @@
+"""Flares with a halo: the light that a wall close behind a source throws back around it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.layout import Structure
+from perception.model.window import Camera
+from perception.robust.goodness import halo_sigmas
+from perception.robust.overlap.rivals import weighed
+from perception.robust.problem import Problem
+from perception.robust.search.structure import joined
+from perception.robust.solve import Solution, solve
+
+Array = NDArray[np.float64]
+
+SEEMS_SIGMAS = 1.5
+LEAST_GAIN = 10.0
+"""2 Δ ln L that a halo must bring: noise gives χ² of two or three degrees of freedom, 10 hardly ever."""
+
+_HALO_SHARE, _SHAPE_SHARE = 1.0, 0.1
+"""What a wall throws back of the light of a source before it, and how far that differs in shape, a priori."""
+
+_WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0)
+_THIRD = 2.0 ** (1.0 / 3.0)
+_ROUNDS = ((1.0,), (_THIRD**-2, _THIRD**-1, 1.0, _THIRD, _THIRD**2), (_THIRD**-1, 1.0, _THIRD))
+"""Of widths so many times the likeliest so far, round by round."""
+
+_LEAST_WIDTH_PX, _LEAST_WIDTH_RADII, _MOST_WIDTH_SIDES = 1.5, 1.05, 0.6
+_STEP = 0.1  # in ln width
+_FINE, _PLACES = 4, 10  # parts of a pixel along an axis, and places of what moves
+
+
+def with_halo(
+    best: Sequence[Solution | None] | Mapping[int, Solution], camera: Camera
+) -> dict[int, Solution]:
+    """Fit lone flares again that seem to have a halo.
+
+    What a source hides of its halo goes by its size, and that by its range: so they are fitted once more as
+    these have come out, with widths nearer to the likeliest.
+
+    Returns
+    -------
+    By index those that have one, sigmas knowing of other widths of it.
+    """
+    found: dict[int, Solution] = {}
+    given = best.items() if isinstance(best, Mapping) else enumerate(best)
+    plain = {index: one for index, one in given if one is not None and _seems_to_have_one(one)}
+    known = {index: (one, _widths_px(one)) for index, one in plain.items()}
+    for factors in _ROUNDS:
+        tried = []
+        for index, (one, widths_px) in known.items():
+            least_px, most_px = _bounds_px(one)
+            widths_px = [factor * width_px for width_px in widths_px for factor in factors]
+            tried += [(index, width_px) for width_px in widths_px if least_px <= width_px <= most_px]
+        problems = [_problem(plain[index], known[index][0], width_px) for index, width_px in tried]
+        fits: dict[int, list[tuple[Solution, float]]] = {}
+        for (index, width_px), again in zip(tried, solve(problems, camera), strict=True):
+            if again is not None and plain[index].deviance - again.deviance > LEAST_GAIN:
+                fits.setdefault(index, []).append((again, width_px))
+        known = {}
+        for index, several in fits.items():
+            several.sort(key=lambda each: each[0].cost)
+            likeliest, width_px = several[0]
+            known[index] = likeliest, [width_px]
+            found[index] = weighed(*(one for one, _ in several))
+    return found
+
+
+def _seems_to_have_one(solution: Solution) -> bool:
+    """Tell whether what a lone flare's fit leaves over looks as if it had a halo."""
+    widths_px = _widths_px(solution)
+    if solution.count != 1 or not widths_px:
+        return False
+    window, (u_px, v_px, _) = solution.window, solution.starts[0]
+    seems = halo_sigmas(
+        window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
+        (u_px - window.box.left, v_px - window.box.top), np.array(widths_px),
+    )  # fmt: skip
+    return bool(seems > SEEMS_SIGMAS)
+
+
+def _radius_px(solution: Solution) -> float:
+    """Return the radius of a flare's image at rest."""
+    return float(solution.image_radius_px[0]) - 0.5 * solution.most_motion_px
+
+
+def _bounds_px(solution: Solution) -> tuple[float, float]:
+    """Return how wide a halo may be: wider than its ball, narrower than its window."""
+    least_px = max(_LEAST_WIDTH_PX, _LEAST_WIDTH_RADII * _radius_px(solution))
+    return least_px, _MOST_WIDTH_SIDES * min(solution.window.image_e.shape)
+
+
+def _widths_px(solution: Solution) -> list[float]:
+    least_px, most_px = _bounds_px(solution)
+    return [least_px * factor for factor in _WIDTHS if least_px * factor <= most_px]
+
+
+def _problem(plain: Solution, known: Solution, width_px: float) -> Problem:
+    """Return the problem of a flare with a halo, of which is hidden what its known image hides."""
+    window = replace(plain.window, structure=joined(plain.window.structure, _halo(known, width_px)))
+    return Problem(window, known.starts, known.background_e, known.motions)
+
+
+def _halo(flare: Solution, width_px: float) -> Structure:
+    """Return the light that a wall close behind a source throws back around its flare.
+
+    A wall at a distance h behind an isotropic source is lit as (1 + ρ²/h²)^(-3/2), ρ from the foot of the
+    source: seen from the front that is a halo of width f h / d, wider than the source's image by h / r. What
+    is behind the source is not seen. A white wall throws back as much as twice the flare's own light, over a
+    hemisphere. The second part is what another width changes.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    (u_px, v_px, _), box, sigma_px = flare.starts[0], flare.window.box, flare.psf_sigma_px
+    rows, columns = np.ogrid[box.top : box.top + box.height, box.left : box.left + box.width]
+    distance2 = (columns - u_px) ** 2 + (rows - v_px) ** 2
+    behind, fine_distance2, covered = _covered(flare)
+
+    def profile(w_px: float) -> Array:
+        image = (1.0 + distance2 / w_px**2) ** -1.5
+        image = gaussian_filter(image, math.hypot(sigma_px, 12**-0.5), mode="nearest")
+        hidden = gaussian_filter((1.0 + fine_distance2 / w_px**2) ** -1.5 * covered, sigma_px * _FINE)
+        across = hidden.shape[1] // _FINE
+        image[behind] -= hidden.reshape(-1, _FINE, across, _FINE).mean(axis=(1, 3))
+        return np.asarray(image / (2.0 * np.pi * w_px**2))
+
+    wider, narrower = (profile(width_px * math.exp(step)) for step in (_STEP, -_STEP))
+    return Structure(
+        np.stack([profile(width_px).ravel(), ((wider - narrower) / (2.0 * _STEP)).ravel()]),
+        np.diag([_HALO_SHARE**-2, _SHAPE_SHARE**-2]) / float(flare.flux_e[0]) ** 2,
+    )
+
+
+def _covered(flare: Solution) -> tuple[tuple[slice, slice], Array, Array]:
+    """Return where in a window a source hides what is behind it, and how much, on parts of pixels.
+
+    The rows and columns; there, on a grid `_FINE` times finer, the square of the distance from the middle of
+    the flare, and what share is hidden: of the time, where it moves.
+    """
+    (u_px, v_px, _), box, radius_px = flare.starts[0], flare.window.box, _radius_px(flare)
+    reach_px = math.ceil(radius_px + 0.5 * flare.most_motion_px + 4.0 * flare.psf_sigma_px) + 1
+    there, offsets = [], []
+    for at_px, first, count in ((v_px, box.top, box.height), (u_px, box.left, box.width)):
+        middle = round(at_px) - first
+        low = min(max(middle - reach_px, 0), count - 1)
+        high = max(min(middle + reach_px + 1, count), low + 1)
+        there.append(slice(low, high))
+        offsets.append(first + (np.arange(low * _FINE, high * _FINE) + 0.5) / _FINE - 0.5 - at_px)
+    down, across = offsets[0][:, None], offsets[1][None, :]
+    motions = [(0.0, 0.0)]
+    if flare.motion_px is not None:
+        motions = [tuple(share * flare.motion_px[0]) for share in np.linspace(-0.45, 0.45, _PLACES)]
+    covered = np.zeros((down.size, across.size))
+    for along_u, along_v in motions:
+        inside_px = radius_px - np.hypot(across - along_u, down - along_v)
+        covered += np.clip(inside_px * _FINE + 0.5, 0.0, 1.0) / len(motions)
+    return (there[0], there[1]), np.asarray(down**2 + across**2), covered
