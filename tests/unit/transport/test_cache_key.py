@@ -9,9 +9,10 @@ import pytest
 import yaml
 
 from nir_render import Scene, load_scene
+from nir_render.scene.documents.shapes import Rectangle
 from nir_render.transport.backend.llvm.choice import choose, cpu_name
 from nir_render.transport.backend.variant import backend
-from nir_render.transport.cache_key import Site, geometry_key, light_key, plan_key, versions
+from nir_render.transport.cache_key import Site, digest, geometry_key, light_key, plan_key, versions
 
 CAMERA = "robots.r1.rig.cameras.c"
 SOURCE = "robots.r2.rig.sources.s"
@@ -288,3 +289,16 @@ def test_a_sky_is_in_the_key_by_its_kind_not_by_its_strength(scene: Scene) -> No
     assert _key(with_it) != _key(scene)
     assert _key(with_it.with_({"beacons.one.position": "[1, 1, 1.1] m"})) != _key(with_it)
     assert _key(with_it.with_({"beacons.one.flux": "1 W"})) == _key(with_it)
+
+
+def test_the_bytes_of_plain_data_stay() -> None:
+    """Random numbers follow from them. Taken from the program before texts and shapes were kept."""
+    shape = {"type": "rectangle", "center": "[1, 2, 3] m", "size": "[4, 5] m", "material": "m"}
+    known = digest(
+        {
+            "shape": Rectangle.model_validate(shape),
+            "plain": ("ä", 1.5, -0.0, None, True, 3, np.int64(7), [np.float64(0.1), ()]),
+            "array": np.arange(6.0).reshape(2, 3),
+        }
+    )
+    assert known == "d17e571fdd14a704e11773de7fed1042af384860081075c59cdf085b3c210ce9"

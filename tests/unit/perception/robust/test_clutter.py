@@ -183,3 +183,35 @@ def test_a_ball_close_before_a_white_wall_is_ranged_as_well_as_it_claims(
     pulls = errors_m / np.array([hit.range_sigma_m for hit in nearest])
     assert abs(np.mean(errors_m)) < 0.003 * range_m
     assert float(np.sqrt(np.mean(np.square(pulls)))) < 1.0 + 4.0 / math.sqrt(50)
+
+
+@pytest.mark.parametrize("place", [(-6.3, -6.3), (-7.6, -7.6)])
+def test_a_disc_that_a_corner_of_the_frame_cuts_is_no_error(place: tuple[float, float]) -> None:
+    """Of 14 px radius, its middle beyond the corner: its window is too small for any halo."""
+    camera = replace(POINT, width_px=256, height_px=192, cx_px=127.5, cy_px=95.5, source_radius_m=0.01)
+    mean_e = expected_e(camera, [(*place, 0.343)], 2e-5, BACKGROUND_E)
+    for hit in perception.detect(expose(mean_e, camera, random(48), 2e-5), camera):
+        assert abs(hit.range_m - 0.343) < 5.0 * hit.range_sigma_m
+
+
+def test_what_moves_before_a_wall_keeps_its_motion() -> None:
+    """Nine balls at 3.4 m, 6 cm before a wall of 80 %, drawn out by 4 px: ranged to 1 %, none lost or divided."""
+    camera, range_m, motion_px = replace(POINT, source_radius_m=0.01), 3.4, 4.0
+    exposure_s = 4e-5 * range_m**2
+    flux_e = camera.range_constant_dn_m2_per_s / camera.system_gain_dn_per_e * exposure_s / range_m**2
+    width_px = camera.fx_px * 0.06 / range_m
+    places, steps = list(cell_centres(3)), 9
+    rows, columns = np.indices((camera.height_px, camera.width_px), dtype=np.float64)
+    mean_e = np.full(rows.shape, BACKGROUND_E)
+    for u_px, v_px in places:
+        fall = (1.0 + ((columns - u_px) ** 2 + (rows - v_px) ** 2) / width_px**2) ** -1.5
+        mean_e += 2.0 * 0.8 * flux_e * fall / (2.0 * math.pi * width_px**2)
+    for step in range(steps):
+        shift_px = motion_px * ((step + 0.5) / steps - 0.5)
+        moved = [(u + shift_px, v, range_m) for u, v in places]
+        mean_e += expected_e(camera, moved, exposure_s) / steps
+        hidden = 1.0 - (1.0 + (camera.fx_px * 0.01 / range_m / width_px) ** 2) ** -0.5
+        mean_e -= 1.6 * hidden * expected_e(camera, moved, exposure_s) / steps
+    hits = perception.detect(expose(mean_e, camera, random(49), exposure_s), camera)
+    assert len(hits) == len(places)
+    assert [hit.range_m for hit in hits] == pytest.approx([range_m] * len(hits), rel=0.01)
