@@ -199,9 +199,7 @@ def _plain_shape(same: Same[ShapeDocument]) -> _Written:
 
 def _of_fields(shape: ShapeDocument, **others: object) -> _Written:
     fields = {name: getattr(shape, name) for name in type(shape).model_fields if name not in _ELSEWHERE}
-    parts: list[bytes] = []
-    _write((type(shape).__name__, fields | others), parts.append)
-    return _Written(b"".join(parts))
+    return _Written(_canonical((type(shape).__name__, fields | others)))
 
 
 def _material(material: MaterialDocument) -> tuple[str, dict[str, Any]]:
@@ -253,9 +251,13 @@ def _versions() -> tuple[str, ...]:
 
 def digest(value: Any) -> str:
     """Return the hash of plain data, arrays and models: 64 hexadecimal digits."""
+    return hashlib.sha256(_canonical(value)).hexdigest()
+
+
+def _canonical(value: Any) -> bytes:
     parts: list[bytes] = []
     _write(value, parts.append)
-    return hashlib.sha256(b"".join(parts)).hexdigest()
+    return b"".join(parts)
 
 
 def _write(value: Any, write: Callable[[bytes], None]) -> None:

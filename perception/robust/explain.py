@@ -67,33 +67,20 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     cut_short: set[int] = set()
     halos: dict[int, Solution] = {}
     plain: list[Solution | None] = [None] * len(found)
+    known = plain
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
         may_be = [one is None or may_be_other_shape(one, camera) for one in plain]
         divisible = [
             one if other or _may_be_several(one) else None for one, other in zip(plain, may_be, strict=True)
         ]
-        halos = with_halo(plain, camera)
+        halos = with_halo(dict(enumerate(plain)), camera)
         parted = _parted(divisible, halos, prepared.shape, camera, cut_short)
         pairs, rivals = eclipses(found, plain, parted, may_be, camera)
         _take_up(pairs, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
-        # Charge that spills along columns makes a flare long, too: a motion must then explain all of it.
-        without = _without_spill(plain, prepared, camera)
-        lines = moving(plain, camera)
-        # What moves before a wall has both.
-        drawn_out = {index: one for index, one in lines.items() if one.motion_px is not None}
-        of_lines = with_halo({index: one for index, one in drawn_out.items() if index in halos}, camera)
-        for index, line in lines.items():
-            spills = index in without and without[index].left_over.share < MOST_LEFT
-            if index in drawn_out and index in halos:
-                rival = of_lines.get(index, line)
-                if halos[index].cost < rival.cost:
-                    halos[index] = weighed(halos[index], rival)
-                    continue
-            if line.motion_px is None or line.left_over.is_good or not spills:
-                chosen[index] = line
-        _drop_beside_lines(chosen, parted, of_lines, prepared.shape, camera, cut_short)
+        known = _take_lines(chosen, plain, halos, _without_spill(plain, prepared, camera), camera)
+        _drop_beside_lines(chosen, parted, halos, prepared.shape, camera, cut_short)
     _retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
@@ -102,8 +89,8 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         for index, more in parted.items()
         if (one := chosen[index]) is not None and more.count > one.count + 1
     }
-    others = [None if one is before else one for one, before in zip(chosen, plain, strict=True)]
-    kept = {index: one for index, one in halos.items() if others[index] is None}
+    others = {index: one for index, one in enumerate(chosen) if one is not known[index]}
+    kept = {index: one for index, one in halos.items() if index not in others}
     for index, one in (kept | with_halo(others, camera)).items():
         chosen[index] = one
         uneven_e[index] = one.left_over.structure_e
@@ -173,6 +160,40 @@ def _beside_rival(one: Solution | None, pair: Solution) -> Solution | None:
     if one.count > 1 and pair.cost < one.cost:
         return replace(weighed(pair, one), is_doubtful=True)
     return weighed(one, pair)
+
+
+def _take_lines(
+    chosen: list[Solution | None],
+    plain: Sequence[Solution | None],
+    halos: dict[int, Solution],
+    without_spill: Mapping[int, Solution],
+    camera: Camera,
+) -> list[Solution | None]:
+    """Choose flares that move where they explain more than flares at rest; both with their halos, if any.
+
+    Charge that spills along columns makes a flare long, too: a motion must then explain all of it. `halos`
+    are those of what is returned: of lines where these were chosen, else of `plain`.
+    """
+    known = list(plain)
+    lines = moving(plain, camera)
+    tried = {index: one for index, one in lines.items() if one.motion_px is not None and index in halos}
+    of_lines = with_halo(tried, camera)
+    for index, line in lines.items():
+        spills = index in without_spill and without_spill[index].left_over.share < MOST_LEFT
+        if index in tried:
+            rival = of_lines.get(index, line)
+            if halos[index].cost < rival.cost:
+                halos[index] = weighed(halos[index], rival)
+                continue
+        if line.motion_px is None or line.left_over.is_good or not spills:
+            chosen[index] = line
+            if index in tried:
+                known[index] = line
+                if index in of_lines:
+                    halos[index] = of_lines[index]
+                else:
+                    del halos[index]
+    return known
 
 
 def _drop_beside_lines(
@@ -261,9 +282,8 @@ def _is_oval(one: Solution, several: Solution, camera: Camera) -> bool:
 
 def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:
     """Tell whether several flares explain all that is seen, each of them seen itself."""
-    left = several.left_over
     hardly_seen = (is_hardly_seen(several, k, shape) for k in range(several.count))
-    return left.is_good and left.structure_e == 0.0 and not any(hardly_seen)
+    return several.left_over.is_nothing and not any(hardly_seen)
 
 
 def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:

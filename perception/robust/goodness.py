@@ -64,6 +64,11 @@ class LeftOver:
         """Whether chance alone may leave so much on the flares."""
         return self.may_be_good(0.0)
 
+    @property
+    def is_nothing(self) -> bool:
+        """Whether chance alone may leave so much, on the flares and around them."""
+        return self.is_good and self.structure_e == 0.0
+
     def may_be_good(self, less_chi2: float) -> bool:
         """Tell whether chance alone may leave so much were χ² less by that."""
         return self.pixels == 0 or _is_likely(self.pixels, self.chi2 - less_chi2)

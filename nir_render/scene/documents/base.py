@@ -131,12 +131,11 @@ class Document(BaseModel):
         if not isinstance(data, Mapping):
             like = f"such as {cls.example}" if cls.example else f"known keys: {', '.join(sorted(known))}"
             raise ValueError(f"{shown(data)} stands where keys with values are wanted, {like}")
-        for key, value in data.items():
-            if key not in known or isinstance(value, _MAY_HOLD_TRUTH):
-                break
-        else:
-            return []
-        found = (_key_problem(key, value, known) for key, value in data.items())
+        found = (
+            _key_problem(key, value, known)
+            for key, value in data.items()
+            if key not in known or isinstance(value, _MAY_HOLD_TRUTH)
+        )
         return [problem for problem in found if problem is not None]
 
 

@@ -51,7 +51,7 @@ def pixels_in_glow(
     """
     rows, columns = labels.middle.shape
     grid = rays.corners[::scale, ::scale]
-    blocks = _unit(grid[:-1, :-1] + grid[:-1, 1:] + grid[1:, :-1] + grid[1:, 1:])
+    blocks = _middles(grid)
     # How near each block's nearest surface is to a source, over what counts as near there.
     nearest = np.full((rows // scale, columns // scale), np.inf)
     for source in snapshot.sources.values():
@@ -64,14 +64,14 @@ def pixels_in_glow(
         corner, right, below = _unit(grid[[row, row, row + 1], [column, column + 1, column]])
         chord = max(float(np.linalg.norm(right - corner)), float(np.linalg.norm(below - corner)))
         block_rad = 2.0 * float(np.arcsin(min(0.5 * chord, 1.0)))
-        reach_rad = radius_rad + (max(_GLOW_BLOCKS, _BESIDE_BLOCKS) + 1.0) * block_rad
+        reach_rad = radius_rad + (_GLOW_BLOCKS + 1.0) * block_rad
         near_row, near_column = np.nonzero(cosine > np.cos(min(reach_rad, np.pi)))
         if not len(near_row):
             continue
         block = np.s_[near_row.min() : near_row.max() + 1, near_column.min() : near_column.max() + 1]
         at = tuple(slice(one.start * scale, one.stop * scale) for one in block)
         corners = rays.corners[at[0].start : at[0].stop + 1, at[1].start : at[1].stop + 1]
-        direction = _unit(corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1] + corners[1:, 1:])
+        direction = _middles(corners)
         nearness_per_m = labels.nearness_per_m[at]
         along_m = 1.0 / np.maximum(nearness_per_m, 1e-12)
         apart_m = np.linalg.norm(direction * along_m[..., None] - offset_m, axis=-1) - radius_m
@@ -89,6 +89,11 @@ def pixels_in_glow(
     is_kept.ravel()[kept] = True
     pixels = np.flatnonzero(np.kron(is_kept, np.ones((scale, scale), dtype=np.bool_)))
     return pixels, (len(glowing) - len(kept)) * scale**2
+
+
+def _middles(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit vectors to the middles of pixels or blocks that have these corners."""
+    return _unit(corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1] + corners[1:, 1:])
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -59,7 +59,7 @@ def deblend(
     asking = [
         index
         for index, each in enumerate(found)
-        if asks_for_more(each) and not (index in beside and _explains_all(beside[index]))
+        if asks_for_more(each) and (index not in beside or _leaves_something(beside[index]))
     ]
     if not asking:
         return found
@@ -89,9 +89,9 @@ def deblend(
     return found
 
 
-def _explains_all(halo: Solution) -> bool:
-    """Tell whether a flare and its halo leave nothing to another flare, nor around them."""
-    return halo.left_over.is_good and halo.left_over.structure_e == 0.0 and not asks_for_more(halo)
+def _leaves_something(halo: Solution) -> bool:
+    """Tell whether a flare and its halo leave something to another flare, or around them."""
+    return not halo.left_over.is_nothing or asks_for_more(halo)
 
 
 def _eased(lone: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:

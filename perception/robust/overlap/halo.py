@@ -1,7 +1,7 @@
 """Flares with a halo: the light that a wall close behind a source throws back around it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -34,9 +34,7 @@ _STEP = 0.1  # in ln width
 _FINE, _PLACES = 4, 10  # parts of a pixel along an axis, and places of what moves
 
 
-def with_halo(
-    best: Sequence[Solution | None] | Mapping[int, Solution], camera: Camera
-) -> dict[int, Solution]:
+def with_halo(flares: Mapping[int, Solution | None], camera: Camera) -> dict[int, Solution]:
     """Fit lone flares again that seem to have a halo.
 
     What a source hides of its halo goes by its size, and that by its range: so they are fitted once more as
@@ -47,8 +45,7 @@ def with_halo(
     By index those that have one, sigmas knowing of other widths of it.
     """
     found: dict[int, Solution] = {}
-    given = best.items() if isinstance(best, Mapping) else enumerate(best)
-    plain = {index: one for index, one in given if one is not None and _seems_to_have_one(one)}
+    plain = {index: one for index, one in flares.items() if one is not None and _seems_to_have_one(one)}
     known = {index: (one, _widths_px(one)) for index, one in plain.items()}
     for factors in _ROUNDS:
         tried = []
