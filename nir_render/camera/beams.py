@@ -103,7 +103,16 @@ def diffuse_electrons(
     Electrons, shape (rows, columns).
     """
     radiance = enlarge(radiance_w_per_m2_sr, camera.sensor.rows, camera.sensor.columns)
-    return radiance * (_collected_per_radiance(camera) * exposure_s) * response_map(camera, emitter, node)
+    electrons = radiance * (_collected_per_radiance(camera) * exposure_s)
+    electrons *= response_map(camera, emitter, node)
+    return electrons
+
+
+def electrons_per_radiance(
+    camera: Camera, emitter: Emitter, exposure_s: float, node: Node = ONE_NODE
+) -> NDArray[np.float64]:
+    """Return what `diffuse_electrons` gives of one W/m²/sr in all pixels, shape (rows, columns)."""
+    return response_map(camera, emitter, node) * (_collected_per_radiance(camera) * exposure_s)
 
 
 def blur(camera: Camera, image_e: NDArray[np.float64]) -> NDArray[np.float64]:

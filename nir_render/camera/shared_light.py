@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.camera.beams import diffuse_electrons
+from nir_render.camera.beams import electrons_per_radiance
 from nir_render.camera.by_spectrum import group_emitters, group_fluxes, spectrum_key
 from nir_render.camera.sensor.read_out import dark_variance_e2
 from nir_render.camera.timing.drive import drive_of
@@ -117,7 +117,7 @@ def _electrons(
     for node in light.nodes:
         key = spectrum_key(emitter), node
         if key not in responses:
-            of_one = diffuse_electrons(camera, np.ones((rows, columns)), emitter, 1.0, node)
+            of_one = electrons_per_radiance(camera, emitter, 1.0, node)
             responses[key] = of_one.reshape(rows, scale, columns, scale).mean(axis=(1, 3)).astype(np.float32)
         found += per_unit[group, node.index] * responses[key]
     return found

@@ -86,6 +86,7 @@ def enlarge_variance(
     columns: int,
     enlargement: Enlargement | None = None,
     patch: Array | None = None,
+    every: int = 1,
 ) -> Array:
     """Return the variance of each pixel of an enlarged image of independent blocks.
 
@@ -93,11 +94,13 @@ def enlarge_variance(
     ----------
     variance, patch
         Of the blocks and of the patch's pixels.
+    every
+        Which rows of the image are wanted: the first, and each so many further down.
     """
     if variance.shape == (rows, columns):
-        return variance
-    sides = zip((rows, columns), variance.shape, strict=True)
-    down, across = (_linear(np.arange(count), count, blocks) for count, blocks in sides)
+        return variance[::every]
+    down = _linear(np.arange(0, rows, every), rows, variance.shape[0])
+    across = _linear(np.arange(columns), columns, variance.shape[1])
     image = _of_pairs(
         np.ascontiguousarray(variance, dtype=np.float64),
         down.indices.reshape(-1, 2),
@@ -106,11 +109,22 @@ def enlarge_variance(
         across.data.reshape(-1, 2) ** 2,
     )
     if enlargement is not None:
-        weights = enlargement.matrix(variance.size)
-        image.ravel()[enlargement.pixels] = weights.multiply(weights) @ variance.ravel()
+        fitted, place = _in_rows(enlargement.pixels, columns, every)
+        weights = enlargement.matrix(variance.size)[fitted]
+        image.ravel()[place] = weights.multiply(weights) @ variance.ravel()
         if patch is not None:
-            image.ravel()[enlargement.patch] = patch
+            rendered, place = _in_rows(enlargement.patch, columns, every)
+            image.ravel()[place] = patch[rendered]
     return image
+
+
+def _in_rows(
+    pixels: NDArray[np.int32], columns: int, every: int
+) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+    """Return which pixels lie in rows 0, `every`, 2 `every`, …, and their numbers in the image of these rows."""
+    kept = pixels // columns % every == 0
+    row, column = np.divmod(pixels[kept], columns)
+    return kept, row // every * columns + column
 
 
 @compiled

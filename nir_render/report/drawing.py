@@ -33,7 +33,9 @@ def sheet(height_in: float) -> Figure:
 def svg_of(figure: Figure) -> str:
     """Return a figure as SVG; the same figure gives the same text."""
     file = io.StringIO()
-    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    # Not `savefig`, which draws all that a layout places twice.
+    canvas = FigureCanvasSVG(figure)
+    canvas.print_svg(file, metadata={"Date": None, "Creator": None})  # type: ignore[no-untyped-call]
     return file.getvalue()
 
 

@@ -25,6 +25,7 @@ from nir_render.geometry import cone_directions, cone_versine, legendre
 _TAIL_SIGMAS = 8.0
 _WAVES_PER_SIGMA = 0.84
 _MOST_RINGS = 128
+_RINGS_OUT_OF_VIEW = 8  # where only the total counts, of a power that is smooth in the angle
 _BEYOND_PX = 64.0
 _SMALL_PX = 40.0  # a disc of which most would be edge
 
@@ -97,9 +98,11 @@ def source_window(
         sigma apart, in images of a radius above 1.8 sigma √(n/π).
     """
     directions, shares = direction[None, :], np.ones(1)
-    is_large = False
+    is_large, out_of_view = False, _is_out_of_view(intrinsics, core, direction, angular_radius_rad)
     if seen is not None:
         directions, shares = seen, np.full(len(seen), 1.0 / len(seen))
+    elif out_of_view:
+        directions, shares = cone_nodes(direction, angular_radius_rad, _RINGS_OUT_OF_VIEW)
     elif angular_radius_rad > 0.0:
         radius_px = intrinsics.image_radius_px(direction, angular_radius_rad)
         rings = _rings(radius_px, _finest_px(core))
@@ -111,7 +114,7 @@ def source_window(
     directions, shares = directions[in_front], shares[in_front]
     power = shares * power_at(directions[:, 2])
     total = float(power.sum())
-    if _is_out_of_view(intrinsics, core, direction, angular_radius_rad):
+    if out_of_view:
         return Window(np.empty((0, 0)), 0, 0, total)
     if is_large:
         disc = Disc(direction, angular_radius_rad, power_at, total, _finest_px(core))

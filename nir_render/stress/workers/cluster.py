@@ -32,6 +32,7 @@ SCHEDULER_SETTINGS = {
     "distributed.scheduler.allowed-failures": DEATHS - 1,
     "distributed.scheduler.worker-saturation": 1.0,  # none waits at a worker, which may end after its job
     "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long
+    "distributed.worker.profile.enabled": False,  # it costs 4 % of a job
 }
 _THREADS = "start workers with '--nthreads 1', and '--nworkers' for more"
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from nir_render.camera.beams import diffuse_electrons
+from nir_render.camera.beams import electrons_per_radiance
 from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
 from nir_render.camera.mean_frame import MeanFrame
 from nir_render.camera.render_noise import temporal_variance_e2
@@ -112,7 +112,7 @@ def _chances(mean: MeanFrame, fluxes: Array, enlargement: Enlargement) -> Array:
     blocks_e = np.zeros(light.indirect.radiance_per_w.shape[2:])
     even = np.ones((enlargement.rows, enlargement.columns))
     for part in by_spectrum(light, mean.rates.snapshot, light.indirect.radiance_per_w, fluxes):
-        per_radiance = diffuse_electrons(mean.camera, even, part.emitter, mean.exposure_s, part.node)
+        per_radiance = electrons_per_radiance(mean.camera, part.emitter, mean.exposure_s, part.node)
         size = blocks_e.shape[::-1]
         blocks_e += part.values * cv2.resize(per_radiance, size, interpolation=cv2.INTER_AREA)
     # By size and by its square: that errors go with these is a guess.
@@ -172,14 +172,13 @@ def _squares(mean: MeanFrame, fluxes: Array, pixels: Numbers, samples: int) -> A
     power = group_power(snapshot, camera)
     wanted = {1: pixels, scale: used}
     renders = rendered_again(snapshot, rays, light.seed, power, wanted, samples, light.wavelengths_m)
-    even = np.ones((camera.sensor.rows, camera.sensor.columns))
     square_e2 = np.ones(len(pixels))
     for radiance_per_w in renders:
         error_e = np.zeros(len(pixels))
         full = by_spectrum(light, snapshot, radiance_per_w[1], fluxes)
         in_blocks = by_spectrum(light, snapshot, radiance_per_w[scale], fluxes)
         for of_pixels, of_blocks in zip(full, in_blocks, strict=True):
-            response = diffuse_electrons(camera, even, of_pixels.emitter, mean.exposure_s, of_pixels.node)
+            response = electrons_per_radiance(camera, of_pixels.emitter, mean.exposure_s, of_pixels.node)
             error_e += response.ravel()[pixels] * (weights @ of_blocks.values - of_pixels.values)
         square_e2 *= error_e
     return square_e2
