@@ -121,7 +121,7 @@ def enlarge_variance(
 def _in_rows(
     pixels: NDArray[np.int32], columns: int, every: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
-    """Return which pixels lie in rows 0, `every`, 2 `every`, …, and their numbers in the image of these rows."""
+    """Return which pixels lie in each `every`th row, and their numbers in the image of these rows."""
     kept = pixels // columns % every == 0
     row, column = np.divmod(pixels[kept], columns)
     return kept, row // every * columns + column

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from nir_render.scene.text.units import short_number
 from nir_render.stress.crossings import Edge, Span
 from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import METRICS, Bound
@@ -172,10 +173,10 @@ def _place_text(threat: Axis, edge: Edge) -> str:
         return f"{text} (beyond it nothing that could be judged)"
     if edge.low is not None and edge.high is not None:
         first, last = edge.within or (edge.low, edge.high)
-        low = f"{edge.low:.3g}" if math.isfinite(edge.low) else f"below {first:.3g}"
-        high = f"{edge.high:.3g}" if math.isfinite(edge.high) else f"beyond {last:.3g}"
+        low = short_number(edge.low, 3) if math.isfinite(edge.low) else f"below {short_number(first, 3)}"
+        high = short_number(edge.high, 3) if math.isfinite(edge.high) else f"beyond {short_number(last, 3)}"
         if low != high:
             return f"{text} ({low}–{high})"
     if between is None:
         return text
-    return f"about {text} (between {between[0]:.3g} and {number_text(threat, between[1])})"
+    return f"about {text} (between {short_number(between[0], 3)} and {number_text(threat, between[1])})"

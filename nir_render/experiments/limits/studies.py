@@ -53,10 +53,10 @@ STUDIES = (
         worst_is_high=True,
         expected=(
             "a source at h before a matt wall of reflectance ρ throws 2ρ of its own signal back at who "
-            "looks, 1 − h/√(h² + R²) of it from within R of its foot. How much of that a fit takes for the "
-            "flare depends on what it takes for ground: for R = 1.5 cm (2.4 px at 3 m), at h = 5 cm and ρ = "
-            "0.85, it is 7 % of the flux, a range 3.6 % short. It falls by h², and grows by the square of "
-            "the range. Power and exposure scale both alike, and win nothing."
+            "looks, 1 − h/√(h² + R²) of it from within R of its foot. What takes that light for the "
+            "source's own, for R = 1.5 cm (2.4 px at 3 m), at h = 5 cm and ρ = 0.85, has 7 % more flux, a "
+            "range 3.6 % short; robust fits it as a halo of the flare. It falls by h², and grows by the "
+            "square of the range. Power and exposure scale both alike, and win nothing."
         ),
     ),
     Study(

@@ -196,6 +196,12 @@ def format_quantity(value: float, quantity: Quantity) -> str:
     return f"{value!r} {quantity.unit}".rstrip()
 
 
+def short_number(number: float, digits: int = 4) -> str:
+    """Write a number with so many digits, below a million without a power of ten: 0.0512, 14000."""
+    text = f"{number:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(number) < 1e6 else text
+
+
 def format_in_unit_of(text: object, value: float) -> str:
     """Write a value, in the unit that the program computes in, in the unit of a text such as "100 deg".
 

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from nir_render.errors import shown
 from nir_render.scene.documents.base import Document, KeyProblem
-from nir_render.scene.text.units import Reading, read_quantity
+from nir_render.scene.text.units import Reading, read_quantity, short_number
 from nir_render.stress.design.draws import Distribution, drawn_units
 
 MOST_VALUES = 1000
@@ -268,7 +268,7 @@ class AxisDocument(Document):
         readings = [read_quantity(written_value(edge, first.unit)) for edge in edges]
         return replace(
             shown,
-            labels=tuple(f"{low:.4g} to {high:.4g} {first.unit}".rstrip() for low, high in pairs),
+            labels=tuple(f"{short_number(a)} to {short_number(b)} {first.unit}".rstrip() for a, b in pairs),
             log=by_ratio,
             edges=tuple(edges),
             edges_si=tuple(reading.value_si for reading in readings if reading is not None),
@@ -368,7 +368,7 @@ def without_added(axis: Axis) -> Axis:
 
 def _number_labels(numbers: Sequence[float], unit: str) -> tuple[str, ...]:
     """Return how numbers are called: four digits where these tell them apart, else all."""
-    labels = tuple(f"{number:.4g} {unit}".rstrip() for number in numbers)
+    labels = tuple(f"{short_number(number)} {unit}".rstrip() for number in numbers)
     if len(set(labels)) != len(labels):
         labels = tuple(f"{number!r} {unit}".rstrip() for number in numbers)
     return labels

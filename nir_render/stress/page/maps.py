@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nir_render.report.drawing import ratio_ticks, sheet, short, svg_of
 from nir_render.report.style import BAD, FAINT, INK, MATPLOTLIB, PANEL, look
+from nir_render.scene.text.units import short_number
 from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import Metric, Values
 from nir_render.stress.page.words import marked_unit, metric_text, tick_text
@@ -131,7 +132,8 @@ def _labels(panel: Axes, along: Axis, down: Axis) -> None:
         size = len(axis.labels)
         chosen = np.unique(np.linspace(0, size - 1, min(size, _MOST_WRITTEN)).round().astype(int))
         labels = [
-            short(axis.labels[i], 12) if axis.numbers is None else f"{axis.numbers[i]:.3g}" for i in chosen
+            short(axis.labels[i], 12) if axis.numbers is None else short_number(axis.numbers[i], 3)
+            for i in chosen
         ]
         side.set_ticks(chosen.tolist(), labels, fontsize=8)
         side.set_tick_params(length=0)

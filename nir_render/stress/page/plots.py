@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nir_render.report.drawing import ratio_ticks, rounded_up, sheet, short, svg_of, symmetric_log
 from nir_render.report.style import BAD, LIMIT, MATPLOTLIB, look
+from nir_render.scene.text.units import short_number
 from nir_render.stress.bootstrap import AlongAxis
 from nir_render.stress.design.axes import Axis
 from nir_render.stress.metrics import Metric, Values
@@ -133,7 +134,9 @@ def _ticks_x(panel: Axes, axis: Axis, x: Values, points: Sequence[Point], metric
     labels = []
     for i in chosen:
         label = (
-            short(axis.labels[i], 14) if axis.numbers is None else f"{axis.numbers[i]:.3g}".replace("-", "−")
+            short(axis.labels[i], 14)
+            if axis.numbers is None
+            else short_number(axis.numbers[i], 3).replace("-", "−")
         )
         point = points[i]
         of = (

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pyarrow as pa
 
 from nir_render.report.wording import counted, metres, share, significant
-from nir_render.scene.text.units import ANGLE, LENGTH
+from nir_render.scene.text.units import ANGLE, LENGTH, short_number
 from nir_render.stress.campaign import Campaign
 from nir_render.stress.crossings import Edge, Span
 from nir_render.stress.design.axes import Axis
@@ -56,7 +56,7 @@ def bound_text(bound: Bound) -> str:
 
 def number_text(axis: Axis, value: float) -> str:
     """Write a place on an axis, with its unit."""
-    return f"{value:.3g} {axis.unit}".rstrip().replace("-", "−")
+    return f"{short_number(value, 3)} {axis.unit}".rstrip().replace("-", "−")
 
 
 def extent_text(axis: Axis, extent: Extent) -> str:
@@ -133,8 +133,8 @@ def _edge_text(axis: Axis, edge: Edge, where: str) -> str:
     numbers = axis.numbers or ()
     if edge.low is not None and edge.high is not None:
         first, last = edge.within or (numbers[0], numbers[-1])
-        low = f"{edge.low:.3g}" if math.isfinite(edge.low) else f"below {first:.3g}"
-        high = f"{edge.high:.3g}" if math.isfinite(edge.high) else f"beyond {last:.3g}"
+        low = short_number(edge.low, 3) if math.isfinite(edge.low) else f"below {short_number(first, 3)}"
+        high = short_number(edge.high, 3) if math.isfinite(edge.high) else f"beyond {short_number(last, 3)}"
         # Repetitions that agree on what is printed tell of the few that there are, not of how sure it is.
         if low != high:
             return f"{text} ({low}–{high})".replace("-", "−")
