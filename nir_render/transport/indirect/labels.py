@@ -16,6 +16,7 @@ from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import Interaction, Mask, UInt
 from nir_render.transport.world.emitters import RECTANGLE
 from nir_render.transport.world.facets import PANE
+from perception.compiled import compiled
 
 _PLACES = 32  # in a pixel where labels meet
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
@@ -38,22 +39,51 @@ def labels_of(built: DeviceScene, origin_m: NDArray[np.float64], corners: NDArra
     middle, nearness_per_m = _view_key(built, origin_m, middles.reshape(-1, 3))
     edge = np.flatnonzero(_has_other_neighbour(middle.reshape(rows, columns)))
     fine, _ = _view_key(built, origin_m, _directions(small, edge))
-    keys, first, label = np.unique(
-        np.concatenate([np.zeros(1, np.int64), middle, fine]), return_index=True, return_inverse=True
-    )
     # Numbered by where they are first seen: Mitsuba's own numbers change from one scene built to the next.
-    rank = np.empty(len(keys), dtype=np.int32)
-    rank[np.argsort(first)] = np.arange(len(keys))
-    labels: NDArray[np.int32] = rank[label.ravel()]
-    shining = np.empty(len(keys), dtype=bool)
-    shining[rank] = _shows_lamp(built, keys)
+    labels, keys = _numbered(np.concatenate([np.zeros(1, np.int64), middle, fine]))
     return Labels(
         middle=labels[1 : 1 + rows * columns].reshape(rows, columns),
         edge=edge,
         within=labels[1 + rows * columns :].reshape(edge.size, _PLACES),
         nearness_per_m=nearness_per_m.reshape(rows, columns),
-        shining=shining,
+        shining=_shows_lamp(built, keys),
     )
+
+
+@compiled
+def _numbered(keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Give keys, none below 0, numbers by where they are first seen; return these, and the key of each."""
+    labels = np.empty(len(keys), dtype=np.int32)
+    # A table of twice as many places as there may be keys; each is at the first free one from its own.
+    size = 256
+    at, seen, known = np.full(size, -1, dtype=np.int32), np.empty(size // 2, dtype=np.int64), 0
+    for one in range(len(keys)):
+        key = keys[one]
+        if one > 0 and key == keys[one - 1]:
+            labels[one] = labels[one - 1]
+            continue
+        if known == size // 2:
+            size *= 2
+            at, larger = np.full(size, -1, dtype=np.int32), np.empty(size // 2, dtype=np.int64)
+            larger[:known] = seen
+            seen = larger
+            for number in range(known):
+                at[_place(seen[number], at, seen)] = number
+        place = _place(key, at, seen)
+        if at[place] < 0:
+            at[place], seen[known] = known, key
+            known += 1
+        labels[one] = at[place]
+    return labels, seen[:known].copy()
+
+
+@compiled
+def _place(key: int, at: NDArray[np.int32], seen: NDArray[np.int64]) -> int:
+    """Return where in a table a key is, or belongs."""
+    place = (key ^ (key >> 17)) * 40503 & (len(at) - 1)
+    while at[place] >= 0 and seen[at[place]] != key:
+        place = (place + 1) & (len(at) - 1)
+    return place
 
 
 def _directions(corners: NDArray[np.float32], pixels: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -95,20 +125,22 @@ def _view_key(
     si = built.bodies.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
     shape, part = _shape_part(si)
     box = dr.gather(mi.Bool, surfaces.box_of_shape, shape, si.is_valid())
-    facet = dr.gather(mi.Int32, surfaces.facet_of_shape, shape, si.is_valid())
-    flat = si.is_valid() & (facet >= 0)
     parts = [dr.select(box, part + (si.prim_index >> 1), part)]
-    if bool(dr.any(flat)):
+    if surfaces.facet_count:
+        facet = dr.gather(mi.Int32, surfaces.facet_of_shape, shape, si.is_valid())
+        flat = si.is_valid() & (facet >= 0)
         turned = direction - 2.0 * dr.dot(direction, si.n) * si.n
         parts.append(_part_along(built, si.spawn_ray(turned), flat))
-    if surfaces.pane_count:
-        kind = dr.gather(mi.UInt32, surfaces.kind, mi.UInt32(dr.maximum(facet, 0)), flat)
-        parts.append(_part_along(built, si.spawn_ray(direction), flat & (kind == PANE)))
-    base = _key_base(built)
-    key = np.zeros(len(directions), dtype=np.int64)
-    for position, part in enumerate(parts):
-        key += np.array(part, dtype=np.int64) * base**position
-    return key, np.array(dr.select(si.is_valid(), 1.0 / si.t, 0.0))
+        if surfaces.pane_count:
+            kind = dr.gather(mi.UInt32, surfaces.kind, mi.UInt32(dr.maximum(facet, 0)), flat)
+            parts.append(_part_along(built, si.spawn_ray(direction), flat & (kind == PANE)))
+    base = dr.opaque(mi.Int64, _key_base(built))
+    key = mi.Int64(0)
+    for part in reversed(parts):
+        key = key * base + mi.Int64(part)
+    nearness_per_m = dr.select(si.is_valid(), 1.0 / si.t, 0.0)
+    dr.eval(key, nearness_per_m)  # at once: each alone would trace the rays again
+    return np.array(key), np.array(nearness_per_m)
 
 
 def _part_along(built: DeviceScene, ray: Any, active: Mask) -> UInt:

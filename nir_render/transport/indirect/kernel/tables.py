@@ -69,6 +69,7 @@ class Surfaces:
     factor: Float
     transmission: Float
     two_sided: Mask
+    facet_count: int
     panes: UInt  # facets that are panes
     pane_count: int
     light_of_shape: Int  # the light whose body a shape is, −1 for none
@@ -220,6 +221,7 @@ def upload_surfaces(facets: Facets, shapes: dict[str, NDArray[np.int64]]) -> Sur
         factor=_real(facets.factor),
         transmission=_real(facets.transmission),
         two_sided=mi.Bool(np.append(facets.two_sided, False)),
+        facet_count=len(facets.kind),
         panes=_whole(panes),
         pane_count=len(panes),
         light_of_shape=mi.Int32(shapes["light"].astype(np.int32)),
