@@ -13,6 +13,14 @@ import yaml
 NUMBERS = (b"0", b"-1", b"1e300", b"nan", b"inf", b"-inf", b"1e999", b"7", b"-7", b"9" * 400, b"x", b"", b"1/2", b"0x10",
            b"4294967295", b"4294967296", b"2147483648", b"1e-300", b"/", b"1//1", b"\xff\xfe", b"1,2,3")  # fmt: skip
 
+_XML = """<scene version="3.0.0"><default name="wide" value="0.3"/><bsdf type="diffuse" id="paint"/>
+<shape type="cube"><transform name="to_world"><scale value="$wide"/><rotate z="1" angle="30"/>
+<translate x="0.1" y="2"/></transform><ref id="paint"/></shape>
+<shape type="sphere"><point name="center" x="1" y="0" z="0.5"/><float name="radius" value="0.2"/></shape>
+<shape type="shapegroup" id="g"><shape type="disk"/></shape><shape type="instance"><ref id="g"/>
+<transform name="to_world"><lookat origin="0, 0, 1" target="1, 0, 0" up="0, 0, 1"/></transform></shape></scene>
+"""
+
 
 def good_files() -> Mapping[str, bytes]:
     """Return what is whole, by name."""
@@ -42,6 +50,7 @@ def good_files() -> Mapping[str, bytes]:
         "mesh.stl": box.export(file_type="stl"),
         "text.stl": str(trimesh.exchange.stl.export_stl_ascii(box)).encode(),
         "mesh.glb": box.export(file_type="glb"),
+        "scene.xml": _XML.encode(),
         "grey8.png": cv2.imencode(".png", grey8)[1].tobytes(),
         "grey16.png": cv2.imencode(".png", grey16)[1].tobytes(),
         "curve.csv": curve.encode(),

@@ -17,6 +17,7 @@ from nir_render.light.light import Light
 from nir_render.regress.following import Following
 from nir_render.scene.documents.materials import texture_of
 from nir_render.scene.documents.shapes import Mesh
+from nir_render.scene.meshes.read import files_of_mesh
 from nir_render.scene.scene import Scene
 from nir_render.transport.fingerprint import code_hash, package_versions
 from perception.types import Calibration, Detection, RawFrame
@@ -117,19 +118,20 @@ def document_of(scene: Scene) -> dict[str, Any]:
     data = scene.document.model_dump(mode="json", by_alias=True, exclude_none=True)
     for name, shape in scene.document.shapes.items():
         if isinstance(shape, Mesh):
-            data["shapes"][name] |= _told_file(scene, "file", shape.file)
+            data["shapes"][name] |= _told_file(scene, "file", *files_of_mesh(shape.file))
     for name, material in scene.document.materials.items():
         texture = texture_of(material)
         if texture is not None:
-            data["materials"][name]["reflectance"] |= _told_file(scene, "texture", texture.texture)
+            data["materials"][name]["reflectance"] |= _told_file(scene, "texture", Path(texture.texture))
     return data
 
 
-def _told_file(scene: Scene, key: str, name: str) -> dict[str, str]:
-    file = Path(name)
+def _told_file(scene: Scene, key: str, file: Path, *parts: Path) -> dict[str, str]:
+    """Return a file's name, and the hash of what it and the files that it is read from hold."""
+    contents = b"".join(one.read_bytes() for one in (file, *parts))
     return {
         key: Path(os.path.relpath(file, scene.folder)).as_posix(),
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "sha256": hashlib.sha256(contents).hexdigest(),
     }
 
 

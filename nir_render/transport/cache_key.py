@@ -35,6 +35,7 @@ from nir_render.scene.documents.matter.texture import TextureDocument
 from nir_render.scene.documents.shapes import Mesh, ShapeDocument
 from nir_render.scene.documents.times.drives import FULL_DRIVE
 from nir_render.scene.emission import Emitter
+from nir_render.scene.meshes.read import files_of_mesh
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import PlacedCamera, Snapshot
 from nir_render.transport.backend.llvm.choice import cpu_name
@@ -188,7 +189,8 @@ class _Written:
 def _shape(shape: ShapeDocument) -> _Written:
     """Return a shape without the name of its material, and a mesh by what its file holds."""
     if isinstance(shape, Mesh):
-        return _of_fields(shape, file=_file(shape.file))
+        files = tuple(_file(str(file)) for file in files_of_mesh(shape.file))
+        return _of_fields(shape, file=files[0] if len(files) == 1 else files)
     return _plain_shape(Same(shape))
 
 

@@ -91,10 +91,10 @@ class Cylinder(_Shape):
 
 
 class Mesh(_Shape):
-    """A triangle mesh from a PLY, OBJ, STL or glTF file, in metres once scaled, turned and moved.
+    """A mesh from a PLY, OBJ, STL or glTF file, or the shapes of a Mitsuba scene, in metres once scaled.
 
-    Slots, the names of materials in OBJ and glTF files, may have `materials` of their own; `material` is that
-    of all others. `up` is the file's axis that stands upright: y for glTF, z for all others where not said.
+    Slots, the names of materials in the file, may have `materials` of their own; `material` is that of all
+    others. `up` is the file's axis that stands upright: y for glTF, z for all others where not said.
     Flat triangles stay flat; where the file has normals the surface is shaded as they say.
     """
 

@@ -76,6 +76,51 @@ def checked(part: MeshPart) -> MeshPart:
     return MeshPart(part.slot, part.vertices, normals, part.faces[has_area], part.uvs)
 
 
+def moved(part: MeshPart, to_world: Array) -> MeshPart:
+    """Return a part where an affine transform, shape (4, 4), takes it; mirrored it still looks outwards."""
+    if np.array_equal(to_world, np.eye(4)):
+        return part
+    linear = to_world[:3, :3]
+    return MeshPart(
+        part.slot,
+        part.vertices @ linear.T + to_world[:3, 3],
+        None if part.normals is None else part.normals @ np.linalg.inv(linear),
+        part.faces[:, ::-1] if np.linalg.det(linear) < 0.0 else part.faces,
+        part.uvs,
+    )
+
+
+def with_flat_normals(part: MeshPart) -> MeshPart:
+    """Return a part whose triangles have corners and normals of their own; those of no area are left out."""
+    doubled = _doubled_areas(part.vertices, part.faces)
+    size = np.linalg.norm(doubled, axis=1)
+    faces = part.faces[size > 0.0]
+    return MeshPart(
+        part.slot,
+        part.vertices[faces].reshape(-1, 3),
+        np.repeat(doubled[size > 0.0] / size[size > 0.0, None], 3, axis=0),
+        np.arange(faces.size, dtype=np.uint32).reshape(-1, 3),
+        None if part.uvs is None else part.uvs[faces].reshape(-1, 2),
+    )
+
+
+def joined(slot: str, parts: Sequence[MeshPart]) -> MeshPart:
+    """Return pieces of one slot as one; flat where any of them is, without uvs where any has none."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return MeshPart(
+        slot,
+        np.concatenate([part.vertices for part in parts]),
+        _of_all([part.normals for part in parts]),
+        np.concatenate([part.faces + np.uint32(at) for part, at in zip(parts, first, strict=False)]),
+        _of_all([part.uvs for part in parts]),
+    )
+
+
+def _of_all(values: Sequence[Array | None]) -> Array | None:
+    given = [one for one in values if one is not None]
+    return np.concatenate(given) if len(given) == len(values) else None
+
+
 def lies_open(parts: Sequence[MeshPart]) -> str | None:
     """Return why parts together have no inside: edges of one triangle alone, faces that look inwards."""
     corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])

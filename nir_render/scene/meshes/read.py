@@ -1,7 +1,7 @@
-"""A mesh file, of PLY, OBJ, STL or glTF, becomes parts of one material each; damaged ones are refused.
+"""A mesh file (PLY, OBJ, STL, glTF, Mitsuba's XML) becomes parts of one material each, or is refused.
 
-OBJ is read here, as errors name their line and slots are needed without a file of materials; the others by
-trimesh. glTF stands with y up by its standard, the others as `up` says.
+OBJ and XML are read here, as errors name their line and slots are needed without a file of materials; the
+others by trimesh. glTF stands with y up by its standard, the others as `up` says.
 """
 
 import io
@@ -13,10 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nir_render.scene.meshes.mesh import Array, MeshPart, checked
+from nir_render.scene.meshes.mesh import Array, MeshPart, checked, joined, moved
+from nir_render.scene.meshes.mitsuba_xml import files_named, read_mitsuba_xml
 from nir_render.scene.meshes.obj import read_obj
 
-SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf")
+SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".xml")
 _MOST_BYTES = 256 * 2**20
 _UNNAMED = ""
 
@@ -31,7 +32,29 @@ def read_mesh(file: str | Path, up: Up | None = None) -> tuple[MeshPart, ...]:
     ValueError
         It is no such file, it is damaged, or it is too large; it says what is wrong, and where.
     """
+    return _read(str(file), up, tuple(map(_state, files_of_mesh(file))))
+
+
+def files_of_mesh(file: str | Path) -> tuple[Path, ...]:
+    """Return the files that a mesh is read from, itself first: a Mitsuba scene names others.
+
+    Raises
+    ------
+    ValueError
+        It cannot be read, or a file that it names is not there.
+    """
     path = Path(file)
+    if _kind(path) != "xml":
+        return (path,)
+    _state(path)
+    try:
+        return files_named(path)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _state(path: Path) -> tuple[str, int, int]:
+    """Return by what a file is known while it does not change."""
     try:
         state = path.stat()
     except OSError as error:
@@ -40,15 +63,20 @@ def read_mesh(file: str | Path, up: Up | None = None) -> tuple[MeshPart, ...]:
         raise ValueError(
             f"{path}: has {state.st_size >> 20} MiB, at most {_MOST_BYTES >> 20} are read; simplify it"
         )
-    return _read(str(path), up, state.st_mtime_ns, state.st_size)
+    return str(path), state.st_mtime_ns, state.st_size
+
+
+def _kind(path: Path) -> str:
+    return path.suffix.lower().removeprefix(".")
 
 
 @lru_cache(maxsize=16)
-def _read(file: str, up: Up | None, _changed_ns: int, _size: int) -> tuple[MeshPart, ...]:
+def _read(file: str, up: Up | None, _states: tuple[tuple[str, int, int], ...]) -> tuple[MeshPart, ...]:
     path = Path(file)
-    kind = path.suffix.lower().removeprefix(".")
+    kind = _kind(path)
     try:
-        parts = [checked(part) for part in _parts(path.read_bytes(), kind)]
+        found = read_mitsuba_xml(path, _parts_of) if kind == "xml" else _parts_of(path)
+        parts = [checked(part) for part in found]
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
@@ -60,7 +88,8 @@ def _read(file: str, up: Up | None, _changed_ns: int, _size: int) -> tuple[MeshP
     return tuple(parts)
 
 
-def _parts(data: bytes, kind: str) -> list[MeshPart]:
+def _parts_of(path: Path) -> list[MeshPart]:
+    data, kind = path.read_bytes(), _kind(path)
     if kind == "obj":
         if b"\0" in data:
             raise ValueError("this is no text, and so no OBJ file; export the mesh again")
@@ -109,7 +138,7 @@ def _read_gltf(data: bytes, kind: str) -> list[MeshPart]:
         material = getattr(found.get("visual"), "material", None)
         slot = str(getattr(material, "name", None) or _UNNAMED)
         slots.setdefault(slot, []).append(_part(found, slot, np.asarray(to_world, dtype=np.float64)))
-    return [_joined(slot, parts) for slot, parts in slots.items()]
+    return [joined(slot, parts) for slot, parts in slots.items()]
 
 
 def _part(found: dict[str, Any], slot: str, to_world: Array) -> MeshPart:
@@ -119,37 +148,15 @@ def _part(found: dict[str, Any], slot: str, to_world: Array) -> MeshPart:
     if faces.size and (faces.min() < 0 or faces.max() >= 2**32):
         raise ValueError(f"a triangle wants vertex {int(faces.min())}")
     vertices = np.asarray(found["vertices"], dtype=np.float64).reshape(-1, 3)
-    normals = found.get("vertex_normals")
-    linear = to_world[:3, :3]
-    if np.linalg.det(linear) < 0.0:  # a mirrored copy
-        faces = faces[:, ::-1]
-    if normals is not None and not np.array_equal(to_world, np.eye(4)):
-        normals = np.asarray(normals, dtype=np.float64) @ np.linalg.inv(linear)
-    uvs = getattr(found.get("visual"), "uv", None)
-    return MeshPart(
+    normals, uvs = found.get("vertex_normals"), getattr(found.get("visual"), "uv", None)
+    part = MeshPart(
         slot,
-        vertices @ linear.T + to_world[:3, 3],
+        vertices,
         None if normals is None or len(normals) != len(vertices) else np.asarray(normals, dtype=np.float64),
         faces.astype(np.uint32),
         None if uvs is None or np.shape(uvs) != (len(vertices), 2) else np.asarray(uvs, dtype=np.float64),
     )
-
-
-def _joined(slot: str, parts: list[MeshPart]) -> MeshPart:
-    """Return pieces of one slot as one; flat where any of them is, without uvs where any has none."""
-    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    return MeshPart(
-        slot,
-        np.concatenate([part.vertices for part in parts]),
-        _of_all([part.normals for part in parts]),
-        np.concatenate([part.faces + np.uint32(at) for part, at in zip(parts, first, strict=False)]),
-        _of_all([part.uvs for part in parts]),
-    )
-
-
-def _of_all(values: list[Array | None]) -> Array | None:
-    given = [one for one in values if one is not None]
-    return np.concatenate(given) if len(given) == len(values) else None
+    return moved(part, to_world)
 
 
 def _stood_up(part: MeshPart) -> MeshPart:
