@@ -103,7 +103,7 @@ def diffuse_electrons(
     Electrons, shape (rows, columns).
     """
     radiance = enlarge(radiance_w_per_m2_sr, camera.sensor.rows, camera.sensor.columns)
-    electrons = radiance * (_collected_per_radiance(camera) * exposure_s)
+    electrons = np.multiply(radiance, _collected_per_radiance(camera) * exposure_s, dtype=np.float64)
     electrons *= response_map(camera, emitter, node)
     return electrons
 

@@ -35,7 +35,8 @@ _TINY_E2 = 1e-12  # a noiseless sensor in the dark has no noise to compare with
 _NEARLY_ALL = 0.99
 _PIXELS_DRAWN = 2_000_000
 _MOST_DRAWS = 64
-_ROWS_LEFT_OUT = 6  # of the median that is only to be told
+_ROW_STEP, _LEAST_PIXELS = 7, 1000  # of a median that is only to be told
+_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -92,15 +93,20 @@ def render_noise(mean: MeanFrame) -> RenderNoise:
 
 
 def share_of_target(mean: MeanFrame) -> float:
-    """Return what `render.noise` bounds: the larger of the median's and the apertures' share (`RenderNoise`).
+    """Return an estimate of what `render.noise` bounds: the larger of the median's and the apertures' share.
 
-    The median is that of every seventh row, which costs a tenth of `render_noise`. Rows are drawn at all
-    places within blocks, as pixels near a block's centre have more of its noise.
+    The median is that of every seventh row, a tenth of the work of `render_noise`, whose own is within some
+    percent of it. They lie at all places within blocks, as pixels near a block's centre have more of its
+    noise. Where few of their pixels have any, all rows are looked at.
     """
-    every = _ROWS_LEFT_OUT + 1
-    while mean.light.indirect is not None and math.gcd(every, mean.light.indirect.scale) > 1:
-        every += 1
-    frame = _Frame.of(mean, every)
+    if mean.light.indirect is None:
+        return 0.0
+    step = _ROW_STEP
+    while math.gcd(step, mean.light.indirect.scale) > 1:
+        step += 1
+    frame = _Frame.of(mean, slice(step // 2, None, step))
+    if frame is None or np.count_nonzero(frame.reached) < _LEAST_PIXELS:
+        frame = _Frame.of(mean)
     return 0.0 if frame is None else max(_median(frame.share), frame.aperture_share())
 
 
@@ -108,39 +114,39 @@ def share_of_target(mean: MeanFrame) -> float:
 class _Frame:
     """Variances of rendering and of the sensor in a frame, and where rendering has any.
 
-    `noise_e2` and `reached` are of each `every`th row, `sensor_e2` of all, shape (rows, columns).
+    `noise_e2` and `reached` are of the chosen rows, `sensor_e2` of all, shape (rows, columns).
     """
 
     mean: MeanFrame
-    every: int
+    chosen: slice
     noise_e2: Array
     sensor_e2: Array
     reached: NDArray[np.bool_]
     squares_s2: Array
 
     @classmethod
-    def of(cls, mean: MeanFrame, every: int = 1) -> "_Frame | None":
+    def of(cls, mean: MeanFrame, chosen: slice = _ALL) -> "_Frame | None":
         """Return those of a frame; None where rendering has no noise."""
         if mean.light.indirect is None:
             return None
         # Light is linear in the exposure, and in what the row of pixels collects of each drive.
         squares_s2 = (mean.profiles * mean.exposure_s) ** 2
-        of_pixels_e2 = _variance_per_s2(mean.rates, every).of_pixels_e2
-        noise_e2 = np.einsum("dr,drc->rc", squares_s2[:, ::every], of_pixels_e2)
+        of_pixels_e2 = _variance_per_s2(mean.rates, chosen).of_pixels_e2
+        noise_e2 = np.einsum("dr,drc->rc", squares_s2[:, chosen], of_pixels_e2)
         reached = noise_e2 > 0.0
         if not reached.any():
             return None
-        return cls(mean, every, noise_e2, temporal_variance_e2(mean), reached, squares_s2)
+        return cls(mean, chosen, noise_e2, temporal_variance_e2(mean), reached, squares_s2)
 
     @cached_property
     def share(self) -> Array:
         """The share of pixels with noise, shape (pixels,)."""
-        share: Array = self.noise_e2 / self.sensor_e2[:: self.every]
+        share: Array = self.noise_e2 / self.sensor_e2[self.chosen]
         return share.ravel() if self.reached.all() else share[self.reached]
 
     def aperture_share(self) -> float:
         """Return the largest share of the sum over a flare's aperture."""
-        of_apertures_e2 = _variance_per_s2(self.mean.rates, self.every).of_apertures_e2
+        of_apertures_e2 = _variance_per_s2(self.mean.rates, self.chosen).of_apertures_e2
         apertures = flare_apertures(self.mean.light, self.mean.camera)
         shares = [
             float(_mean_over_rows(one, self.squares_s2) @ noise) / one.sum(self.sensor_e2)
@@ -174,16 +180,16 @@ class _Variance:
     of_apertures_e2: Array
 
 
-def _variance_per_s2(rates: Rates, every: int) -> _Variance:
-    """Return the variance of rates in each `every`th row, kept with them."""
-    name = f"render_variance_{every}"
+def _variance_per_s2(rates: Rates, chosen: slice) -> _Variance:
+    """Return the variance of rates in chosen rows, kept with them."""
+    name = f"render_variance {chosen}"
     kept: _Variance | None = rates.kept.get(name)
     if kept is None:
-        kept = rates.kept[name] = _variance_of(rates, every)
+        kept = rates.kept[name] = _variance_of(rates, chosen)
     return kept
 
 
-def _variance_of(rates: Rates, every: int) -> _Variance:
+def _variance_of(rates: Rates, chosen: slice) -> _Variance:
     light, apertures = rates.light, flare_apertures(rates.light, rates.camera)
     if rates.between:
         between = [
@@ -196,7 +202,7 @@ def _variance_of(rates: Rates, every: int) -> _Variance:
         return _Variance(
             np.sum(
                 [
-                    np.float32(weight**2) * _variance_per_s2(one, every).of_pixels_e2
+                    np.float32(weight**2) * _variance_per_s2(one, chosen).of_pixels_e2
                     for weight, one in rates.between
                 ],
                 axis=0,
@@ -206,7 +212,7 @@ def _variance_of(rates: Rates, every: int) -> _Variance:
     of_pixels, of_apertures = [], []
     for of_drive in _levels(rates):  # one at a time: each is as large as some frames
         parts = _variances(light, rates.snapshot, 1.0, of_drive)
-        of_pixels.append(_of_pixels_e2(light, rates.camera, parts, every).astype(np.float32))
+        of_pixels.append(_of_pixels_e2(light, rates.camera, parts, chosen).astype(np.float32))
         of_apertures.append(_of_apertures_e2(light, rates.camera, parts, apertures))
     return _Variance(np.stack(of_pixels), np.stack(of_apertures))
 
@@ -275,12 +281,12 @@ def render_variance_e2(
     return _of_pixels_e2(light, camera, _variances(light, snapshot, exposure_s, levels))
 
 
-def _of_pixels_e2(light: Light, camera: Camera, parts: _Parts, every: int = 1) -> Array:
+def _of_pixels_e2(light: Light, camera: Camera, parts: _Parts, chosen: slice = _ALL) -> Array:
     rows, columns = camera.sensor.rows, camera.sensor.columns
-    total, enlargement = np.zeros((rows, columns))[::every], _enlargement(light)
+    total, enlargement = np.zeros((len(range(rows)[chosen]), columns)), _enlargement(light)
     for factor, variance, patch in parts:
-        of_part = factor[::every] * enlarge_variance(variance, rows, columns, enlargement, patch, every)
-        of_part *= factor[::every]  # in place: images are large
+        of_part = factor[chosen] * enlarge_variance(variance, rows, columns, enlargement, patch, chosen)
+        of_part *= factor[chosen]  # in place: images are large
         total += of_part
     return total
 

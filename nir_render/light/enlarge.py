@@ -17,6 +17,8 @@ from perception.compiled import compiled
 
 Array = NDArray[np.float64]
 
+_ALL = slice(None)
+
 
 @dataclass(frozen=True, eq=False)
 class Enlargement:
@@ -86,7 +88,7 @@ def enlarge_variance(
     columns: int,
     enlargement: Enlargement | None = None,
     patch: Array | None = None,
-    every: int = 1,
+    chosen: slice = _ALL,
 ) -> Array:
     """Return the variance of each pixel of an enlarged image of independent blocks.
 
@@ -94,12 +96,13 @@ def enlarge_variance(
     ----------
     variance, patch
         Of the blocks and of the patch's pixels.
-    every
-        Which rows of the image are wanted: the first, and each so many further down.
+    chosen
+        Which rows of the image are wanted.
     """
     if variance.shape == (rows, columns):
-        return variance[::every]
-    down = _linear(np.arange(0, rows, every), rows, variance.shape[0])
+        return variance[chosen]
+    row = np.arange(rows)[chosen]
+    down = _linear(row, rows, variance.shape[0])
     across = _linear(np.arange(columns), columns, variance.shape[1])
     image = _of_pairs(
         np.ascontiguousarray(variance, dtype=np.float64),
@@ -109,22 +112,26 @@ def enlarge_variance(
         across.data.reshape(-1, 2) ** 2,
     )
     if enlargement is not None:
-        fitted, place = _in_rows(enlargement.pixels, columns, every)
-        weights = enlargement.matrix(variance.size)[fitted]
-        image.ravel()[place] = weights.multiply(weights) @ variance.ravel()
+        weights, pixels, patched = enlargement.matrix(variance.size), enlargement.pixels, enlargement.patch
+        if len(row) < rows:
+            fitted, pixels = _in_rows(pixels, columns, row, rows)
+            rendered, patched = _in_rows(patched, columns, row, rows)
+            weights, patch = weights[fitted], None if patch is None else patch[rendered]
+        image.ravel()[pixels] = weights.multiply(weights) @ variance.ravel()
         if patch is not None:
-            rendered, place = _in_rows(enlargement.patch, columns, every)
-            image.ravel()[place] = patch[rendered]
+            image.ravel()[patched] = patch
     return image
 
 
 def _in_rows(
-    pixels: NDArray[np.int32], columns: int, every: int
+    pixels: NDArray[np.int32], columns: int, chosen: NDArray[np.int64], rows: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
-    """Return which pixels lie in each `every`th row, and their numbers in the image of these rows."""
-    kept = pixels // columns % every == 0
-    row, column = np.divmod(pixels[kept], columns)
-    return kept, row // every * columns + column
+    """Return which pixels lie in the chosen rows, and their numbers in the image of these rows."""
+    place = np.full(rows, -1, dtype=np.int32)
+    place[chosen] = np.arange(len(chosen))
+    row, column = np.divmod(pixels, columns)
+    kept = place[row] >= 0
+    return kept, place[row[kept]] * columns + column[kept]
 
 
 @compiled

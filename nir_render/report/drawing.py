@@ -32,10 +32,11 @@ def sheet(height_in: float) -> Figure:
 
 def svg_of(figure: Figure) -> str:
     """Return a figure as SVG; the same figure gives the same text."""
-    file = io.StringIO()
+    file, dpi = io.StringIO(), figure.dpi
     # Not `savefig`, which draws all that a layout places twice.
     canvas = FigureCanvasSVG(figure)
     canvas.print_svg(file, metadata={"Date": None, "Creator": None})  # type: ignore[no-untyped-call]
+    figure.dpi = dpi
     return file.getvalue()
 
 

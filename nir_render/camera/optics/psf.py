@@ -25,7 +25,7 @@ from nir_render.geometry import cone_directions, cone_versine, legendre
 _TAIL_SIGMAS = 8.0
 _WAVES_PER_SIGMA = 0.84
 _MOST_RINGS = 128
-_RINGS_OUT_OF_VIEW = 8  # where only the total counts, of a power that is smooth in the angle
+_RINGS_OUT_OF_VIEW = 8  # where only the total counts: to 1e-3, as the response bends at the corner
 _BEYOND_PX = 64.0
 _SMALL_PX = 40.0  # a disc of which most would be edge
 
@@ -101,7 +101,7 @@ def source_window(
     is_large, out_of_view = False, _is_out_of_view(intrinsics, core, direction, angular_radius_rad)
     if seen is not None:
         directions, shares = seen, np.full(len(seen), 1.0 / len(seen))
-    elif out_of_view:
+    elif angular_radius_rad > 0.0 and out_of_view:
         directions, shares = cone_nodes(direction, angular_radius_rad, _RINGS_OUT_OF_VIEW)
     elif angular_radius_rad > 0.0:
         radius_px = intrinsics.image_radius_px(direction, angular_radius_rad)

@@ -55,7 +55,7 @@ STUDIES = (
             "a source at h before a matt wall of reflectance ρ throws 2ρ of its own signal back at who "
             "looks, 1 − h/√(h² + R²) of it from within R of its foot. What takes that light for the "
             "source's own, for R = 1.5 cm (2.4 px at 3 m), at h = 5 cm and ρ = 0.85, has 7 % more flux, a "
-            "range 3.6 % short; robust fits it as a halo of the flare. It falls by h², and grows by the "
+            "range 3.4 % short; robust fits it as a halo of the flare. It falls by h², and grows by the "
             "square of the range. Power and exposure scale both alike, and win nothing."
         ),
     ),

@@ -197,9 +197,11 @@ def format_quantity(value: float, quantity: Quantity) -> str:
 
 
 def short_number(number: float, digits: int = 4) -> str:
-    """Write a number with so many digits, below a million without a power of ten: 0.0512, 14000."""
+    """Write a number with so many digits; up to a million no power of ten, and whole ones in full."""
     text = f"{number:.{digits}g}"
-    return f"{float(text):.0f}" if "e+" in text and abs(number) < 1e6 else text
+    if "e+" not in text or abs(number) >= 1e6:
+        return text
+    return f"{number if number == round(number) else float(text):.0f}"
 
 
 def format_in_unit_of(text: object, value: float) -> str:

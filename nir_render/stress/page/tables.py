@@ -107,9 +107,10 @@ def render_noise_sentences(rows: pa.Table) -> tuple[str, str]:
         return "It is not known: the table has no figure of it.", ""
     shares = known["render_noise_share"].to_numpy()
     sentence = (
-        "Monte Carlo noise adds to the sensor's. Of the sensor's variance it is, in the median pixel or the "
-        f"worst flare's place, whichever is more: {_percent(float(np.median(shares)))} in the median frame "
-        f"and {_percent(float(shares.max()))} in the worst of {counted(known.num_rows, 'frame')}."
+        "Monte Carlo noise adds to the sensor's. Of the sensor's variance it is, in the median pixel of each "
+        f"seventh row or the worst flare's place, whichever is more: {_percent(float(np.median(shares)))} in "
+        f"the median frame and {_percent(float(shares.max()))} in the worst of "
+        f"{counted(known.num_rows, 'frame')}."
     )
     targets = pc.drop_null(known["render_noise_target"])
     if not len(targets):

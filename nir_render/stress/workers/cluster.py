@@ -28,7 +28,7 @@ _STARTS_WITHIN_S = 120
 _MAY_DIFFER = ("platform",)  # the processor: its bits may differ, its statistics do not
 MARK = ".seen-"  # not one of the names that a cache takes for a killed writer's, and removes in time
 DEATHS = 3  # of workers, that a job is given up after
-SCHEDULER_SETTINGS = {
+DASK_SETTINGS = {
     "distributed.scheduler.allowed-failures": DEATHS - 1,
     "distributed.scheduler.worker-saturation": 1.0,  # none waits at a worker, which may end after its job
     "distributed.scheduler.worker-ttl": None,  # a worker that renders may be silent for long

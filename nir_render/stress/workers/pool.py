@@ -33,7 +33,7 @@ from nir_render.stress.jobs import Job, is_same, made_by_of
 from nir_render.stress.store import Store
 from nir_render.stress.table import read_part, write_part
 from nir_render.stress.workers.cluster import (
-    SCHEDULER_SETTINGS,
+    DASK_SETTINGS,
     RefusedError,
     Scheduler,
     Terms,
@@ -116,7 +116,7 @@ def run_jobs(
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     settings = {
-        **SCHEDULER_SETTINGS,
+        **DASK_SETTINGS,
         "distributed.nanny.pre-spawn-environ": thread_settings(work.threads or 1),
         "temporary-directory": str(scratch),
     }

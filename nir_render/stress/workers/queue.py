@@ -21,7 +21,7 @@ from nir_render.errors import InputError
 from nir_render.scene.documents.base import Document, Positive, Time
 from nir_render.scene.problems import explain
 from nir_render.scene.text.yaml_text import read_yaml
-from nir_render.stress.workers.cluster import SCHEDULER_SETTINGS, Scheduler
+from nir_render.stress.workers.cluster import DASK_SETTINGS, Scheduler
 
 _SUBMITS = {"slurm": "sbatch", "pbs": "qsub", "lsf": "bsub"}
 _CLUSTERS = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster"}
@@ -126,7 +126,7 @@ def queued(file: Path, document: QueueDocument, logs: Path) -> Iterator[Schedule
         ) from None
     for name in ("distributed", "dask_jobqueue"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    with dask.config.set(SCHEDULER_SETTINGS):
+    with dask.config.set(DASK_SETTINGS):
         try:
             cluster = getattr(dask_jobqueue, _CLUSTERS[document.system])(
                 **_arguments(document, logs.absolute())

@@ -80,7 +80,7 @@ def _numbered(keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.in
 @compiled
 def _place(key: int, at: NDArray[np.int32], seen: NDArray[np.int64]) -> int:
     """Return where in a table a key is, or belongs."""
-    place = (key ^ (key >> 17)) * 40503 & (len(at) - 1)
+    place = ((key ^ (key >> 17)) & 0xFFFFFFFF) * 40503 & (len(at) - 1)
     while at[place] >= 0 and seen[at[place]] != key:
         place = (place + 1) & (len(at) - 1)
     return place

@@ -106,6 +106,14 @@ def test_the_share_of_render_noise_in_the_frame(scene: Scene) -> None:
     assert noise.reached == pytest.approx(1.0 / 3.0)
     upper = (noise_e2 / (signal_e + 100.0))[:320]
     assert noise.median_share == pytest.approx(float(np.median(upper)), rel=0.005)
+    told = share_of_target(mean_frame(light, scene.at(0.0), 1e-3))
+    assert told == pytest.approx(float(np.median(upper[3::7])), rel=0.005)
+    # Light in few rows, none of which is one of those: all are looked at.
+    variance = np.zeros_like(arrays[1])
+    variance[..., 326:328, :] = 1e-6
+    few = dataclasses.replace(light, indirect=Indirect(arrays[0], variance, 1, 16))
+    mean = mean_frame(few, scene.at(0.0), 1e-3)
+    assert share_of_target(mean) == render_noise(mean).median_share > 0.0
     none = mean_frame(_light(0.0, 0.0), scene.at(0.0), 1e-3)
     assert (render_noise(none), share_of_target(none)) == (RenderNoise(), 0.0)
 
@@ -151,14 +159,35 @@ def test_the_share_of_render_noise_in_a_flare(scene: Scene, scale: int) -> None:
     noise = render_noise(mean)
     assert noise.aperture_share == pytest.approx(noise_e2 / temporal_e2, rel=0.005)
     # What a target bounds is the larger one, the median that of each seventh row.
-    of_rows_e2 = render_variance_e2(mean.light, scene.at(0.0), 1e-3)[::7] / temporal_variance_e2(mean)[::7]
+    some = np.s_[3::7]
+    of_rows_e2 = render_variance_e2(mean.light, scene.at(0.0), 1e-3)[some] / temporal_variance_e2(mean)[some]
     larger = max(noise.aperture_share, float(np.median(of_rows_e2)))
     assert share_of_target(mean) == pytest.approx(larger, rel=1e-6)
-    assert np.median(of_rows_e2) == pytest.approx(noise.median_share, rel=0.1)
+    assert np.median(of_rows_e2) == pytest.approx(noise.median_share, rel=0.005)
     bare = mean_frame(light, scene.at(0.0), 1e-3)
     assert render_noise(bare).aperture_share == 0.0
-    of_rows_e2 = render_variance_e2(light, scene.at(0.0), 1e-3)[::7] / temporal_variance_e2(bare)[::7]
+    of_rows_e2 = render_variance_e2(light, scene.at(0.0), 1e-3)[some] / temporal_variance_e2(bare)[some]
     assert share_of_target(bare) == pytest.approx(float(np.median(of_rows_e2)), rel=1e-6)
+
+
+def test_the_share_of_some_rows_goes_with_what_these_rows_see(scene: Scene) -> None:
+    """A source blinks behind a rolling shutter, the other does not: each row has levels of its own."""
+    rolling = scene.with_(
+        {
+            "robots.r1.rig.cameras.front.shutter": {"type": "rolling", "line_time": "50 us"},
+            "robots.r2.rig.sources.top.drive": {"square": {"frequency": "40 Hz", "duty": 0.5}},
+        }
+    )
+    world = rolling.at(0.0)
+    mean = mean_frame(_light(1e-2, 1e-6), world, 1e-3, 0.0)
+    assert len(mean.profiles) == 2
+    assert np.ptp(mean.profiles[1]) == 1.0
+    noise_e2 = sum(
+        render_variance_e2(mean.light, world, 1e-3, np.eye(2)[group]) * mean.profiles[drive][:, None] ** 2
+        for group, drive in enumerate(mean.rates.drive)
+    )
+    share = (noise_e2 / temporal_variance_e2(mean))[3::7]
+    assert share_of_target(mean) == pytest.approx(float(np.median(share)), rel=1e-6)
 
 
 @pytest.mark.parametrize("exposure_s", [0.0, -1.0, float("nan"), float("inf")])

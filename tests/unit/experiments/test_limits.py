@@ -173,9 +173,10 @@ def test_a_wall_close_behind_no_longer_takes_a_range_along(
 ) -> None:
     """Reflectance 0.05 and 0.85, gaps of 5 and 30 cm, 3 m away: light off the wall in the flare, 2ρ(1 − h/√(h² + R²)).
 
-    With R = 1.5 cm (2.4 px), what takes that light for the source's own is 3.6 % short at 5 cm and 0.85:
-    10.8 cm. A fit with a halo keeps a tenth of it at most, within three of its σ; that the light is there is
-    seen by the limit, whose noise it is. Four jobs with one seed; done once, they are not done again.
+    With R = 1.5 cm (2.4 px), what takes that light for the source's own is 3.4 % short at 5 cm and 0.85:
+    10.2 cm. A fit with a halo keeps a tenth of it at most, and three times the physical limit; that the light
+    is there is seen by the limit, whose noise it is (how much it is: `tests/physics/test_enlarge.py`). Four
+    jobs with one seed; done once, they are not done again.
     """
     multipath = next(study for study in STUDIES if study.name == "multipath")
     document = yaml.safe_load(multipath.document.read_text(encoding="utf-8"))
@@ -192,11 +193,11 @@ def test_a_wall_close_behind_no_longer_takes_a_range_along(
     assert (of.jobs, of.failed) == (4, 0)
     maps = of.record()["crossings"]["gap"]["maps"]
     bias_m, pull = maps["range_bias"]["robust"], maps["range_pull"]["robust"]
-    assert abs(bias_m[1][0]) < 0.1 * 0.036 * 3.0
+    assert abs(bias_m[1][0]) < 0.1 * 0.034 * 3.0
     assert abs(bias_m[1][1]) < 0.01 * 3.0
     assert max(itertools.chain(*pull)) < 3.0
     limit_share = maps["range_rmse_share"]["physical limit"]
-    assert limit_share[1][0] > 1.03 * limit_share[0][0]
+    assert 1.03 < limit_share[1][0] / limit_share[0][0] < 1.1
     assert "Multipath: ranging" in write_outcome(outcome, tmp_path / "limits").read_text()
     parts = {path: path.stat().st_mtime_ns for path in (tmp_path / "limits" / "multipath" / "jobs").iterdir()}
     again = outcome_of([multipath], 1, tmp_path / "limits", 1, _no_bar)

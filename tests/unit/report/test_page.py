@@ -5,11 +5,14 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 
 from nir_render.evaluate.metrics import evaluate
+from nir_render.report.drawing import sheet, svg_of
 from nir_render.report.page import report_html
+from nir_render.report.style import MATPLOTLIB
 from nir_render.truth.sources import SourceTruth
 from perception.causes import CAUSES, DetectionCauses
 from perception.types import Detection, FrameKey
@@ -124,3 +127,14 @@ def test_a_long_run_stays_a_small_page() -> None:
     }
     _, html = _page(keys, rows, said)
     assert len(html) < 2_000_000
+
+
+def test_the_same_figure_gives_the_same_svg_again() -> None:
+    with mpl.rc_context(MATPLOTLIB):
+        figure = sheet(2.0)
+        axes = figure.subplots(1, 2)
+        axes[0].imshow(np.arange(12.0).reshape(3, 4))
+        axes[1].plot(np.arange(5.0), rasterized=True)
+        first = svg_of(figure)
+        assert svg_of(figure) == first
+    assert figure.dpi == 130

@@ -3,7 +3,13 @@ import math
 import pytest
 
 from nir_render.scene.text import units
-from nir_render.scene.text.units import format_quantity, format_vector, parse_quantity, parse_vector
+from nir_render.scene.text.units import (
+    format_quantity,
+    format_vector,
+    parse_quantity,
+    parse_vector,
+    short_number,
+)
 
 
 @pytest.mark.parametrize(
@@ -79,3 +85,21 @@ def test_what_is_no_vector_is_refused(text: object, said: str) -> None:
 def test_a_written_value_reads_back_to_the_same_bits(value: float) -> None:
     assert parse_quantity(format_quantity(value, units.LENGTH), units.LENGTH) == value
     assert parse_vector(format_vector((value, value), units.LENGTH), units.LENGTH, 2) == (value, value)
+
+
+@pytest.mark.parametrize(
+    ("number", "digits", "text"),
+    [
+        (12345.0, 4, "12345"),
+        (12345.0, 3, "12345"),
+        (5055.439, 3, "5060"),
+        (-14000.0, 3, "-14000"),
+        (999_999.7, 4, "1000000"),
+        (2e6, 4, "2e+06"),
+        (0.0512, 4, "0.0512"),
+        (1e-5, 4, "1e-05"),
+        (0.0, 3, "0"),
+    ],
+)
+def test_short_numbers_are_whole_up_to_a_million(number: float, digits: int, text: str) -> None:
+    assert short_number(number, digits) == text
