@@ -5,7 +5,7 @@
     python benchmarks/swarm.py --robots 100 --observers 10    # ten robots': `all_cameras_s` is scaled up
 
 One JSON object. Robots stand at 1 per m², hulls below lines of sight; sources blink each by itself, as they
-do over a minute. Indirect light is rendered in blocks of 4 × 4 pixels with 8 samples. `peak_gib` is the
+do over a minute. Indirect light is rendered in blocks of 4 × 4 pixels with 4 samples. `peak_gib` is the
 largest resident memory of a process. Starting, compiling and reading the scene are part of `seconds`.
 """
 

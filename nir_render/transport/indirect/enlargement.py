@@ -7,12 +7,14 @@ edge cuts has its share of each surface. All of it is linear in the light, with 
 `light.enlarge` applies them.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.light.enlarge import Enlargement
+from perception.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -137,6 +139,7 @@ def _parts(
     return pixel[order], label[order], np.concatenate([np.ones(len(whole)), share])[order]
 
 
+@compiled
 def _fit(
     pure: NDArray[np.int32], pixel: NDArray[np.int64], label: NDArray[np.int32], scale: int, columns: int
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
@@ -146,28 +149,46 @@ def _fit(
     label best, each block counted by a Gaussian of its distance; b and c are held towards 0 (ridge
     regression), so that a single block is continued flat.
     """
-    row, column = ((at + 0.5) / scale - 0.5 for at in np.divmod(pixel, columns))
-    steps = np.arange(-_REACH, _REACH + 1)
-    down, across = (steps.repeat(len(steps)), np.tile(steps, len(steps)))
-    block_row = np.rint(row).astype(np.int64)[:, None] + down
-    block_column = np.rint(column).astype(np.int64)[:, None] + across
-    inside = (block_row >= 0) & (block_row < pure.shape[0])
-    inside &= (block_column >= 0) & (block_column < pure.shape[1])
-    y, x = block_row - row[:, None], block_column - column[:, None]
-    block = np.where(inside, block_row * pure.shape[1] + block_column, 0)
-    same = inside & (pure.ravel()[block] == label[:, None])
-    kernel = np.where(same, np.exp(-0.5 * (x**2 + y**2) / _KERNEL_BLOCKS**2), 0.0)
-    found = same.any(axis=1)
-    kernel[found] /= kernel[found].sum(axis=1, keepdims=True)
-    mean_x, mean_y = (kernel * x).sum(axis=1), (kernel * y).sum(axis=1)
-    x, y = x - mean_x[:, None], y - mean_y[:, None]
-    xx = (kernel * x * x).sum(axis=1) + _RIDGE
-    yy = (kernel * y * y).sum(axis=1) + _RIDGE
-    xy = (kernel * x * y).sum(axis=1)
-    # The value at the pixel, x = y = 0: the mean of the blocks, and from there along the slopes.
-    determinant = xx * yy - xy**2
-    along_x, along_y = (yy * mean_x - xy * mean_y) / determinant, (xx * mean_y - xy * mean_x) / determinant
-    return block, kernel * (1.0 - along_x[:, None] * x - along_y[:, None] * y), found
+    side = 2 * _REACH + 1
+    block = np.zeros((len(pixel), side * side), dtype=np.int64)
+    weight, found = np.zeros(block.shape), np.zeros(len(pixel), dtype=np.bool_)
+    x, y, kernel = np.empty(side * side), np.empty(side * side), np.empty(side * side)
+    for part in range(len(pixel)):
+        row, column = (
+            (pixel[part] // columns + 0.5) / scale - 0.5,
+            (pixel[part] % columns + 0.5) / scale - 0.5,
+        )
+        top, left = int(np.rint(row)) - _REACH, int(np.rint(column)) - _REACH
+        total, mean_x, mean_y = 0.0, 0.0, 0.0
+        for one in range(side * side):
+            block_row, block_column = top + one // side, left + one % side
+            y[one], x[one], kernel[one] = block_row - row, block_column - column, 0.0
+            if not (0 <= block_row < pure.shape[0] and 0 <= block_column < pure.shape[1]):
+                continue
+            block[part, one] = block_row * pure.shape[1] + block_column
+            if pure[block_row, block_column] == label[part]:
+                kernel[one] = math.exp(-0.5 * (x[one] ** 2 + y[one] ** 2) / _KERNEL_BLOCKS**2)
+                total += kernel[one]
+        if total == 0.0:
+            continue
+        found[part] = True
+        for one in range(side * side):
+            kernel[one] /= total
+            mean_x += kernel[one] * x[one]
+            mean_y += kernel[one] * y[one]
+        xx, yy, xy = _RIDGE, _RIDGE, 0.0
+        for one in range(side * side):
+            x[one], y[one] = x[one] - mean_x, y[one] - mean_y
+            xx += kernel[one] * x[one] * x[one]
+            yy += kernel[one] * y[one] * y[one]
+            xy += kernel[one] * x[one] * y[one]
+        # The value at the pixel, x = y = 0: the mean of the blocks, and from there along the slopes.
+        determinant = xx * yy - xy**2
+        along_x = (yy * mean_x - xy * mean_y) / determinant
+        along_y = (xx * mean_y - xy * mean_x) / determinant
+        for one in range(side * side):
+            weight[part, one] = kernel[one] * (1.0 - along_x * x[one] - along_y * y[one])
+    return block, weight, found
 
 
 def _foreshortened(labels: Labels, scale: int, block: NDArray[np.int64], weight: Array) -> NDArray[np.bool_]:
