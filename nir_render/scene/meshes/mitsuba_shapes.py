@@ -28,9 +28,11 @@ def transform_of(shape: Element) -> Array:
             raise step.wrong(f"<{step.tag}> is no step of a transform; known: {', '.join(_STEPS)}")
         whole = make(step) @ whole
         if not np.abs(whole).max() <= _LARGEST:
-            raise step.wrong("up to here the transform enlarges or moves by more than 1e12")
+            raise step.wrong("up to here the transform is of more than 1e12; give smaller numbers")
     if not abs(np.linalg.det(whole[:3, :3])) > 0.0 or not np.allclose(whole[3], (0.0, 0.0, 0.0, 1.0)):
-        raise given.wrong("the transform flattens the shape, or is of perspective")
+        raise given.wrong(
+            "the transform flattens the shape, or is of perspective; give one that can be undone"
+        )
     return whole
 
 
@@ -62,7 +64,7 @@ def _matrix(step: Element) -> Array:
         return numbers.reshape(4, 4)
     if numbers.size == 9:
         return _affine(numbers.reshape(3, 3))
-    raise step.wrong(f"a matrix has 16 numbers, or 9; this one {numbers.size}")
+    raise step.wrong(f"a matrix has 16 numbers, or 9; this one {numbers.size}: write all")
 
 
 _STEPS: Mapping[str, Callable[[Element], Array]] = {
@@ -78,7 +80,11 @@ def _rectangle(_shape: Element) -> MeshPart:
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     vertices = np.column_stack([corners, np.zeros(4)])
     return MeshPart(
-        "", vertices, None, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32), 0.5 * (corners + 1.0)
+        "",
+        vertices,
+        None,
+        np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
+        0.5 * (1.0 + corners * (1.0, -1.0)),
     )
 
 
@@ -164,7 +170,7 @@ def _triple(element: Element, name: str, default: tuple[float, float, float] = (
 def _unit(element: Element, vector: Array, what: str) -> Array:
     length = float(np.linalg.norm(vector))
     if not length > _LEAST_LENGTH:
-        raise element.wrong(f"{what} has no direction")
+        raise element.wrong(f"{what} has no direction; give another")
     return vector / length
 
 

@@ -2,128 +2,146 @@
 
 Read are OBJ, PLY and STL files, rectangles, cubes, disks, spheres, cylinders, groups and instances, with
 their transforms, defaults, and files that are included. Names are those of versions 2 and 3; those of 0.6, in
-camel case, are taken too. All else is passed over: materials, emitters, sensors, media are the scene file's.
+camel case, are taken too. What is not there for light is left out: shapes of a `null` material, which hold
+fog, and those that are nothing but lamps. All else is passed over: what reflects, emitters, sensors, media
+are the scene file's.
 """
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from nir_render.scene.meshes.mesh import MeshPart, joined, moved, with_flat_normals
 from nir_render.scene.meshes.mitsuba_shapes import SHAPES, transform_of
 from nir_render.scene.meshes.xml import Element, tree_of
 
-FILES = (".obj", ".ply", ".stl")
-_MOST_INCLUDED = 16
+KINDS = ("obj", "ply", "stl")
+_MOST_INCLUDED = 64
 _PARAMETER = re.compile(r"\$(\w+)")
 
-ReadFile = Callable[[Path], list[MeshPart]]
+ReadFile = Callable[[Path, str], list[MeshPart]]
+
+
+@dataclass
+class _Scene:
+    """What a scene's files hold: elements in order, parameters filled in, and what has an id."""
+
+    parameters: dict[str, str] = field(default_factory=dict)
+    folders: list[Path] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    reading: list[Path] = field(default_factory=list)
+    shapes: list[Element] = field(default_factory=list)
+    groups: dict[str, Element] = field(default_factory=dict)
+    materials: dict[str, Element] = field(default_factory=dict)
+    aliases: dict[str, str] = field(default_factory=dict)
 
 
 def read_mitsuba_xml(path: Path, read_file: ReadFile) -> list[MeshPart]:
-    """Return the parts of all shapes of a scene, those of one slot together; `read_file` reads their files.
+    """Return the parts of all shapes of a scene, those of one slot together.
+
+    `read_file` reads a file of a kind ("ply"). Where any part has normals, those that have none get them for
+    each triangle: they look as flat as they are.
 
     Raises
     ------
     ValueError
         It is no such scene, or has a shape that is none of these; it says in which line.
     """
+    scene = _scene_of(path)
+    parts = [part for shape in scene.shapes for part in _parts(shape, scene, read_file)]
+    if any(part.normals is not None for part in parts):
+        parts = [part if part.normals is not None else with_flat_normals(part) for part in parts]
     slots: dict[str, list[MeshPart]] = {}
-    groups: dict[str, Element] = {}
-    for shape in scene_shapes(path):
-        kind = shape.attributes.get("type", "")
-        if kind == "shapegroup":
-            groups[shape.attributes.get("id", "")] = shape
-            continue
-        for part in _parts(shape, kind, groups, read_file):
-            slots.setdefault(part.slot, []).append(part)
-    return [joined(slot, _alike(parts)) for slot, parts in slots.items()]
-
-
-def _alike(parts: list[MeshPart]) -> list[MeshPart]:
-    """Return parts of which all have normals where any has: flat triangles get corners of their own."""
-    if all(part.normals is None for part in parts):
-        return parts
-    return [part if part.normals is not None else with_flat_normals(part) for part in parts]
+    for part in parts:
+        slots.setdefault(part.slot, []).append(part)
+    return [joined(slot, those) for slot, those in slots.items()]
 
 
 def files_named(path: Path) -> tuple[Path, ...]:
     """Return the files that a scene is made of, itself first; raise ValueError as `read_mitsuba_xml`."""
-    files = [path]
-    for shape in scene_shapes(path, files):
-        inner = [one for one in shape.children if one.tag == "shape"]
-        files += [_file_of(one) for one in (shape, *inner) if one.named("filename") is not None]
-    return tuple(dict.fromkeys(files))
+    scene = _scene_of(path)
+    grouped = [one for group in scene.groups.values() for one in group.children if one.tag == "shape"]
+    named = [one for one in (*scene.shapes, *grouped) if one.named("filename") is not None]
+    return tuple(dict.fromkeys([path, *scene.files, *map(_file_of, named)]))
 
 
-def scene_shapes(path: Path, files: list[Path] | None = None) -> Iterator[Element]:
-    """Yield the shapes of a scene in order, parameters filled in; `files` takes those that are included."""
-    yield from _shapes_in(path, {}, [path.parent], files if files is not None else [], 0)
-
-
-def _shapes_in(
-    path: Path, parameters: dict[str, str], folders: list[Path], files: list[Path], depth: int
-) -> Iterator[Element]:
+def _scene_of(path: Path) -> _Scene:
+    scene = _Scene(folders=[path.parent], reading=[path.resolve()])
     root = tree_of(path.read_bytes())
     if root.tag != "scene":
         raise root.wrong(f"this is <{root.tag}>, not the <scene> of Mitsuba; give that file, or a mesh")
-    for raw in root.children:
-        one = _filled(raw, parameters, tuple(folders))
-        if one.tag == "default":
-            parameters.setdefault(one.attributes.get("name", ""), one.attributes.get("value", ""))
-        elif one.tag == "path":
-            folders.append(path.parent / one.attributes.get("value", ""))
-        elif one.tag == "include":
-            if depth == _MOST_INCLUDED:
-                raise one.wrong(f"files are included {_MOST_INCLUDED} deep; does one include itself?")
-            found = _found(one, one.attributes.get("filename", ""))
-            files.append(found)
-            try:
-                yield from _shapes_in(found, parameters, [*folders, found.parent], files, depth + 1)
-            except ValueError as error:
-                raise one.wrong(f"{found}: {error}") from None
+    for one in _filled(root, scene, path).children:
+        if one.tag == "shape" and one.attributes.get("type") == "shapegroup":
+            scene.groups[one.attributes.get("id", "")] = one
         elif one.tag == "shape":
-            yield one
+            scene.shapes.append(one)
+        elif one.tag == "alias":
+            scene.aliases[one.attributes.get("as", "")] = one.attributes.get("id", "")
+    return scene
 
 
-def _filled(raw: Element, parameters: dict[str, str], folders: tuple[Path, ...]) -> Element:
-    """Return an element with the values of $parameters."""
+def _filled(raw: Element, scene: _Scene, path: Path) -> Element:
+    """Return an element with the values of $parameters, and with what it includes."""
 
     def value(match: re.Match[str]) -> str:
-        if match[1] not in parameters:
-            raise raw.wrong(
-                f"${match[1]} has no value; give it one by <default name='{match[1]}' value='…'/>"
-            )
-        return parameters[match[1]]
+        if match[1] not in scene.parameters:
+            raise raw.wrong(f"${match[1]} has no value; add <default name='{match[1]}' value='…'/>")
+        return scene.parameters[match[1]]
 
     attributes = {name: _PARAMETER.sub(value, text) for name, text in raw.attributes.items()}
-    children = [_filled(child, parameters, folders) for child in raw.children]
-    return replace(raw, attributes=attributes, folders=folders, children=children)
+    filled = Element(raw.tag, attributes, raw.line, tuple(scene.folders))
+    for child in raw.children:
+        one = _filled(child, scene, path)
+        if one.tag == "default":
+            scene.parameters.setdefault(one.attributes.get("name", ""), one.attributes.get("value", ""))
+        elif one.tag == "path":
+            scene.folders.insert(0, path.parent / one.attributes.get("value", ""))
+        elif one.tag == "include":
+            filled.children.extend(_included(one, scene))
+        else:
+            filled.children.append(one)
+    if filled.tag == "bsdf" and "id" in attributes:
+        scene.materials[attributes["id"]] = filled
+    return filled
 
 
-def _parts(shape: Element, kind: str, groups: dict[str, Element], read_file: ReadFile) -> Iterator[MeshPart]:
+def _included(include: Element, scene: _Scene) -> list[Element]:
+    """Return what an included file has: the elements of its scene, or one element."""
+    path = _found(include, include.attributes.get("filename", ""))
+    scene.files.append(path)
+    if path.resolve() in scene.reading or len(scene.files) > _MOST_INCLUDED:
+        raise include.wrong(f"{path.name} includes itself, or too many others; take the <include> out")
+    scene.reading.append(path.resolve())
+    scene.folders.append(path.parent)
+    try:
+        root = _filled(tree_of(path.read_bytes()), scene, path)
+    except (ValueError, OSError) as error:
+        raise include.wrong(f"{path}: {error}") from None
+    finally:
+        scene.folders.remove(path.parent)
+        scene.reading.pop()
+    return root.children if root.tag == "scene" else [root]
+
+
+def _parts(shape: Element, scene: _Scene, read_file: ReadFile) -> Iterator[MeshPart]:
     """Yield the parts of one shape, where it stands."""
-    to_world = transform_of(shape)
+    kind, to_world = shape.attributes.get("type", ""), transform_of(shape)
     if kind == "instance":
-        ref = next((one for one in shape.children if one.tag == "ref"), None)
-        group = None if ref is None else groups.get(ref.attributes.get("id", ""))
-        if group is None:
-            raise shape.wrong("an instance names no <shape type='shapegroup'> that stands before it")
-        for one in group.children:
+        for one in _group_of(shape, scene).children:
+            if one.tag == "ref":
+                raise one.wrong("a group refers to a shape; write the shape into the group")
+            if one.tag == "shape" and one.attributes.get("type") == "instance":
+                raise one.wrong("a group holds an instance; write the shapes that it stands for")
             if one.tag == "shape":
-                for part in _parts(one, one.attributes.get("type", ""), {}, read_file):
+                for part in _parts(one, scene, read_file):
                     yield moved(part, to_world)
         return
-    if kind in SHAPES:
-        parts = [SHAPES[kind](shape)]
-    elif "." + kind in FILES:
-        parts = read_file(_file_of(shape))
-    else:
-        known = ", ".join([*(name[1:] for name in FILES), *SHAPES, "shapegroup", "instance"])
-        raise shape.wrong(f"a shape of the type {kind!r} is not read; export it as a mesh (known: {known})")
-    slot = _slot(shape)
-    for part in parts:
+    material, slot = _material_of(shape, scene)
+    is_lamp = any(one.tag == "emitter" for one in shape.children)
+    if (material is None and is_lamp) or (material is not None and material.attributes.get("type") == "null"):
+        return
+    for part in _own_parts(shape, kind, read_file):
         whole = replace(part, slot=slot)
         if _is_true(shape, "face_normals"):
             whole = replace(whole, normals=None)
@@ -133,21 +151,54 @@ def _parts(shape: Element, kind: str, groups: dict[str, Element], read_file: Rea
         yield moved(whole, to_world)
 
 
-def _slot(shape: Element) -> str:
-    """Return the id of what reflects on a shape, or of what that is made of; empty where it has none."""
+def _own_parts(shape: Element, kind: str, read_file: ReadFile) -> list[MeshPart]:
+    """Return the parts of a shape as it is by itself. Mitsuba's pictures have their first row at v = 0."""
+    if kind in SHAPES:
+        return [SHAPES[kind](shape)]
+    if kind not in KINDS:
+        known = ", ".join([*KINDS, *SHAPES, "shapegroup", "instance"])
+        raise shape.wrong(f"a shape of the type {kind!r} is not read; export it as a mesh (known: {known})")
+    file = _file_of(shape)
+    try:
+        parts = read_file(file, kind)
+    except (ValueError, OSError) as error:
+        raise shape.wrong(f"{file}: {error}") from None
+    if _is_true(shape, "flip_tex_coords", default=kind == "obj"):
+        return parts
+    return [part if part.uvs is None else replace(part, uvs=part.uvs * (1, -1) + (0, 1)) for part in parts]
+
+
+def _group_of(instance: Element, scene: _Scene) -> Element:
+    for one in instance.children:
+        name = one.attributes.get("id", "")
+        name = scene.aliases.get(name, name)
+        if one.tag == "ref" and name in scene.groups:
+            return scene.groups[name]
+    raise instance.wrong("an instance names no <shape type='shapegroup'>; add a <ref id='…'/> of one")
+
+
+def _material_of(shape: Element, scene: _Scene) -> tuple[Element | None, str]:
+    """Return what reflects on a shape, None for the default, and its id or that of what it is made of."""
     for one in shape.children:
-        side = one.attributes.get("name", "")
-        if one.tag == "ref" and side not in ("interior", "exterior"):
-            return one.attributes.get("id", "")
         if one.tag == "bsdf":
-            inner = next((child for child in one.children if child.tag in ("bsdf", "ref")), one)
-            return one.attributes.get("id") or inner.attributes.get("id", "")
-    return ""
+            inner = [
+                child for child in one.children if child.tag in ("bsdf", "ref") and "id" in child.attributes
+            ]
+            only = inner[0].attributes["id"] if len(inner) == 1 else ""
+            return one, one.attributes.get("id") or only
+        if one.tag == "ref":
+            name = one.attributes.get("id", "")
+            name = scene.aliases.get(name, name)
+            if name in scene.materials:
+                return scene.materials[name], name
+            if one.attributes.get("name") == "bsdf":
+                raise one.wrong(f"there is no <bsdf id={name!r}> in the scene; add it, or take another id")
+    return None, ""
 
 
-def _is_true(shape: Element, name: str) -> bool:
+def _is_true(shape: Element, name: str, *, default: bool = False) -> bool:
     given = shape.named(name)
-    return given is not None and given.attributes.get("value", "").strip().lower() == "true"
+    return default if given is None else given.attributes.get("value", "").strip().lower() == "true"
 
 
 def _file_of(shape: Element) -> Path:
@@ -159,7 +210,11 @@ def _file_of(shape: Element) -> Path:
 
 def _found(element: Element, name: str) -> Path:
     for folder in element.folders:
-        if (folder / name).is_file():
-            return folder / name
+        for one in (folder / name, folder / name.replace("\\", "/")):
+            try:
+                if one.is_file():
+                    return one
+            except OSError:  # too long a name
+                continue
     looked = ", ".join(dict.fromkeys(map(str, element.folders)))
-    raise element.wrong(f"there is no file {name!r} (looked in {looked}); check its name and folder")
+    raise element.wrong(f"there is no file {name[:200]!r} (looked in {looked}); check its name and folder")

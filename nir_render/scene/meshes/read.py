@@ -49,6 +49,8 @@ def files_of_mesh(file: str | Path) -> tuple[Path, ...]:
     _state(path)
     try:
         return files_named(path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -75,7 +77,7 @@ def _read(file: str, up: Up | None, _states: tuple[tuple[str, int, int], ...]) -
     path = Path(file)
     kind = _kind(path)
     try:
-        found = read_mitsuba_xml(path, _parts_of) if kind == "xml" else _parts_of(path)
+        found = read_mitsuba_xml(path, _parts_of) if kind == "xml" else _parts_of(path, kind)
         parts = [checked(part) for part in found]
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
@@ -88,8 +90,8 @@ def _read(file: str, up: Up | None, _states: tuple[tuple[str, int, int], ...]) -
     return tuple(parts)
 
 
-def _parts_of(path: Path) -> list[MeshPart]:
-    data, kind = path.read_bytes(), _kind(path)
+def _parts_of(path: Path, kind: str) -> list[MeshPart]:
+    data = path.read_bytes()
     if kind == "obj":
         if b"\0" in data:
             raise ValueError("this is no text, and so no OBJ file; export the mesh again")

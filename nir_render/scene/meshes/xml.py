@@ -41,7 +41,9 @@ def tree_of(data: bytes) -> Element:
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if len(open_elements) == _MOST_DEEP:
-            raise ValueError(f"line {parser.CurrentLineNumber}: elements lie {_MOST_DEEP} deep")
+            raise ValueError(
+                f"line {parser.CurrentLineNumber}: elements lie {_MOST_DEEP} deep; export the scene again"
+            )
         element = Element(tag, attributes, parser.CurrentLineNumber)
         (open_elements[-1].children if open_elements else roots).append(element)
         open_elements.append(element)
@@ -57,7 +59,11 @@ def tree_of(data: bytes) -> Element:
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise ValueError(f"line {error.lineno}: this is no XML: {expat.ErrorString(error.code)}") from None
+        raise ValueError(
+            f"line {error.lineno}: this is no XML: {expat.ErrorString(error.code)}; export the scene again"
+        ) from None
+    except LookupError as error:
+        raise ValueError(f"line 1: {error}; save it as UTF-8") from None
     return roots[0]
 
 
@@ -82,7 +88,7 @@ def numbers_of(element: Element, text: str) -> Array:
     try:
         numbers = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
-        raise element.wrong(f"{text!r} is no number") from None
+        raise element.wrong(f"{text[:60]!r} is no number; write one") from None
     if not numbers.size or not (np.abs(numbers) <= _LARGEST).all():
-        raise element.wrong(f"{text[:60]!r} is no number of at most {_LARGEST:g}")
+        raise element.wrong(f"{text[:60]!r} is no number; write one of at most {_LARGEST:g}")
     return numbers

@@ -162,7 +162,7 @@ def test_what_a_scene_names_counts_for_its_light(tmp_path: Path) -> None:
         ("<scene><shape type='cube'>\n<transform name='to_world'><rotate angle='x'/></transform></shape></scene>", "line 2: "),
         ("<scene><shape type='sphere'>\n<float name='radius' value='-1'/></shape></scene>", "line 2: the radius is -1"),
         ("<scene><shape type='instance'/></scene>", "an instance names no"),
-        ("<scene>\n<include filename='m.xml'/></scene>", "included 16 deep; does one include itself?"),
+        ("<scene>\n<include filename='m.xml'/></scene>", "m.xml includes itself"),
         ("<scene><shape", "line 1: this is no XML"),
         ("", "this is no XML"),
         ("<mesh/>", "line 1: this is <mesh>, not the <scene>"),
@@ -178,3 +178,103 @@ def test_what_cannot_be_read_is_told_by_its_line(tmp_path: Path, text: str, said
         _scene(tmp_path, file)
     assert said in str(told.value)
     assert "m.xml" in str(told.value)
+
+
+def _slots(folder: Path, text: str) -> dict[str, int]:
+    """Write a scene of some shapes; return how many triangles each slot has."""
+    file = folder / "some.xml"
+    file.write_text(f"<scene version='3.0.0'>{text}</scene>")
+    return {part.slot: len(part.faces) for part in read_mesh(file)}
+
+
+LAMP = "<shape type='rectangle'><emitter type='area'/>{}</shape>"
+CUBE = "<shape type='cube'>{}</shape>"
+
+
+@pytest.mark.parametrize(
+    ("text", "slots"),
+    [
+        # A lamp and a cloud's hull are nothing to reflect on; a body that shines is.
+        (LAMP.format("") + LAMP.format("<bsdf type='null'/>") + CUBE.format(""), {"": 12}),
+        ("<bsdf type='null' id='air'/>" + CUBE.format("<ref id='air'/>") + CUBE.format(""), {"": 12}),
+        (LAMP.format("<bsdf type='diffuse' id='glow'/>"), {"glow": 2}),
+        # What reflects is what has the id, not what else is referred to; before or after the shape.
+        (CUBE.format("<ref id='em'/><ref id='m'/>") + "<bsdf type='diffuse' id='m'/><emitter type='point' id='em'/>", {"m": 12}),
+        ("<bsdf type='diffuse' id='m'/><alias id='m' as='n'/>" + CUBE.format("<ref id='n'/>"), {"m": 12}),
+        (CUBE.format("<bsdf type='twosided'><bsdf type='diffuse' id='in'/></bsdf>"), {"in": 12}),
+        (CUBE.format("<bsdf type='blendbsdf'><bsdf type='a' id='x'/><bsdf type='b' id='y'/></bsdf>"), {"": 12}),
+        # A group may stand after who stands for it, and be stood for twice.
+        ("<shape type='instance'><ref id='g'/></shape>" * 2 + "<shape type='shapegroup' id='g'><shape type='rectangle'/></shape>", {"": 4}),
+        # What a shape includes is its own; and a part may be the file.
+        (CUBE.format("<include filename='prop.xml'/>") + "<include filename='one.xml'/>", {"z": 12, "": 2}),
+    ],
+)  # fmt: skip
+def test_what_shows_and_what_it_is_of(tmp_path: Path, text: str, slots: dict[str, int]) -> None:
+    (tmp_path / "prop.xml").write_text("<scene version='3.0.0'><bsdf type='diffuse' id='z'/></scene>")
+    (tmp_path / "one.xml").write_text("<shape type='rectangle'/>")
+    assert _slots(tmp_path, text) == slots
+
+
+def test_the_last_path_is_looked_in_first(tmp_path: Path) -> None:
+    for folder, size in ((".", 1.0), ("a", 2.0), ("b", 3.0)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        body = trimesh.creation.box((size, size, size))
+        (tmp_path / folder / "m.ply").write_bytes(body.export(file_type="ply"))
+    file = tmp_path / "some.xml"
+    mesh = "<shape type='ply'><string name='filename' value='m.ply'/></shape>"
+    for paths, size in (("", 1.0), ("<path value='a'/>", 2.0), ("<path value='a'/><path value='b'/>", 3.0)):
+        file.write_text(f"<scene version='3.0.0'>{paths}{mesh}</scene>")
+        assert np.ptp(read_mesh(file)[0].vertices[:, 0]) == pytest.approx(size)
+
+
+def test_pictures_lie_as_mitsuba_lays_them(tmp_path: Path) -> None:
+    """There v is down a picture: that of OBJ is turned as it is read, that of PLY is as it stands."""
+    obj = "v 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 0.75\nf 1/1 2/2 3/3\n"
+    (tmp_path / "t.obj").write_text(obj)
+    ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty float s\n"
+    ply += "property float t\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "t.ply").write_text(ply + "0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 0.75\n3 0 1 2\n")
+    for kind, flip, v in (
+        ("obj", "", 0.75),
+        ("obj", "false", 0.25),
+        ("ply", "", 0.25),
+        ("ply", "true", 0.75),
+    ):
+        turned = f"<boolean name='flip_tex_coords' value='{flip}'/>" if flip else ""
+        file = tmp_path / "some.xml"
+        file.write_text(
+            f"<scene version='3.0.0'><shape type='{kind}'><string name='filename' value='t.{kind}'/>{turned}</shape></scene>"
+        )
+        (part,) = read_mesh(file)
+        assert part.uvs is not None
+        highest = part.uvs[np.argmax(part.vertices[:, 0] + part.vertices[:, 1])]
+        assert highest == pytest.approx([1.0, v]), (kind, flip)
+
+
+def test_round_shapes_stay_round_beside_flat_ones(tmp_path: Path) -> None:
+    """Of another slot, too: what is flat has a normal for each triangle."""
+    file = tmp_path / "some.xml"
+    file.write_text(
+        "<scene version='3.0.0'><shape type='sphere'><bsdf type='diffuse' id='a'/></shape><shape type='cube'/></scene>"
+    )
+    parts = {part.slot: part for part in read_mesh(file)}
+    flat, round_ = parts[""], parts["a"]
+    assert flat.normals is not None
+    assert round_.normals is not None
+    assert np.abs(flat.normals).max(axis=1) == pytest.approx(1.0)
+    assert len(np.unique(round_.normals, axis=0)) > 1000
+
+
+def test_what_is_wrong_with_a_named_file_names_it(tmp_path: Path) -> None:
+    (tmp_path / "bad.obj").write_text("v 0 0 0\nf 1 2 9\n")
+    text = "<scene>\n\n<shape type='obj'><string name='filename' value='bad.obj'/></shape></scene>"
+    (tmp_path / "m.xml").write_text(text)
+    with pytest.raises(InputError, match=r"line 3: .*bad\.obj: line 2"):
+        _scene(tmp_path, tmp_path / "m.xml")
+    for text in (
+        "<?xml version='1.0' encoding='foo'?><scene/>",
+        f"<scene><shape type='ply'><string name='filename' value='{'x' * 300}'/></shape></scene>",
+    ):
+        (tmp_path / "m.xml").write_text(text)
+        with pytest.raises(InputError, match="line 1"):
+            _scene(tmp_path, tmp_path / "m.xml")
