@@ -133,7 +133,7 @@ def load_campaign(path: str | Path) -> Campaign:
         )
     if not document.bounds:
         problems += [
-            places.tell(("axes", axis.name), ("axes", axis.name), "'refine' finds limits: state 'bounds' too")
+            places.tell(("axes", axis.name), ("axes", axis.name), "'refine' finds limits: give 'bounds' too")
             for axis in axes
             if axis.refinement is not None
         ]

@@ -116,7 +116,7 @@ def word_of(text: str) -> int:
     if len(text) == 1:
         return _character(text)
     raise ValueError(
-        f"{text!r} is no command; wanted one of {', '.join(COMMANDS)}, one ASCII character, or 'word 17'"
+        f"{text[:40]!r} is no command; wanted one of {', '.join(COMMANDS)}, one ASCII character, or 'word 17'"
     )
 
 
@@ -158,5 +158,5 @@ def packet_levels(
 
 def _character(character: str) -> int:
     if not 32 <= ord(character) <= 126:
-        raise ValueError(f"{character!r} is no printable ASCII character (32 to 126)")
+        raise ValueError(f"{character!r} is no printable ASCII character (32 to 126); take one")
     return ord(character)

@@ -86,7 +86,7 @@ def _filled(raw: Element, scene: _Scene, path: Path) -> Element:
 
     def value(match: re.Match[str]) -> str:
         if match[1] not in scene.parameters:
-            raise raw.wrong(f"${match[1]} has no value; add <default name='{match[1]}' value='…'/>")
+            raise raw.wrong(f"${match[1]} has no value; write <default name='{match[1]}' value='…'/>")
         return scene.parameters[match[1]]
 
     attributes = {name: _PARAMETER.sub(value, text) for name, text in raw.attributes.items()}

@@ -210,7 +210,7 @@ def test_two_combinations_that_are_one_scene_are_refused(tmp_path: Path) -> None
 
 def test_limits_are_refined_where_there_are_bounds_and_a_plan_says_so(tmp_path: Path) -> None:
     axes = {"range": {"path": "robots.r2.position.x", "values": ["1 m", "2 m", "4 m"], "refine": "2 %"}}
-    with pytest.raises(InputError, match="'refine' finds limits: state 'bounds' too"):
+    with pytest.raises(InputError, match="'refine' finds limits: give 'bounds' too"):
         load_campaign(written(tmp_path, axes=axes, bounds={}))
     campaign, jobs = planned(tmp_path, axes=axes)
     assert plan_record(campaign, jobs, tmp_path / "out")["refined"] == ["range"]
