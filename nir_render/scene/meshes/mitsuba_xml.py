@@ -174,7 +174,7 @@ def _group_of(instance: Element, scene: _Scene) -> Element:
         name = scene.aliases.get(name, name)
         if one.tag == "ref" and name in scene.groups:
             return scene.groups[name]
-    raise instance.wrong("an instance names no <shape type='shapegroup'>; add a <ref id='…'/> of one")
+    raise instance.wrong("an instance names no <shape type='shapegroup'>; write a <ref id='…'/> of one")
 
 
 def _material_of(shape: Element, scene: _Scene) -> tuple[Element | None, str]:

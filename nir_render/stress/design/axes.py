@@ -289,7 +289,7 @@ class AxisDocument(Document):
         if begin == end:
             raise ValueError("'from' and 'to' are the same; write two ends")
         if self.spacing == "log" and min(begin, end) <= 0.0:
-            raise ValueError("a log range needs 'from' and 'to' above 0")
+            raise ValueError("a log range needs 'from' and 'to' above 0: give such")
         return first, begin, end
 
     def _range(self) -> tuple[Any, ...]:
