@@ -22,7 +22,7 @@ from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
 from nir_render.camera.mean_frame import MeanFrame, Rates
 from nir_render.camera.optics.apertures import Aperture, aperture_weights, flare_apertures
 from nir_render.camera.sensor.read_out import dark_variance_e2
-from nir_render.light.enlarge import Enlargement, enlarge, enlarge_variance, without_edges
+from nir_render.light.enlarge import ALL_ROWS, Enlargement, enlarge, enlarge_variance, without_edges
 from nir_render.light.light import Light
 from nir_render.randomness import generator
 from nir_render.scene.documents.camera import Camera
@@ -36,7 +36,6 @@ _NEARLY_ALL = 0.99
 _PIXELS_DRAWN = 2_000_000
 _MOST_DRAWS = 64
 _ROW_STEP, _LEAST_PIXELS = 7, 1000  # of a median that is only to be told
-_ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,7 @@ class _Frame:
     squares_s2: Array
 
     @classmethod
-    def of(cls, mean: MeanFrame, chosen: slice = _ALL) -> "_Frame | None":
+    def of(cls, mean: MeanFrame, chosen: slice = ALL_ROWS) -> "_Frame | None":
         """Return those of a frame; None where rendering has no noise."""
         if mean.light.indirect is None:
             return None
@@ -281,7 +280,7 @@ def render_variance_e2(
     return _of_pixels_e2(light, camera, _variances(light, snapshot, exposure_s, levels))
 
 
-def _of_pixels_e2(light: Light, camera: Camera, parts: _Parts, chosen: slice = _ALL) -> Array:
+def _of_pixels_e2(light: Light, camera: Camera, parts: _Parts, chosen: slice = ALL_ROWS) -> Array:
     rows, columns = camera.sensor.rows, camera.sensor.columns
     total, enlargement = np.zeros((len(range(rows)[chosen]), columns)), _enlargement(light)
     for factor, variance, patch in parts:

@@ -17,7 +17,7 @@ from perception.compiled import compiled
 
 Array = NDArray[np.float64]
 
-_ALL = slice(None)
+ALL_ROWS = slice(None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ def enlarge_variance(
     columns: int,
     enlargement: Enlargement | None = None,
     patch: Array | None = None,
-    chosen: slice = _ALL,
+    chosen: slice = ALL_ROWS,
 ) -> Array:
     """Return the variance of each pixel of an enlarged image of independent blocks.
 

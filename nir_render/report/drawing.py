@@ -25,9 +25,7 @@ class Drawing:
 
 def sheet(height_in: float) -> Figure:
     """Return an empty figure of the page's width."""
-    figure = Figure((_WIDTH_IN, height_in), layout="constrained", dpi=130)
-    FigureCanvasSVG(figure)
-    return figure
+    return Figure((_WIDTH_IN, height_in), layout="constrained", dpi=130)
 
 
 def svg_of(figure: Figure) -> str:

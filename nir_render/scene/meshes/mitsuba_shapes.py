@@ -7,7 +7,9 @@ normals shade them as if they were round. Cylinders are open, as Mitsuba's are.
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from nir_render.geometry import perpendiculars
 from nir_render.scene.meshes.mesh import Array, MeshPart, moved
 from nir_render.scene.meshes.xml import Element, numbers_of, vector_of
 
@@ -46,9 +48,8 @@ def _scale(step: Element) -> Array:
 
 def _rotate(step: Element) -> Array:
     axis = _unit(step, vector_of(step), "the axis")
-    (angle_rad,) = np.deg2rad(numbers_of(step, step.attributes.get("angle", "0"))[:1])
-    across = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    return _affine(np.eye(3) + np.sin(angle_rad) * across + (1.0 - np.cos(angle_rad)) * across @ across)
+    (angle_deg,) = numbers_of(step, step.attributes.get("angle", "0"))[:1]
+    return _affine(Rotation.from_rotvec(angle_deg * axis, degrees=True).as_matrix())
 
 
 def _look_at(step: Element) -> Array:
@@ -96,9 +97,8 @@ def _cube(_shape: Element) -> MeshPart:
 
 
 def _disk(_shape: Element) -> MeshPart:
-    around = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
     radius = np.sqrt(2.0 * np.pi / (_SIDES * np.sin(2.0 * np.pi / _SIDES)))  # of the disk's area
-    ring = radius * np.column_stack([np.cos(around), np.sin(around), np.zeros(_SIDES)])
+    ring = radius * _circle()
     at = np.arange(1, _SIDES + 1)
     faces = np.column_stack([np.zeros(_SIDES, dtype=np.int64), at, at % _SIDES + 1])
     return MeshPart("", np.vstack([np.zeros(3), ring]), None, faces.astype(np.uint32))
@@ -118,8 +118,7 @@ def _sphere(shape: Element) -> MeshPart:
 def _cylinder(shape: Element) -> MeshPart:
     low, high = _triple(shape, "p0"), _triple(shape, "p1", (0.0, 0.0, 1.0))
     along = _unit(shape, high - low, "the way from p0 to p1")
-    around = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
-    normals = np.column_stack([np.cos(around), np.sin(around), np.zeros(_SIDES)])
+    normals = _circle()
     ring = _radius(shape) * np.pi / (_SIDES * np.sin(np.pi / _SIDES)) * normals  # as long as the circle
     at, after = np.arange(_SIDES), (np.arange(_SIDES) + 1) % _SIDES
     faces = np.vstack(
@@ -131,9 +130,7 @@ def _cylinder(shape: Element) -> MeshPart:
         np.vstack([normals, normals]),
         faces.astype(np.uint32),
     )
-    aside = np.eye(3)[np.argmin(np.abs(along))]
-    left = _unit(shape, np.cross(aside, along), "the cylinder's side")
-    return moved(upright, _affine(np.stack([left, np.cross(along, left), along], axis=1), low))
+    return moved(upright, _affine(np.stack([*perpendiculars(along), along], axis=1), low))
 
 
 SHAPES: Mapping[str, Callable[[Element], MeshPart]] = {
@@ -144,6 +141,12 @@ SHAPES: Mapping[str, Callable[[Element], MeshPart]] = {
     "cylinder": _cylinder,
 }
 """By Mitsuba's names of types."""
+
+
+def _circle() -> Array:
+    """Return points around z at a distance of 1, shape (_SIDES, 3)."""
+    around_rad = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    return np.column_stack([np.cos(around_rad), np.sin(around_rad), np.zeros(_SIDES)])
 
 
 def _radius(shape: Element) -> float:

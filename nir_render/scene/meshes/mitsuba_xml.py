@@ -119,7 +119,7 @@ def _included(include: Element, scene: _Scene) -> list[Element]:
     except (ValueError, OSError) as error:
         raise include.wrong(f"{path}: {error}") from None
     finally:
-        scene.folders.remove(path.parent)
+        scene.folders.pop()
         scene.reading.pop()
     return root.children if root.tag == "scene" else [root]
 

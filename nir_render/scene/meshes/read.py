@@ -163,6 +163,5 @@ def _part(found: dict[str, Any], slot: str, to_world: Array) -> MeshPart:
 
 def _stood_up(part: MeshPart) -> MeshPart:
     """Return a part whose y is up with z up: x stays."""
-    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    normals = None if part.normals is None else part.normals @ turn.T
-    return MeshPart(part.slot, part.vertices @ turn.T, normals, part.faces, part.uvs)
+    turn = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    return moved(part, np.array(turn))

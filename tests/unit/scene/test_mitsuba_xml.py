@@ -225,6 +225,12 @@ def test_the_last_path_is_looked_in_first(tmp_path: Path) -> None:
     for paths, size in (("", 1.0), ("<path value='a'/>", 2.0), ("<path value='a'/><path value='b'/>", 3.0)):
         file.write_text(f"<scene version='3.0.0'>{paths}{mesh}</scene>")
         assert np.ptp(read_mesh(file)[0].vertices[:, 0]) == pytest.approx(size)
+    # What is included from there leaves it where it is.
+    (tmp_path / "a" / "nothing.xml").write_text("<scene version='3.0.0'/>")
+    file.write_text(
+        f"<scene version='3.0.0'><path value='a'/><include filename='nothing.xml'/>{mesh}</scene>"
+    )
+    assert np.ptp(read_mesh(file)[0].vertices[:, 0]) == pytest.approx(2.0)
 
 
 def test_pictures_lie_as_mitsuba_lays_them(tmp_path: Path) -> None:
