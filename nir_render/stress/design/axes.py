@@ -163,7 +163,7 @@ class AxisDocument(Document):
         if self.labels is not None and (self.values is None or len(self.labels) != len(self.values)):
             raise ValueError("'labels' names each of the 'values': wanted as many of them")
         if self.labels is not None and len(set(self.labels)) != len(self.labels):
-            raise ValueError("two of the 'labels' are the same")
+            raise ValueError("two of the 'labels' are the same: give each value its own")
         return self
 
     def _drawn(self) -> Self:

@@ -126,10 +126,8 @@ def _brought_to_fog(
         brought = brought_to_stretch(scene, k, origin, direction, begin, end, active)
         if scene.lights.sky >= 0:  # fog does not ask for it, but its paths come from there
             brought = dr.select(k == scene.lights.sky, of_sky, brought)
-        sums = [
-            total + connect.of_tier(scene.lights, k, mi.UInt32(number), brought)
-            for number, total in enumerate(sums)
-        ]
+        tier = dr.gather(mi.UInt32, scene.lights.tier, k)
+        sums = [total + dr.select(tier == number, brought, 0.0) for number, total in enumerate(sums)]
         return k + 1, sums
 
     width = dr.width(direction)

@@ -32,9 +32,17 @@ class Draws:
     samples: UInt
 
     def pixel(self, sample: UInt, dimension: int) -> Float:
-        """Return a stratified number in [0, 1) for a sample's place in the pixel, or its tier."""
+        """Return a stratified number in [0, 1) for a sample's place in the pixel."""
         bits = self._bits(sample, mi.UInt32(dimension))
         return self._even(sample, mi.UInt32(dimension), _unit(bits))
+
+    def tier(self, sample: UInt) -> Float:
+        """Return a stratified number in [0, 1) for a sample's tier, the strata in their order.
+
+        So lanes side by side serve the same tier most of the time, and loop over as many lights.
+        """
+        plain = _unit(self._bits(sample, mi.UInt32(TIER)))
+        return dr.minimum((mi.Float(sample) + plain) / mi.Float(self.samples), _BELOW_ONE)
 
     def vertex(self, sample: UInt, depth: UInt, purpose: UInt) -> Float:
         """Return a number in [0, 1) for a vertex of a path, stratified for its first; `purpose` < STEP."""

@@ -96,13 +96,15 @@ def _light_for_stretch(
     chance returned is then the one that makes the estimate right on average.
     """
     few = weighs_all(scene)
+    first, count = connect.lights_of_tier(scene.lights, state.tier, active) if few else (0, _CANDIDATES)
 
     def weigh(k: UInt) -> tuple[UInt, Float]:
-        row, chance = (k, 1.0) if few else _candidate(scene, state, begin, end, k, number)
-        weight = brought_to_stretch(scene, row, state.origin, state.direction, begin, end, active)
-        return row, connect.of_tier(scene.lights, row, state.tier, weight) / chance
+        if few:
+            row, chance = connect.row_of_tier(scene.lights, state.tier, first + k, active), 1.0
+        else:
+            row, chance = _candidate(scene, state, begin, end, k, number)
+        return row, brought_to_stretch(scene, row, state.origin, state.direction, begin, end, active) / chance
 
-    count = scene.lights.count if few else _CANDIDATES
     row, weight, total = draws.draw_by_weight(count, weigh, number(draws.FOG_LIGHT))
     if few:
         return row, weight / total

@@ -26,10 +26,10 @@ from nir_render.transport.world.emitters import SKY, SUN
 
 # Shares of directions that go into the halo of a light, from surfaces in fog and from fog itself. Each turn
 # that misses the halo weighs by one over what is left: near 1 it must be, as paths turn often.
-_FROM_SURFACE, _FROM_FOG = 0.25, 0.15
+_FROM_SURFACE, _FROM_FOG = 0.5, 0.15
 # So many times more often than light do paths turn in fog: what comes of it varies more than what comes from
 # surfaces.
-_TURNS = 3.0
+_TURNS = 1.5
 _BRIGHTEST_PER_SR = 10.0  # how bright a halo counts, at most, in front of a path that turns
 
 
@@ -165,7 +165,8 @@ class _Halos:
         self.place, self.heading, self.turned, self.active = place, heading, turned, active
         self.tier, self.total = tier, None
         if weighs_all(scene):
-            self.row, _, self.total = draws.draw_by_weight(self.lights.count, self._weigh, u)
+            self.first, self.count = connect.lights_of_tier(self.lights, tier, active)
+            self.row, _, self.total = draws.draw_by_weight(self.count, self._weighed, u)
         else:
             cell = connect.guide_cell(scene.choice, place, tier)
             self.row, _ = connect.choose_light(scene.choice, scene.lights, cell, u)
@@ -183,17 +184,19 @@ class _Halos:
             return self._density(self._axis(self.row)[0], direction)
 
         def more(k: UInt, _sum: Float) -> Mask:
-            return k < self.lights.count
+            return k < self.count
 
         def add(k: UInt, density: Float) -> tuple[UInt, Float]:
-            return k + 1, density + self._weigh(k)[1] * self._density(self._axis(k)[0], direction)
+            row, weight = self._weighed(k)
+            return k + 1, density + weight * self._density(self._axis(row)[0], direction)
 
         width = dr.width(direction)
         start = (dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width))
         return dr.while_loop(start, more, add)[1] / self.total
 
-    def _weigh(self, row: UInt) -> tuple[UInt, Float]:
-        """Return a light and how much of its halo a path brings on, roughly: never nothing."""
+    def _weighed(self, k: UInt) -> tuple[UInt, Float]:
+        """Return a light of the tier, and how much of its halo a path brings on, roughly: never nothing."""
+        row = connect.row_of_tier(self.lights, self.tier, self.first + k, self.active)
         axis, distance = self._axis(row)
         spread = dr.gather(mi.Float, self.lights.spread, row, self.active)
         weight = dr.gather(mi.Float, self.lights.power, row, self.active)
@@ -205,8 +208,7 @@ class _Halos:
         ahead = phase_function(self.fog, turn) + dr.minimum(
             self._density(axis, self.heading), _BRIGHTEST_PER_SR
         )
-        weight = dr.maximum(dr.select(self.turned, weight * ahead, weight), 1e-12)
-        return row, connect.of_tier(self.lights, row, self.tier, weight)
+        return row, dr.maximum(dr.select(self.turned, weight * ahead, weight), 1e-12)
 
     def _axis(self, row: UInt) -> tuple[Vector, Float]:
         """Return the direction of a light, and its distance; the sun counts as a metre away."""

@@ -86,10 +86,8 @@ def walk(
     deal = deal_of(scene, film.origin, camera_direction(film, pixel, mi.Float(0.5), mi.Float(0.5)))
 
     def begin(sample: UInt) -> _Begin:
-        along, down, dealt = (
-            draw.pixel(sample, purpose) for purpose in (draws.PIXEL_U, draws.PIXEL_V, draws.TIER)
-        )
-        return camera_direction(film, pixel, along, down), *deal.tier_of(dealt)
+        along, down = (draw.pixel(sample, purpose) for purpose in (draws.PIXEL_U, draws.PIXEL_V))
+        return camera_direction(film, pixel, along, down), *deal.tier_of(draw.tier(sample))
 
     def step(state: PathState) -> tuple[PathState]:
         return (_step(scene, state, draw, max_depth, add, begin, film.origin),)

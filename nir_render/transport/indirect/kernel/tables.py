@@ -42,6 +42,8 @@ class Lights:
     power: Float
     tier: UInt
     tiers: int
+    by_tier: UInt  # rows, tier by tier
+    first_of_tier: UInt  # where those of a tier begin in `by_tier`, and where the last ends
     pattern: Float  # values of all patterns, one after the other
     pattern_first: Int  # where each light's begins, −1 for none
     pattern_azimuths: UInt
@@ -189,6 +191,8 @@ def upload_lights(
         power=_real(power[emitters.group]),
         tier=_whole(tier),
         tiers=int(tier.max(initial=0)) + 1,
+        by_tier=_whole(np.argsort(tier, kind="stable")),
+        first_of_tier=_whole(np.searchsorted(np.sort(tier), np.arange(int(tier.max(initial=0)) + 2))),
         pattern=_real(np.concatenate(values)),
         pattern_first=mi.Int32(np.array(first, dtype=np.int32)),
         pattern_azimuths=_whole(np.array(azimuths)),
