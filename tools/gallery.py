@@ -25,7 +25,7 @@ PICTURES = ROOT / "docs" / "gallery"
 SHOWN = {
     "Rooms and halls": ("arena", "corridor", "clutter_around", "crowd", "warehouse", "workshop"),
     "Mirrors and glass": ("glass_room", "mirror_corridor", "retroreflectors"),
-    "Out of doors, and in fog": ("sunlit_yard", "yard_in_fog", "foggy_hall", "greenhouse"),
+    "Out of doors, and in fog": ("sunlit_yard", "yard_in_fog", "ground_fog", "foggy_hall", "greenhouse"),
     "Robots that move and talk": ("crossing", "occlusion", "sixteen_talkers", "swarm_30"),
 }
 WIDTH_PX, QUALITY = 960, 80

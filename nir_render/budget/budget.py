@@ -32,6 +32,7 @@ from nir_render.scene.documents.base import Orientation
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.times.drives import FULL_DRIVE
+from nir_render.scene.fog_depth import extinction_among_robots_per_m
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.calibration import calibration
@@ -90,7 +91,10 @@ class CameraBudget:
 
 @dataclass(frozen=True)
 class Budget:
-    """The photon budget of a scene at a time; `fog` is what `Fog.facts` tells, None in clear air."""
+    """The photon budget of a scene at a time; `fog` is what `Fog.facts` tells, None in clear air.
+
+    Where fog varies over height, `extinction_per_m` is that where robots carry their sources.
+    """
 
     name: str
     scene: str
@@ -140,7 +144,7 @@ def photon_budget(
         name=scene.document.name or "",
         scene=scene.path,
         time_s=time_s,
-        extinction_per_m=_extinction_per_m(snapshot),
+        extinction_per_m=extinction_among_robots_per_m(snapshot),
         fog=None if snapshot.fog is None else snapshot.fog.facts(),
         assumptions=assumed,
         cameras=tuple(
@@ -215,7 +219,7 @@ def _source_budget(
     assumed: Assumptions,
 ) -> SourceBudget:
     mean_intensity = source.sent_flux_w / (4.0 * math.pi)
-    extinction_per_m, leaks = _extinction_per_m(snapshot), leak(camera, source).out_of_band_shares
+    extinction_per_m, leaks = extinction_among_robots_per_m(snapshot), leak(camera, source).out_of_band_shares
     return SourceBudget(
         sources=tuple(names),
         drives={name: drive_text(ranged[name]) for name in names},
@@ -281,10 +285,6 @@ def _kind_of(source: Source) -> Source:
 def _bare(camera: Camera) -> Camera:
     placeless = {"position_m": (0.0, 0.0, 0.0), "orientation": Orientation(), "serial": None, "clock": None}
     return camera.model_copy(update=placeless)
-
-
-def _extinction_per_m(snapshot: Snapshot) -> float:
-    return 0.0 if snapshot.fog is None else snapshot.fog.extinction_per_m
 
 
 def _finite(value: Any) -> Any:

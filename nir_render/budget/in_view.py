@@ -15,10 +15,10 @@ from nir_render.camera.optics.lens import Intrinsics, intrinsics_of
 from nir_render.camera.timing.drive import mean_level
 from nir_render.camera.timing.exposure_control import Setting
 from nir_render.scene.documents.camera import Camera
+from nir_render.scene.fog_depth import optical_depth
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import PlacedSource, Snapshot
 from nir_render.simulation.flare_spread import flare_spread
-from nir_render.transport.direct.rays import length_in_box_m
 from nir_render.transport.world.pattern import pattern_of, relative_intensity
 from perception.types import Calibration
 
@@ -187,9 +187,7 @@ def _seen(snapshot: Snapshot, name: str, placed: PlacedSource, pose: Pose, lens:
     if snapshot.fog is not None:
         # Up to the source's surface, as light is rendered.
         surface_m = np.array([max(range_m - placed.source.radius_m, 0.0)])
-        box = snapshot.fog.region_m()
-        in_fog_m = length_in_box_m(pose.position_m[None], towards[None], surface_m, *box)
-        passed = math.exp(-snapshot.fog.extinction_per_m * float(in_fog_m[0]))
+        passed = math.exp(-optical_depth(snapshot.fog, pose.position_m[None], towards[None], surface_m)[0])
     direction = towards @ pose.rotation
     u_px, v_px = (float(value) for value in lens.project(direction))
     is_robots = name in snapshot.carried_sources

@@ -164,10 +164,13 @@ def fog_sentence(fog: Mapping[str, Any]) -> str:
         f"(σ(940)/σ(550) = {fog['ratio_940_to_550']:.3f}{sigma}, that of {fog['ratio_of']}); "
         f"1 − albedo {fog['absorbed_share']:.2g}, g {fog['asymmetry']:.3f}"
     )
-    if fog["droplets_per_cm3"] is None:
-        return f"{text}."
-    number, volume = fog["droplets_per_cm3"], fog["volume_cm3_per_m3"]
-    return f"{text}; {number:.3g} droplets per cm³, {volume:.3g} cm³ of them in a m³."
+    if fog["droplets_per_cm3"] is not None:
+        number, volume = fog["droplets_per_cm3"], fog["volume_cm3_per_m3"]
+        text += f"; {number:.3g} droplets per cm³, {volume:.3g} cm³ of them in a m³"
+    if fog["profile"] is not None:
+        points = ", ".join(f"{density:g} at {height_m:g} m" for height_m, density in fog["profile"])
+        text += f". Of that by height: {points}; linear between, and the budget at the sources' height"
+    return f"{text}."
 
 
 def source_sentences(source: SourceBudget) -> str:

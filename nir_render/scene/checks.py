@@ -190,10 +190,10 @@ def _pictures_without_a_place(document: SceneDocument) -> list[str]:
 
 def _fog_up_to_the_sun(document: SceneDocument) -> list[str]:
     fog = document.fog
-    endless = fog is not None and fog.extinction_per_m > 0.0 and fog.top_m is None and fog.size_m is None
+    endless = fog is not None and fog.extinction_per_m > 0.0 and not math.isfinite(fog.region_m()[1][2])
     problem = (
         "fog: has no end on the way to the sun, so that the sun is black; give it a 'top', such as '4 m', "
-        "or make it a bank with 'center' and 'size'"
+        "make it a bank with 'center' and 'size', or let its 'profile' end with 0"
     )
     return [problem] if endless and document.sun is not None else []
 

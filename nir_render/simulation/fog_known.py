@@ -16,6 +16,7 @@ from nir_render.errors import InputError
 from nir_render.scattering.forward import scattered_forward
 from nir_render.scattering.optics import ANGLE_RAD
 from nir_render.scene.documents.ambient.droplets import Droplets
+from nir_render.scene.fog_depth import extinction_among_robots_per_m
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from perception.types import Calibration, ForwardLight
@@ -35,7 +36,7 @@ def knowing_fog(
     droplets: tuple[str, ...] = USUAL,
     extinction_sigma_per_m: float = _EXACT_PER_M,
 ) -> Calibration:
-    """Return a calibration of a robot that knows the extinction of the scene's fog.
+    """Return a calibration of a robot that knows the extinction of the scene's fog, where sources are.
 
     Parameters
     ----------
@@ -53,14 +54,15 @@ def knowing_fog(
     InputError
         The scene has no fog, or no droplets of such a name are known.
     """
-    fog = (world.at(0.0) if isinstance(world, Scene) else world).fog
+    snapshot = world.at(0.0) if isinstance(world, Scene) else world
+    fog = snapshot.fog
     if fog is None or fog.extinction_per_m == 0.0:
         raise InputError("there is no fog to know of; give the scene one, such as fog: {visibility: 50 m}")
     if not droplets:
         raise InputError("droplets: none is named; name one of those that the fog may be of, or more")
     return replace(
         known,
-        extinction_per_m=fog.extinction_per_m,
+        extinction_per_m=extinction_among_robots_per_m(snapshot),
         forward_light=forward_light(droplets),
         sigma={**known.sigma, "extinction_per_m": extinction_sigma_per_m},
     )

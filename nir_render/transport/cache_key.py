@@ -225,12 +225,13 @@ def _file(name: str) -> tuple[str, str]:
 
 
 def _fog(fog: Fog | None) -> tuple[str, dict[str, Any]] | None:
-    """Return a fog; droplets count only where there are some, so that others keep their random numbers."""
+    """Return a fog; droplets and profile count only where there are some: others keep their numbers."""
     if fog is None:
         return None
     fields = {name: getattr(fog, name) for name in type(fog).model_fields}
-    if fog.droplets is None:
-        del fields["droplets"]
+    for name in ("droplets", "profile"):
+        if fields[name] is None:
+            del fields[name]
     return type(fog).__name__, fields
 
 

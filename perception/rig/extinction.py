@@ -51,10 +51,11 @@ def estimated_extinction(
     calibrations: Mapping[str, Calibration],
     images: Collection[Key] = (),
 ) -> Extinction | None:
-    """Estimate the extinction of homogeneous fog from a set's detections.
+    """Estimate the extinction of fog from a set's detections.
 
     Least squares for σ and the error k of the range constant, each with its prior; a source whose own flux
-    differs (σ_K once more) is one of many. What is off by 4 σ is left out.
+    differs (σ_K once more) is one of many. What is off by 4 σ is left out. It may be an odd source, or fog
+    that is thinner on its way: so the mean square of what it is off by, over all sources, counts in σ.
 
     Parameters
     ----------
@@ -94,12 +95,15 @@ def estimated_extinction(
     for _ in range(3):
         estimate, k = _line(slope[kept], said[kept], variance[kept], prior, constant)
         off = said - slope * estimate.per_m - k
-        again = abs(off) < OUTLIER_SIGMAS * np.sqrt(variance + (slope * estimate.sigma_per_m) ** 2)
+        expected2 = variance + (slope * estimate.sigma_per_m) ** 2
+        again = off**2 < OUTLIER_SIGMAS**2 * expected2
         if not again.any():
             return None
         if (again == kept).all():
             break
         kept = again
+    uneven2 = np.where(kept, 0.0, (off**2 - expected2) / slope**2).mean()
+    estimate = replace(estimate, sigma_per_m=math.hypot(estimate.sigma_per_m, math.sqrt(max(uneven2, 0.0))))
     return estimate if estimate.sigma_per_m < DETERMINED * prior.sigma_per_m else None
 
 

@@ -154,6 +154,15 @@ FURNACES: dict[str, tuple[int, dict[str, Any]]] = {
     "even fog": (
         32, {"fog": {"extinction": "1 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.0}}},
     ),
+    "fog by height": (
+        32,
+        {
+            "fog": {
+                "extinction": "2 /m", "albedo": 1.0, "phase": {"type": "henyey_greenstein", "g": 0.5},
+                "profile": [["-0.8 m", 0.0], ["-0.2 m", 1.0], ["0.3 m", 0.1], ["0.6 m", 0.8]],
+            }
+        },
+    ),
     "bank of fog": (
         32,
         {

@@ -12,12 +12,29 @@ from nir_render.errors import InputError, shown
 from nir_render.scattering.optics import Optics, mean_cosine
 from nir_render.scene.documents.ambient.droplets import Droplets
 from nir_render.scene.documents.base import Document, Extinction, Fraction, Length, Position, Size3, typed
-from nir_render.scene.documents.curves import Points, one_form, parse_half_turn, read_curve, write_points
+from nir_render.scene.documents.curves import (
+    Points,
+    one_form,
+    parse_half_turn,
+    parse_points,
+    read_curve,
+    write_points,
+)
 from nir_render.scene.documents.files import resolve_file
-from nir_render.scene.text.units import ANGLE, EXTINCTION, VISIBILITY, format_quantity, parse_quantity
+from nir_render.scene.text.units import (
+    ANGLE,
+    EXTINCTION,
+    LENGTH,
+    VISIBILITY,
+    format_quantity,
+    parse_quantity,
+)
 
 # Koschmieder: an extinction of σ dims a contrast to 2 % over a distance of −ln 0.02 / σ = 3.912/σ.
 _VISIBILITY_TIMES_EXTINCTION = 3.912
+
+MOST_HEIGHTS = 63
+"""So many points a profile may have."""
 
 UNNAMED_DROPLETS = "radiation_heavy"
 """Whose σ(940)/σ(550) a visibility counts with where a scene names no droplets: the middle of four fogs."""
@@ -88,11 +105,14 @@ PhaseDocument = Annotated[
 
 
 class Fog(Document):
-    """Fog of one density: everywhere, below z = `top`, or in a box of `size` about `center`.
+    """Fog: everywhere, below z = `top`, or in a box of `size` about `center`.
 
     `extinction` is σ_t at 940 nm in light lost per metre; 0 /m is clear air. Or `visibility`, the
     meteorologist's, 3.912/σ_t at 550 nm: it becomes the extinction at 940 nm when the scene is loaded, by the
     droplets' σ(940)/σ(550), without droplets by that of `radiation_heavy`, 1.0275 ± 0.014 (assumed).
+
+    `profile` are [height, density] points, the density at heights over that of `extinction`: linear between
+    them, below and above as at the ends; where that is 0, the fog ends there. Without it density is one.
 
     `droplets` say all else by Mie theory. Without them `albedo` is the share of what is lost that is
     scattered, and not absorbed, and `phase` where to.
@@ -108,6 +128,16 @@ class Fog(Document):
     top_m: Length | None = None
     center_m: Position | None = None
     size_m: Size3 | None = None
+    profile: Points | None = None
+
+    @field_validator("profile", mode="before")
+    @classmethod
+    def _parse_profile(cls, points: Any) -> Any:
+        return None if points is None else parse_points(points, LENGTH, "height", "['0.5 m', 1.0]")
+
+    @field_serializer("profile")
+    def _write_profile(self, points: Points | None) -> list[list[Any]] | None:
+        return write_points(points, LENGTH)
 
     @model_validator(mode="before")
     @classmethod
@@ -149,6 +179,23 @@ class Fog(Document):
         return self
 
     @model_validator(mode="after")
+    def _profile_within_bounds(self) -> Self:
+        if self.profile is None:
+            return self
+        if len(self.profile) > MOST_HEIGHTS:
+            raise ValueError(
+                f"profile: has {len(self.profile)} points; wanted {MOST_HEIGHTS} at most, linear between them"
+            )
+        densest = max(density for _, density in self.profile)
+        if densest == 0.0:
+            raise ValueError("profile: is 0 at every height; leave the fog out for clear air")
+        if densest * self.extinction_per_m > EXTINCTION.most:
+            raise ValueError(
+                f"profile: {densest:g} times the extinction is beyond {EXTINCTION.most:g} 1/m; check both"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _one_place(self) -> Self:
         if (self.center_m is None) != (self.size_m is None):
             raise ValueError("a fog bank needs both 'center' and 'size'")
@@ -168,6 +215,10 @@ class Fog(Document):
         if self.center_m is not None and self.size_m is not None:
             center_m, half_m = np.array(self.center_m), 0.5 * np.array(self.size_m)
             low_m, high_m = center_m - half_m, center_m + half_m
+        if self.profile is not None:  # a density of 0 at an end is one beyond it
+            (lowest_m, below), (highest_m, above) = self.profile[0], self.profile[-1]
+            low_m[2] = low_m[2] if below else max(low_m[2], lowest_m)
+            high_m[2] = high_m[2] if above else min(high_m[2], highest_m)
         return low_m, high_m
 
     def asymmetry(self) -> float:
@@ -191,6 +242,7 @@ class Fog(Document):
         number_per_m3 = None if optics is None else self.extinction_per_m / optics.extinction_m2
         return {
             "extinction_per_m": self.extinction_per_m,
+            "profile": None if self.profile is None else [list(point) for point in self.profile],
             "visibility_m": _VISIBILITY_TIMES_EXTINCTION / visible_per_m if visible_per_m > 0.0 else None,
             "ratio_940_to_550": ratio,
             "ratio_sigma": None if known else UNNAMED_RATIO_SIGMA,

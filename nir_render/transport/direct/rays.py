@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from nir_render.geometry import sunflower
 from nir_render.scene.documents.fog import Fog
+from nir_render.scene.fog_depth import optical_depth
 from nir_render.scene.pose import Pose
 from nir_render.transport.backend.variant import blocked
 from nir_render.transport.direct.ways import SmallLights, Ways
@@ -115,18 +116,6 @@ def crossing(surfaces: Facets, facet: Any, start_m: Array, direction: Array) -> 
     return along_m, within
 
 
-def length_in_box_m(start_m: Array, direction: Array, length_m: Array, low_m: Array, high_m: Array) -> Array:
-    """Return how much of rays, shape (n, 3), lies in a box whose corners, shape (3,), may be infinite."""
-    still = direction == 0.0
-    outside = still & ((start_m < low_m) | (start_m > high_m))
-    safe = np.where(still, 1.0, direction)
-    one, other = (low_m - start_m) / safe, (high_m - start_m) / safe
-    enter_m = np.where(still, -np.inf, np.minimum(one, other)).max(axis=1)
-    leave_m = np.where(still, np.inf, np.maximum(one, other)).min(axis=1)
-    inside_m = np.minimum(leave_m, length_m) - np.maximum(enter_m, 0.0)
-    return np.where(outside.any(axis=1), 0.0, np.maximum(inside_m, 0.0))
-
-
 def _fans(ways: Ways, lights: SmallLights, pose: Pose, rays: int) -> tuple[NDArray[np.int64], Array, Array]:
     """Return each ray's way, its direction in the world, and its length up to the source's surface."""
     discs = zip(ways.direction, ways.angular_radius_rad, strict=True)
@@ -151,8 +140,7 @@ def _left(around: Surroundings, leg: _Leg, mirror: NDArray[np.int64] | None) -> 
     """Return the share of light that fog and panes leave on legs; `mirror` is the facet at an end of each."""
     share = np.ones(len(leg.length_m))
     if around.fog is not None and around.fog.extinction_per_m > 0.0:
-        fog_m = length_in_box_m(leg.start_m, leg.direction, leg.length_m, *around.fog.region_m())
-        share *= np.exp(-around.fog.extinction_per_m * fog_m)
+        share *= np.exp(-optical_depth(around.fog, leg.start_m, leg.direction, leg.length_m))
     for pane in np.flatnonzero(around.facets.kind == PANE):
         along_m, within = crossing(around.facets, pane, leg.start_m, leg.direction)
         crossed = within & (along_m > 0.0) & (along_m < leg.length_m)

@@ -247,7 +247,7 @@ def world_on_device(
     opaque = bodies
     if panes:
         opaque = None if traces_one_scene() else mitsuba_scene.build(snapshot, panes=False)
-    extinction_per_m = 0.0 if fog is None else fog.extinction_per_m
+    extinction_per_m = 0.0 if fog is None else fog.mean_extinction_per_m(low_m[2], high_m[2])
     choice = guide(shining, flat, power, low_m, high_m, extinction_per_m)
     columns = _shape_columns(snapshot, (bodies,) if opaque is None else (bodies, opaque), flat)
     return DeviceScene(
@@ -290,7 +290,8 @@ def default_depth(
         return CLEAR_DEPTH
     places_m = np.array([low_m, high_m, *(robot.pose.position_m for robot in snapshot.robots.values())])
     low_m, high_m = np.maximum(places_m.min(axis=0), fog.low_m), np.minimum(places_m.max(axis=0), fog.high_m)
-    optical_depth = fog.extinction_per_m * float(np.linalg.norm(np.maximum(high_m - low_m, 0.0)))
+    extinction_per_m = fog.mean_extinction_per_m(low_m[2], high_m[2])
+    optical_depth = extinction_per_m * float(np.linalg.norm(np.maximum(high_m - low_m, 0.0)))
     open_air = snapshot.sun is not None or snapshot.skylight is not None
     least, per_turn = _OPEN_FOG_DEPTH if open_air else _FOG_DEPTH
     return int(min(least + per_turn * optical_depth, _MOST_DEPTH))

@@ -1,4 +1,4 @@
-"""Fog as numbers: one homogeneous medium in a box, whose faces may be infinitely far."""
+"""Fog as numbers: a medium in a box, whose faces may be infinitely far, of one density or one over height."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,31 @@ from numpy.typing import NDArray
 
 from nir_render.scattering.optics import ANGLE_RAD
 from nir_render.scene.documents.fog import HenyeyGreenstein, TabulatedPhase
+from nir_render.scene.fog_depth import HeightProfile, height_profile
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.world.phase import PhaseTable, henyey_greenstein, phase_table, tabulated
 
 
 @dataclass(frozen=True, eq=False)
 class Medium:
-    """A fog: extinction, share of it that is scattering, the box it fills, and its phase function."""
+    """A fog: extinction, share of it that is scattering, the box it fills, and its phase function.
+
+    `profile` is its density over height, relatively; None where that is the same everywhere.
+    """
 
     extinction_per_m: float
     albedo: float
     low_m: NDArray[np.float64]
     high_m: NDArray[np.float64]
     phase: PhaseTable
+    profile: HeightProfile | None = None
+
+    def mean_extinction_per_m(self, low_m: float = -np.inf, high_m: float = np.inf) -> float:
+        """Return the mean extinction between two heights, at most those of the profile."""
+        if self.profile is None:
+            return self.extinction_per_m
+        ends_m = np.clip(np.array([low_m, high_m]), self.profile.height_m[0], self.profile.height_m[-1])
+        return self.extinction_per_m * float(self.profile.mean(ends_m[:1], ends_m[1:])[0])
 
 
 def medium(snapshot: Snapshot) -> Medium | None:
@@ -37,4 +49,4 @@ def medium(snapshot: Snapshot) -> Medium | None:
     else:
         assert fog.droplets is not None  # their document sees to it
         function = tabulated(ANGLE_RAD, fog.droplets.optics.phase_per_sr)
-    return Medium(fog.extinction_per_m, fog.albedo, low_m, high_m, phase_table(function))
+    return Medium(fog.extinction_per_m, fog.albedo, low_m, high_m, phase_table(function), height_profile(fog))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect
-from nir_render.transport.indirect.kernel.fog import absorbed_share, fog_interval
+from nir_render.transport.indirect.kernel.fog import absorbed_share, fog_interval, optical_depth
 from nir_render.transport.indirect.kernel.fog_scatter import brought_to_stretch, weighs_all
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import Float, Mask, Point, UInt, Vector
@@ -90,7 +90,7 @@ def deal_of(scene: DeviceScene, origin: Point, direction: Vector) -> Deal:
     met = si.is_valid()
     begin, end = fog_interval(fog, origin, direction, dr.select(met, si.t, _FAR))
     end = dr.maximum(begin, end)
-    lost = dr.select(met, absorbed_share(fog.extinction * (end - begin)), 1.0)
+    lost = dr.select(met, absorbed_share(optical_depth(fog, origin, direction, begin, end)), 1.0)
     in_fog = _brought_to_fog(scene, origin, direction, begin, end)
     surface = origin + direction * dr.select(met, si.t, 0.0)
     on_surface = _brought_to_place(scene, surface)
@@ -112,10 +112,10 @@ def _brought_to_fog(
     fog = scene.fog
     assert fog is not None  # only called in fog
     if not weighs_all(scene):
-        within = dr.minimum(0.5 * (end - begin), 1.0 / fog.extinction)
+        within = dr.minimum(0.5 * (end - begin), 1.0 / fog.typical)
         return _brought_to_place(scene, origin + direction * (begin + within))
     active, tiers = mi.Bool(end > begin), scene.lights.tiers
-    lost = absorbed_share(fog.extinction * (end - begin)) / fog.extinction
+    lost = absorbed_share(optical_depth(fog, origin, direction, begin, end)) / fog.typical
     row = mi.UInt32(max(scene.lights.sky, 0))
     of_sky = dr.gather(mi.Float, scene.lights.power, row) * lost / (2.0 * dr.pi)
 

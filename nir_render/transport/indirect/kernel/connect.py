@@ -56,7 +56,7 @@ def light_chance(choice: Choice, lights: Lights, cell: UInt, row: UInt, active: 
 
 
 def lights_of_tier(lights: Lights, tier: UInt | None, active: Mask) -> tuple[UInt, UInt]:
-    """Return where the lights of a tier begin in `by_tier`, and how many they are; all, where there is one."""
+    """Return where the lights of a tier begin in `by_tier`, and how many they are; all of one tier."""
     if tier is None:
         return mi.UInt32(0), lights.count
     first, end = (dr.gather(mi.UInt32, lights.first_of_tier, tier + k, active) for k in range(2))

@@ -1,7 +1,7 @@
 """Fog on the device: where a ray is in it, how far it gets, and how it turns."""
 
 from nir_render.transport.backend.variant import dr, mi
-from nir_render.transport.indirect.kernel.tables import FogTable, along_table
+from nir_render.transport.indirect.kernel.tables import HEIGHTS, FogTable, HeightTable, along_table
 from nir_render.transport.indirect.kernel.types import Float, Point, UInt, Vector
 from nir_render.transport.world.phase import CELLS
 
@@ -22,7 +22,101 @@ def fog_interval(fog: FogTable, origin: Point, direction: Vector, reach: Float) 
 def transmittance(fog: FogTable, origin: Point, direction: Vector, reach: Float) -> Float:
     """Return what is left of light after a straight way: Beer and Lambert."""
     begin, end = fog_interval(fog, origin, direction, reach)
-    return dr.exp(-fog.extinction * dr.maximum(end - begin, 0.0))
+    return dr.exp(-optical_depth(fog, origin, direction, begin, end))
+
+
+def optical_depth(fog: FogTable, origin: Point, direction: Vector, begin: Float, end: Float) -> Float:
+    """Return the optical depth along a ray between two distances in the fog; 0 if end ≤ begin."""
+    depth = fog.extinction * dr.maximum(end - begin, 0.0)
+    if fog.profile is None:
+        return depth
+    return depth * _mean_density(fog.profile, origin.z + direction.z * begin, origin.z + direction.z * end)
+
+
+def extinction_at(fog: FogTable, place: Point) -> Float:
+    """Return the extinction at a place in the fog."""
+    if fog.profile is None:
+        return fog.extinction
+    return fog.extinction * _density(fog.profile, place.z)
+
+
+def draw_flight(fog: FogTable, origin: Point, direction: Vector, begin: Float, end: Float, u: Float) -> Float:
+    """Return a distance in the fog on a stretch of a ray, drawn by the extinction, never beyond its end."""
+    whole = absorbed_share(optical_depth(fog, origin, direction, begin, end))
+    depth = -dr.log(1.0 - u * whole)
+    if fog.profile is None:
+        return dr.minimum(begin + depth / fog.extinction, end)
+    profile = fog.profile
+    low, high = origin.z + direction.z * begin, origin.z + direction.z * end
+    level = dr.abs(high - low) <= profile.level
+    even = begin + depth / (fog.extinction * dr.maximum(_mean_density(profile, low, high), 1e-30))
+    wanted = _column(profile, low) + direction.z * depth / fog.extinction
+    rising = (_height_of(profile, wanted) - origin.z) / dr.select(level, 1.0, direction.z)
+    return dr.clip(dr.select(level, even, rising), begin, end)
+
+
+def flight_density(
+    fog: FogTable, origin: Point, direction: Vector, begin: Float, end: Float, distance: Float
+) -> Float:
+    """Return the density per metre with which `draw_flight` draws a distance."""
+    depth = optical_depth(fog, origin, direction, begin, end)
+    whole = absorbed_share(depth)
+    if fog.profile is None:
+        return fog.extinction * dr.exp(-fog.extinction * (distance - begin)) / whole
+    low, high = origin.z + direction.z * begin, origin.z + direction.z * end
+    even = depth / dr.maximum(end - begin, 1e-30)
+    level = dr.abs(high - low) <= fog.profile.level
+    here = dr.select(level, even, extinction_at(fog, origin + direction * distance))
+    before = dr.select(
+        level, even * (distance - begin), optical_depth(fog, origin, direction, begin, distance)
+    )
+    return here * dr.exp(-before) / whole
+
+
+def _density(profile: HeightTable, height: Float) -> Float:
+    within = dr.maximum(height, profile.lowest)
+    cell = _cell_below(profile.height, within)
+    step = within - dr.gather(mi.Float, profile.height, cell)
+    return dr.gather(mi.Float, profile.density, cell) + step * dr.gather(mi.Float, profile.slope, cell)
+
+
+def _mean_density(profile: HeightTable, low: Float, high: Float) -> Float:
+    """Return the mean density between heights, in whichever order.
+
+    That in the middle where it is linear between them, and where they are nearly equal: else digits are lost.
+    """
+    rise, lower = high - low, dr.minimum(low, high)
+    cells = (_cell_below(profile.height, dr.maximum(height, profile.lowest)) for height in (low, high))
+    level = (next(cells) == next(cells)) & (lower >= profile.lowest)
+    level = level | (dr.abs(rise) <= profile.level)
+    mean = (_column(profile, high) - _column(profile, low)) / dr.select(level, 1.0, rise)
+    return dr.maximum(dr.select(level, _density(profile, 0.5 * (low + high)), mean), 0.0)
+
+
+def _column(profile: HeightTable, height: Float) -> Float:
+    """Return ∫ of the density from the lowest point to a height, below it negative."""
+    within = dr.maximum(height, profile.lowest)
+    cell = _cell_below(profile.height, within)
+    step = within - dr.gather(mi.Float, profile.height, cell)
+    density, slope = (dr.gather(mi.Float, table, cell) for table in (profile.density, profile.slope))
+    column = dr.gather(mi.Float, profile.column, cell) + step * (density + 0.5 * slope * step)
+    return column + (height - within) * profile.below
+
+
+def _height_of(profile: HeightTable, column: Float) -> Float:
+    """Return the height up to which `_column` is a value: in a cell ρ δ + ½ s δ² is what is left of it."""
+    within = dr.maximum(column, 0.0)
+    cell = _cell_below(profile.column, within)
+    left = within - dr.gather(mi.Float, profile.column, cell)
+    density, slope = (dr.gather(mi.Float, table, cell) for table in (profile.density, profile.slope))
+    root = dr.safe_sqrt(density * density + 2.0 * slope * left)
+    height = dr.gather(mi.Float, profile.height, cell) + 2.0 * left / dr.maximum(density + root, 1e-30)
+    return height + dr.minimum(column, 0.0) / dr.maximum(profile.below, 1e-30)
+
+
+def _cell_below(table: Float, value: Float) -> UInt:
+    """Return the last cell of a profile's table that begins at or below a value."""
+    return dr.binary_search(0, HEIGHTS - 2, lambda k: dr.gather(mi.Float, table, k + 1) <= value)
 
 
 def absorbed_share(depth: Float) -> Float:

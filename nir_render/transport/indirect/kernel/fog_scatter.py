@@ -15,6 +15,10 @@ from nir_render.transport.indirect.kernel.fog import (
     absorbed_share,
     arc_integral,
     draw_angle,
+    draw_flight,
+    extinction_at,
+    flight_density,
+    optical_depth,
     phase_function,
     table_slope,
 )
@@ -66,14 +70,16 @@ def scatter_on_stretch(
     """Add the light of one light that fog on a stretch scatters into the path."""
     fog = scene.fog
     assert fog is not None  # only called in fog
-    lost = dr.select(active, absorbed_share(fog.extinction * (end - begin)), 0.0)
+    depth = optical_depth(fog, state.origin, state.direction, begin, end)
+    lost = dr.select(active, absorbed_share(depth), 0.0)
     active = active & (state.depth + 1 < max_depth)
     row, chance = _light_for_stretch(scene, state, begin, end, active, number)
     distance, density = _place_on_stretch(scene, row, state, begin, end, number(draws.FOG_PLACE), active)
     place = state.origin + state.direction * distance
     aim = connect.aim_at_light(scene.lights, row, place, number(draws.FOG_U), number(draws.FOG_V), active)
     turn = 0.5 * dr.squared_norm(aim.direction - state.direction)
-    weight = fog.extinction * fog.albedo * dr.exp(-fog.extinction * (distance - begin)) / density
+    before = optical_depth(fog, state.origin, state.direction, begin, distance)
+    weight = extinction_at(fog, place) * fog.albedo * dr.exp(-before) / density
     phase = phase_function(fog, turn)
     brought = state.weight * weight * phase * aim.radiance / (chance * aim.density)
     brought = brought * draws.power_heuristic(aim.density, TURNED * phase)
@@ -122,7 +128,9 @@ def _candidate(
 ) -> tuple[UInt, Float]:
     """Return a light that the guide draws at one of some places on a stretch, and its chance."""
     along, pick = (number(draws.FOG_CANDIDATES + 2 * k + which) for which in range(2))
-    distance = _flight_within(scene, begin, end, (mi.Float(k) + along) / _CANDIDATES)
+    assert scene.fog is not None  # only called in fog
+    share = (mi.Float(k) + along) / _CANDIDATES
+    distance = draw_flight(scene.fog, state.origin, state.direction, begin, end, share)
     cell = connect.guide_cell(scene.choice, state.origin + state.direction * distance, state.tier)
     return connect.choose_light(scene.choice, scene.lights, cell, pick)
 
@@ -139,12 +147,13 @@ def brought_to_stretch(
     _, off, low, high = _arcs(scene, row, origin, direction, begin, end, active)
     weight = dr.maximum(high - low, 1e-6) / (4.0 * dr.pi * off)
     to = dr.gather(mi.Point3f, lights.center, row, active) - origin
-    weight = weight * dr.maximum(dr.exp(-fog.extinction * dr.norm(to)), 1e-6)
+    weight = weight * dr.maximum(dr.exp(-fog.typical * dr.norm(to)), 1e-6)
     if lights.sun >= 0:
         kind = dr.gather(mi.UInt32, lights.kind, row, active)
         to_sun = dr.gather(mi.Vector3f, lights.normal, row, active)
         turn = 0.5 * dr.squared_norm(to_sun - direction)
-        of_sun = phase_function(fog, turn) * absorbed_share(fog.extinction * (end - begin)) / fog.extinction
+        lost = absorbed_share(optical_depth(fog, origin, direction, begin, end))
+        of_sun = phase_function(fog, turn) * lost / fog.typical
         weight = dr.select(kind == SUN, of_sun, weight)
     if lights.sky >= 0:
         kind = dr.gather(mi.UInt32, lights.kind, row, active)
@@ -172,13 +181,13 @@ def _place_on_stretch(
     angle = draw_angle(fog, fog.arc, dr.lerp(low, high, u))
     sine, cosine = dr.sincos(angle)
     distance = dr.clip(middle - off * cosine / dr.maximum(sine, 1e-9), begin, end)
-    distance = dr.select(by_arc, distance, _flight_within(scene, begin, end, u))
+    flight = draw_flight(fog, state.origin, state.direction, begin, end, u)
+    distance = dr.select(by_arc, distance, flight)
     beside = distance - middle
     slope = table_slope(fog, fog.arc, dr.atan2(off, -beside))
     arc_density = slope / dr.maximum(high - low, 1e-9) * off / (off * off + beside * beside)
-    whole = absorbed_share(fog.extinction * (end - begin))
-    flight_density = fog.extinction * dr.exp(-fog.extinction * (distance - begin)) / whole
-    return distance, dr.select(far, flight_density, 0.5 * (arc_density + flight_density))
+    by_flight = flight_density(fog, state.origin, state.direction, begin, end, distance)
+    return distance, dr.select(far, by_flight, 0.5 * (arc_density + by_flight))
 
 
 def _arcs(
@@ -194,10 +203,3 @@ def _arcs(
     low = arc_integral(fog, dr.atan2(off, middle - begin))
     high = arc_integral(fog, dr.atan2(off, middle - end))
     return middle, off, low, high
-
-
-def _flight_within(scene: DeviceScene, begin: Float, end: Float, u: Float) -> Float:
-    """Return a distance on a stretch, drawn by the extinction, never beyond its end."""
-    assert scene.fog is not None  # only called in fog
-    whole = absorbed_share(scene.fog.extinction * (end - begin))
-    return dr.minimum(begin - dr.log(1.0 - u * whole) / scene.fog.extinction, end)

@@ -200,7 +200,7 @@ class _Halos:
         axis, distance = self._axis(row)
         spread = dr.gather(mi.Float, self.lights.spread, row, self.active)
         weight = dr.gather(mi.Float, self.lights.power, row, self.active)
-        weight = weight * dr.exp(-self.fog.extinction * distance) / dr.maximum(distance, spread)
+        weight = weight * dr.exp(-self.fog.typical * distance) / dr.maximum(distance, spread)
         if self.lights.sky >= 0:  # it has no halo
             kind = dr.gather(mi.UInt32, self.lights.kind, row, self.active)
             weight = dr.select(kind == SKY, 0.0, weight)

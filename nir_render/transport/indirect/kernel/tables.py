@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.scene.documents.fog import MOST_HEIGHTS
+from nir_render.scene.fog_depth import HeightProfile
 from nir_render.spectra.skies import CieSky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import Guide
@@ -18,6 +20,8 @@ from nir_render.transport.world.pattern import Pattern
 from nir_render.transport.world.phase import CELLS
 
 _EDGELESS_M = 1e30  # stands for infinity, whose products with 0 are not numbers
+HEIGHTS = MOST_HEIGHTS + 1
+_LEVEL = 1e-4  # of a profile's height: of less rise, differences of columns would lose their digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +101,29 @@ class Choice:
 
 
 @dataclass(frozen=True, eq=False)
+class HeightTable:
+    """The density of fog over height, over that of its extinction (`scene.fog_depth.HeightProfile`).
+
+    Of each of `HEIGHTS` points; those beyond the highest of the profile are endlessly high. `level` is the
+    rise below which a way counts as level, `below` the density below the lowest point.
+    """
+
+    height: Float
+    density: Float
+    slope: Float  # of the density, up to the next point
+    column: Float  # ∫ of the density from the lowest point
+    lowest: Float
+    below: Float
+    level: Float
+
+
+@dataclass(frozen=True, eq=False)
 class FogTable:
-    """Fog on the device."""
+    """Fog on the device; `typical` is the mean extinction over the profile, for choices alone."""
 
     extinction: Float
+    typical: Float
+    profile: HeightTable | None
     albedo: Float
     low: Point
     high: Point
@@ -258,6 +281,8 @@ def upload_fog(medium: Medium) -> FogTable:
     assert len(medium.phase.arc) == CELLS + 1  # the lookups count on it
     return FogTable(
         extinction=dr.opaque(mi.Float, medium.extinction_per_m),
+        typical=dr.opaque(mi.Float, medium.mean_extinction_per_m()),
+        profile=None if medium.profile is None else _upload_profile(medium.profile),
         albedo=dr.opaque(mi.Float, medium.albedo),
         low=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in low)),
         high=mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in high)),
@@ -267,6 +292,21 @@ def upload_fog(medium: Medium) -> FogTable:
         cumulative=_real(medium.phase.cumulative),
         arc=_real(medium.phase.arc),
         halo=_real(medium.phase.halo),
+    )
+
+
+def _upload_profile(profile: HeightProfile) -> HeightTable:
+    more = HEIGHTS - len(profile.height_m)
+    slope_per_m = np.append(np.diff(profile.density) / np.diff(profile.height_m), np.zeros(more + 1))
+    span_m = float(profile.height_m[-1] - profile.height_m[0])
+    return HeightTable(
+        height=_real(np.append(profile.height_m, np.full(more, _EDGELESS_M))),
+        density=_real(np.append(profile.density, np.full(more, profile.density[-1]))),
+        slope=_real(slope_per_m),
+        column=_real(np.append(profile.column_m, np.full(more, _EDGELESS_M))),
+        lowest=dr.opaque(mi.Float, float(profile.height_m[0])),
+        below=dr.opaque(mi.Float, float(profile.density[0])),
+        level=dr.opaque(mi.Float, _LEVEL * span_m),
     )
 
 

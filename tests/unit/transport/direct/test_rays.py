@@ -1,4 +1,4 @@
-"""Rays against boxes of fog and against facets, by hand."""
+"""Rays against facets and bodies, by hand."""
 
 import math
 
@@ -7,44 +7,10 @@ import pytest
 
 from nir_render import load_scene
 from nir_render.transport.backend.variant import blocked
-from nir_render.transport.direct.rays import crossing, length_in_box_m
+from nir_render.transport.direct.rays import crossing
 from nir_render.transport.world.facets import facets
 from nir_render.transport.world.mitsuba_scene import build
 from tests.paths import SCENES
-
-INF = math.inf
-
-
-@pytest.mark.parametrize(
-    ("start", "direction", "length_m", "low", "high", "inside_m"),
-    [
-        ([0, 0, 0], [1, 0, 0], 5.0, [1, -1, -1], [3, 1, 1], 2.0),
-        ([0, 0, 0], [1, 0, 0], 2.5, [1, -1, -1], [3, 1, 1], 1.5),  # ends within
-        ([2, 0, 0], [1, 0, 0], 5.0, [1, -1, -1], [3, 1, 1], 1.0),  # starts within
-        ([0, 0, 0], [-1, 0, 0], 5.0, [1, -1, -1], [3, 1, 1], 0.0),  # leads away
-        ([0, 2, 0], [1, 0, 0], 5.0, [1, -1, -1], [3, 1, 1], 0.0),  # passes beside
-        ([0, 1, 0], [1, 0, 0], 5.0, [1, -1, -1], [3, 1, 1], 2.0),  # along its face
-        ([0, 0, 0], [0.6, 0.8, 0], 5.0, [-INF, -INF, -INF], [INF, INF, INF], 5.0),
-        ([0, 0, 0], [0.6, 0, 0.8], 5.0, [-INF, -INF, -INF], [INF, INF, 2.0], 2.5),
-        ([0, 0, 0], [0.6, 0, 0.8], INF, [-INF, -INF, -INF], [INF, INF, 2.0], 2.5),  # to the sun
-        ([0, 0, 3], [0.6, 0, 0.8], INF, [-INF, -INF, -INF], [INF, INF, 2.0], 0.0),
-        ([0, 0, 3], [1, 0, 0], INF, [-INF, -INF, -INF], [INF, INF, 2.0], 0.0),
-        ([0, 0, 0], [0.6, 0.8, 0], 9.0, [1.2, 0, -1], [3, 2, 1], 0.5),  # enters at x = 1.2, leaves at y = 2
-    ],
-)
-def test_how_much_of_a_ray_lies_in_a_box(
-    start: list[float],
-    direction: list[float],
-    length_m: float,
-    low: list[float],
-    high: list[float],
-    inside_m: float,
-) -> None:
-    found = length_in_box_m(
-        np.array([start], dtype=float), np.array([direction], dtype=float), np.array([length_m]), np.array(low, dtype=float),
-        np.array(high, dtype=float),
-    )  # fmt: skip
-    assert found == pytest.approx([inside_m])
 
 
 def test_where_rays_cross_a_facet() -> None:
