@@ -1,7 +1,7 @@
 """What a robot may know of fog beyond that there is some: how thick it is, and of which droplets.
 
 Then its calibration tells what the fog scatters forward about a flare, to the droplets that it takes it to be
-of; where it does not know these, to all that fog is usually of, with what these differ by as σ.
+of; where it does not know these, to all that fog is usually of, with what these differ by.
 """
 
 import math
@@ -69,9 +69,7 @@ def knowing_fog(
 
 
 def forward_light(droplets: tuple[str, ...]) -> tuple[ForwardLight, ...]:
-    """Return what fog of one of some droplets scatters forward: their mean, and what they differ by as σ.
-
-    The σ is that of the light within half a degree, about what the window of a flare holds.
+    """Return what fog of one of some droplets scatters forward: their mean, and by what each of them differs.
 
     Raises
     ------
@@ -79,14 +77,14 @@ def forward_light(droplets: tuple[str, ...]) -> tuple[ForwardLight, ...]:
         No droplets of such a name are known.
     """
     tables = np.stack([_shares(name) for name in droplets])
-    mean, spread = tables.mean(axis=0), tables.std(axis=0)
-    of_flare = int(np.argmin(np.abs(np.array(_ANGLES_RAD) - np.radians(0.5))))
+    mean = tables.mean(axis=0)
+    apart = tables - mean if len(tables) > 1 else tables[:0]
     return tuple(
         ForwardLight(
             depth,
             _ANGLES_RAD,
             tuple(float(share) for share in mean[k]),
-            float(spread[k, of_flare] / mean[k, of_flare]),
+            deviations=tuple(float(share) for share in apart[:, k].ravel()),
         )
         for k, depth in enumerate(_DEPTHS)
     )

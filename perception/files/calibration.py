@@ -47,6 +47,14 @@ FORWARD_ENTRIES = (
     Entry("angle_rad", "list", "angles off the source, increasing, above 0", 0.0, 3.2),
     Entry("share", "list", "light that fog scatters forward within each, over what comes straight", 0.0, 1e6),
     Entry("share_sigma", "number", "relative σ of all shares together", 0.0, 10.0, default=0.0),
+    Entry(
+        "deviations",
+        "list",
+        "shares of each kind that the fog may be of less `share`, kind after kind; none where it is of one",
+        -1e6,
+        1e6,
+        default=(),
+    ),
 )
 """The fields of one optical depth among `forward_light`."""
 
@@ -190,7 +198,10 @@ def _camera_record(calibration: Calibration) -> dict[str, Any]:
     if calibration.layouts:
         record["layouts"] = [_layout_record(layout) for layout in calibration.layouts]
     if calibration.forward_light:
-        record["forward_light"] = [asdict(light) for light in calibration.forward_light]
+        record["forward_light"] = [
+            {name: value for name, value in asdict(light).items() if value != ()}
+            for light in calibration.forward_light
+        ]
     record["distortion"] = [float(number) for number in calibration.distortion]
     for field, sigma in calibration.sigma.items():
         name = _QUATERNION if field == "rotation_body_camera" else field
@@ -276,7 +287,7 @@ def _layout(values: Mapping[str, Any]) -> Layout:
 
 
 def _forward_light(values: Mapping[str, Any]) -> ForwardLight:
-    lists = {name: tuple(values[name]) for name in ("angle_rad", "share")}
+    lists = {name: tuple(values.get(name, ())) for name in ("angle_rad", "share", "deviations")}
     return ForwardLight(**{**values, **lists})
 
 
@@ -340,9 +351,14 @@ def _contradictions(values: Mapping[str, Any], place: Place) -> Iterator[Recordi
 def _contradictions_of_forward_light(
     lights: Iterable[Mapping[str, Any]], place: Place
 ) -> Iterator[RecordingError]:
-    before = 0.0
+    before, kinds = 0.0, None
     for number, light in enumerate(lights):
         inside = place.within(f"forward_light[{number}]")
+        angles, deviations = len(light["angle_rad"]), len(light.get("deviations", ()))
+        kinds = deviations / max(angles, 1) if kinds is None else kinds
+        if deviations != kinds * angles or deviations % max(angles, 1):
+            remedy = "Write as many as angles of each kind, of as many kinds at each depth, or none"
+            yield inside.error(f"has {deviations} numbers", remedy, "deviations")
         if not light["depth"] > before:
             yield inside.error("does not increase", "Sort them by optical depth", "depth")
         before = light["depth"]

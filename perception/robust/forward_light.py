@@ -64,23 +64,25 @@ def _with_halos(solution: Solution, camera: Camera) -> Window:
     per_m = calibration.extinction_per_m if known else unsure_per_m
     depths = per_m * ranges_m
     halos = [
-        halo_e(
+        halos_e(
             float(solution.u_px[k]), float(solution.v_px[k]), float(solution.flux_e[k]),
             float(solution.image_radius_px[k]), float(depths[k]), window.box, calibration,
         )
         for k in range(solution.count)
     ]  # fmt: skip
-    halo, unsure = np.sum(halos, axis=0), None
+    halo, *kinds = np.sum(halos, axis=0)
     sigma = math.hypot(unsure_per_m / per_m, forward_sigma(calibration))
-    if sigma > 0.0:
-        unsure = Structure(halo.reshape(1, -1), np.array([[1.0 / sigma**2]]))
+    columns = np.array([*([sigma * halo] if sigma > 0.0 else []), *kinds]).reshape(-1, halo.size)
+    unsure = Structure(columns, np.eye(len(columns))) if len(columns) else None
     return replace(window, known_e=halo if known else None, unsure=unsure)
 
 
-def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array, Array]:
-    """Return the light within angles over what comes straight, at an optical depth, and these angles.
+def forward_shares(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array, Array]:
+    """Return the light within angles over what comes straight, at an optical depth; the angles.
 
-    Between tabulated depths the share per depth is interpolated, and held beyond them.
+    Between tabulated depths the share per depth is interpolated, and held beyond them. After the shares stand
+    those of each kind that the fog may be of, less them, over the root of how many kinds there are: the sum of
+    their squares is the variance of the shares.
 
     Parameters
     ----------
@@ -89,7 +91,7 @@ def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array
 
     Returns
     -------
-    Shares and angles in rad, shape (n,) each; the first of both is 0.
+    Shares, shape (1 + kinds, n), and angles in rad, shape (n,); the first of both is 0.
     """
     depths, rates, angle_rad = _rates(lights)
     after = int(np.clip(np.searchsorted(depths, depth), 1, max(len(depths) - 1, 1)))
@@ -101,19 +103,29 @@ def forward_share(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Array
 
 @lru_cache(maxsize=32)
 def _rates(lights: tuple[ForwardLight, ...]) -> tuple[Array, Array, Array]:
-    """Return tabulated depths, light within angles per depth, shape (depths, angles), and these angles."""
+    """Return tabulated depths, `forward_shares` per depth, shape (depths, 1 + kinds, n), and the angles."""
     angle_rad = np.unique(np.concatenate([[0.0], *(light.angle_rad for light in lights)]))
     rates = np.array(
-        [np.interp(angle_rad, [0.0, *one.angle_rad], [0.0, *one.share]) / one.depth for one in lights]
+        [
+            [np.interp(angle_rad, [0.0, *one.angle_rad], [0.0, *row]) / one.depth for row in _rows(one)]
+            for one in lights
+        ]
     )
     return np.array([one.depth for one in lights]), rates, angle_rad
 
 
-def halo_e(
+def _rows(light: ForwardLight) -> list[Array]:
+    """Return the shares within angles, and after them the scaled deviations of each kind."""
+    share = np.array(light.share)
+    kinds = np.array(light.deviations).reshape(-1, len(share))
+    return [share, *(kinds / math.sqrt(max(len(kinds), 1)))]
+
+
+def halos_e(
     u_px: float, v_px: float, flux_e: float, image_radius_px: float, depth: float,
     box: PixelBox, calibration: Calibration,
 ) -> Array:  # fmt: skip
-    """Return the electrons that fog brings forward about a flare into the pixels of a window.
+    """Return the electrons that fog brings forward about a flare into a window, and what may differ of them.
 
     Between angles of the table the light lies evenly over the angle, as a halo of 1/α does; what blurs it,
     point spread, pixel, and the source's own image, counts as one Gaussian, round in directions.
@@ -131,9 +143,9 @@ def halo_e(
 
     Returns
     -------
-    Shape (height, width).
+    Shape (1 + kinds, height, width), as `forward_shares`.
     """
-    share, angle_rad = forward_share(calibration.forward_light, depth)
+    shares, angle_rad = forward_shares(calibration.forward_light, depth)
     rows, columns = np.mgrid[box.top : box.top + box.height, box.left : box.left + box.width]
     own = np.array([[u_px, v_px]]) + _STEPS
     places = np.concatenate([own, np.stack([columns.ravel(), rows.ravel()], axis=1)])
@@ -142,13 +154,14 @@ def halo_e(
     chord = np.minimum(np.linalg.norm(direction - middle, axis=1), 2.0)
     # Beyond a fisheye's image circle pixels see no direction.
     seen = np.isfinite(chord)
-    image = np.zeros(len(direction))
+    images = np.zeros((len(shares), len(direction)))
     if math.isfinite(px_per_rad) and seen.any():
         off_px = px_per_rad * 2.0 * np.arcsin(0.5 * chord[seen])
         sigma_px = np.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0 + 0.25 * image_radius_px**2)
-        profile, at_px = _blurred(share, px_per_rad * angle_rad, float(sigma_px), float(off_px.max()))
-        image[seen] = flux_e * np.interp(off_px, at_px, profile)
-    return image.reshape(box.height, box.width)
+        profiles, at_px = _blurred(shares, px_per_rad * angle_rad, float(sigma_px), float(off_px.max()))
+        for image, profile in zip(images, profiles, strict=True):
+            image[seen] = flux_e * np.interp(off_px, at_px, profile)
+    return images.reshape(-1, box.height, box.width)
 
 
 def _pixel_sr(near: Array) -> float:
@@ -160,8 +173,8 @@ def _pixel_sr(near: Array) -> float:
     return math.sqrt(max(float((aside @ aside) * (down @ down) - (aside @ down) ** 2), 0.0))
 
 
-def _blurred(share: Array, angle_px: Array, sigma_px: float, most_px: float) -> tuple[Array, Array]:
-    """Return light per square pixel against the distance, rings of it spread by a Gaussian; the distances.
+def _blurred(shares: Array, angle_px: Array, sigma_px: float, most_px: float) -> tuple[Array, Array]:
+    """Return lights per square pixel against the distance, rings of each spread by a Gaussian; the distances.
 
     A ring of radius a and light m gives m exp(−(ρ² + a²)/2σ²) I₀(ρ a/σ²) / 2πσ² at the distance ρ.
     """
@@ -169,9 +182,9 @@ def _blurred(share: Array, angle_px: Array, sigma_px: float, most_px: float) -> 
 
     most_ring_px = min(float(angle_px[-1]), most_px + 6.0 * sigma_px)
     edges = np.linspace(0.0, most_ring_px, max(int(most_ring_px / (_RING_SIGMAS * sigma_px)), 1) + 1)
-    light = np.diff(np.interp(edges, angle_px, share))
+    light = np.array([np.diff(np.interp(edges, angle_px, share)) for share in shares])
     ring = 0.5 * (edges[1:] + edges[:-1])
     at = np.arange(0.0, most_px + _STEP_SIGMAS * sigma_px, _STEP_SIGMAS * sigma_px)
     variance = sigma_px**2
     spread = np.exp(-0.5 * (at[:, None] - ring) ** 2 / variance) * i0e(at[:, None] * ring / variance)
-    return spread @ light / (2.0 * np.pi * variance), at
+    return light @ spread.T / (2.0 * np.pi * variance), at

@@ -78,12 +78,16 @@ class ForwardLight:
         Light within each, over that which comes straight.
     share_sigma
         Relative σ of all shares together.
+    deviations
+        Where the fog may be of several kinds: the shares of each less `share`, one kind after the other. The
+        mean of their products is the covariance of the shares.
     """
 
     depth: float
     angle_rad: tuple[float, ...]
     share: tuple[float, ...]
     share_sigma: float = 0.0
+    deviations: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,6 +80,7 @@ def test_ranges_in_heavy_advection_fog_hold_with_extinction_known_and_unknown(
     assert np.median(np.abs(errors["all"])) < 0.01
     assert pulls["all"] < 1.35
     assert np.median(np.abs(errors["extinction"])) < 0.02
+    print(visibility, {k: (round(float(v), 2), np.round(np.sqrt(np.mean((errors[k] / np.array(found[k])[..., 1]) ** 2, axis=0)), 2), np.round(errors[k].mean(axis=0)*100, 2), np.round(np.array(found[k])[...,1].mean(axis=0)*100,2)) for k, v in pulls.items()})
     if places is PLACES:
         assert np.median(np.abs(errors["nothing"])) < 0.04
         assert pulls["nothing"] < 1.3

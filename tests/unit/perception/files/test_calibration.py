@@ -33,8 +33,8 @@ FULL = calibration(
     prnu=0.009,
     layouts=(Layout("pair", ((0.06, 0.0, 1.0 / 3.0), (-0.06, 0.0, 0.28)), (1.0, 1.0 / 3.0), 0.1, 0.05),),
     forward_light=(
-        ForwardLight(0.5, (1e-3, 1.0 / 300.0), (0.01, 1.0 / 30.0), 0.4),
-        ForwardLight(1.0, (1e-3,), (0.03,)),
+        ForwardLight(0.5, (1e-3, 1.0 / 300.0), (0.01, 1.0 / 30.0), 0.4, (0.001, -0.002, -0.001, 0.002)),
+        ForwardLight(1.0, (1e-3,), (0.03,), deviations=(0.003, -0.003)),
     ),
     lens_model="brown_conrady",
     distortion=(-0.1, 0.01, 1e-3, -1.0 / 3.0, 0.0),
@@ -58,6 +58,7 @@ def test_round_trip_through_text() -> None:
     ("change", "words"),
     [
         ({"depth": 0.1}, "forward_light[1]"),
+        ({"deviations": [0.1]}, "forward_light[1].deviations': has 1 numbers"),
         ({"angle_rad": [2e-3]}, "has 2 numbers"),
         ({"angle_rad": [1e-3, 1e-3]}, "does not increase"),
         ({"share": [0.1, 0.05]}, "falls"),

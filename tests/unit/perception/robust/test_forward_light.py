@@ -12,7 +12,7 @@ from scipy.stats import norm
 from perception import Calibration, ForwardLight, RawFrame, detect
 from perception.model.bearing import direction_camera
 from perception.model.flare import PixelBox, flare_image
-from perception.robust.forward_light import forward_share, halo_e
+from perception.robust.forward_light import forward_shares, halos_e
 from tests.unit.perception.simulation import calibration
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ def _foggy_e(camera: Calibration, sources: Sequence[tuple[float, float, float]])
         image += flux_e * flare_image(u_px, v_px, radius_rad, whole, camera).fraction
         shares = depth * (1.0 - np.exp(-fine / 0.01))
         exact = replace(camera, forward_light=(ForwardLight(depth, tuple(fine), tuple(shares)),))
-        image += halo_e(u_px, v_px, flux_e, 0.0, depth, whole, exact)
+        image += halos_e(u_px, v_px, flux_e, 0.0, depth, whole, exact)[0]
     return image
 
 
@@ -62,11 +62,11 @@ def _frames(camera: Calibration, expected_e: Array, count: int) -> Iterator[RawF
 
 
 def test_shares_between_optical_depths_go_by_their_rate() -> None:
-    share, angle_rad = forward_share((_light(0.5), _light(1.0, 1.2)), 0.75)
+    (share,), angle_rad = forward_shares((_light(0.5), _light(1.0, 1.2)), 0.75)
     assert angle_rad[0] == share[0] == 0.0
     np.testing.assert_allclose(share[1:], 0.75 * np.array(_light(1.0, 1.1).share), rtol=1e-12)
     for depth, scale in ((0.1, 1.0), (3.0, 1.2)):
-        held, _ = forward_share((_light(0.5), _light(1.0, 1.2)), depth)
+        (held,), _ = forward_shares((_light(0.5), _light(1.0, 1.2)), depth)
         np.testing.assert_allclose(held[1:], _light(depth, scale).share, rtol=1e-12)
 
 
@@ -80,12 +80,12 @@ def test_a_halo_is_the_sum_of_many_points_about_the_flare(u_px: float, v_px: flo
     camera = calibration(forward_light=(_light(1.0),))
     depth, flux_e = 0.8, 1e4
     box = PixelBox(round(v_px) - 10, round(u_px) - 10, 21, 21)
-    found = halo_e(u_px, v_px, flux_e, 0.0, depth, box, camera)
+    (found,) = halos_e(u_px, v_px, flux_e, 0.0, depth, box, camera)
     middle = direction_camera(np.array([[u_px, v_px]]), camera)[0]
     across = np.cross(middle, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
     frame = np.stack([across, np.cross(middle, across)])
-    share, angle_rad = forward_share(camera.forward_light, depth)
+    (share,), angle_rad = forward_shares(camera.forward_light, depth)
     rings, around = 400, 48
     edges = np.linspace(0.0, 1.0, rings + 1) ** 2 * ANGLES_RAD[-1]
     light = np.repeat(np.diff(np.interp(edges, angle_rad, share)) / around, around)
@@ -116,12 +116,12 @@ def test_a_halo_ends_at_the_edge_of_an_image_circle(inside_px: float) -> None:
     u_px, v_px = edge_px - inside_px, 479.7
     box = PixelBox(470, round(u_px) - 10, 21, 21)
     within = math.floor(edge_px) - box.left - 1
-    found = halo_e(u_px, v_px, 1e4, 0.0, 0.8, box, camera)
-    cut = halo_e(u_px, v_px, 1e4, 0.0, 0.8, PixelBox(470, box.left, 21, within), camera)
+    (found,) = halos_e(u_px, v_px, 1e4, 0.0, 0.8, box, camera)
+    (cut,) = halos_e(u_px, v_px, 1e4, 0.0, 0.8, PixelBox(470, box.left, 21, within), camera)
     np.testing.assert_allclose(found[:, :within], cut, rtol=2e-3)
     assert cut.min() > 0.0
     assert (found[:, box.left + np.arange(21) > edge_px] == 0.0).all()
-    shifted = halo_e(u_px - 5.0, v_px, 1e4, 0.0, 0.8, PixelBox(470, box.left - 5, 21, 21), camera)
+    (shifted,) = halos_e(u_px - 5.0, v_px, 1e4, 0.0, 0.8, PixelBox(470, box.left - 5, 21, 21), camera)
     own = np.s_[8:12, 6:within]
     assert found[own].sum() == pytest.approx(shifted[own].sum(), rel=0.02)
 
