@@ -32,7 +32,8 @@ def test_ranges_in_heavy_advection_fog_hold_with_extinction_known_and_unknown(
 
     The halo is the path tracer's, and what robots know of it is small-angle theory. Expected: with extinction and droplets
     known the median error is below 1 %, each mean within 4 standard errors and 0.6 % of 0 (render noise, and what the
-    theory leaves), and errors over σ have a mean square below 1.35² (about 1.1²); with one of four kinds of droplets, the median is below 2 %. With
+    theory leaves), and errors over σ have a mean square below 1.35² (about 1.1²); with one of four kinds of droplets, the median is below 2 %, and errors over σ are
+    below 1.8 rms: these droplets are the farthest of the four from their mean, by 1.4 σ. With
     extinction not known either, it is below 4 % up to 8 m, and errors over σ are below 1.3 rms.
     """
     scene = parse_scene(
@@ -80,7 +81,7 @@ def test_ranges_in_heavy_advection_fog_hold_with_extinction_known_and_unknown(
     assert np.median(np.abs(errors["all"])) < 0.01
     assert pulls["all"] < 1.35
     assert np.median(np.abs(errors["extinction"])) < 0.02
-    print(visibility, {k: (round(float(v), 2), np.round(np.sqrt(np.mean((errors[k] / np.array(found[k])[..., 1]) ** 2, axis=0)), 2), np.round(errors[k].mean(axis=0)*100, 2), np.round(np.array(found[k])[...,1].mean(axis=0)*100,2)) for k, v in pulls.items()})
+    assert pulls["extinction"] < 1.8
     if places is PLACES:
         assert np.median(np.abs(errors["nothing"])) < 0.04
         assert pulls["nothing"] < 1.3
