@@ -32,11 +32,11 @@ from nir_render.scene.documents.base import Orientation
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.times.drives import FULL_DRIVE
-from nir_render.scene.fog_depth import extinction_among_robots_per_m
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from nir_render.simulation.calibration import calibration
 from nir_render.simulation.flare_spread import Progress, flare_spread
+from nir_render.simulation.fog_known import extinction_among_robots_per_m
 from perception.types import Calibration
 
 
@@ -93,7 +93,7 @@ class CameraBudget:
 class Budget:
     """The photon budget of a scene at a time; `fog` is what `Fog.facts` tells, None in clear air.
 
-    Where fog varies over height, `extinction_per_m` is that where robots carry their sources.
+    Where fog varies over height, `extinction_per_m` is the mean over the heights of robots' sources.
     """
 
     name: str
@@ -144,7 +144,7 @@ def photon_budget(
         name=scene.document.name or "",
         scene=scene.path,
         time_s=time_s,
-        extinction_per_m=extinction_among_robots_per_m(snapshot),
+        extinction_per_m=extinction_among_robots_per_m(snapshot)[0],
         fog=None if snapshot.fog is None else snapshot.fog.facts(),
         assumptions=assumed,
         cameras=tuple(
@@ -219,7 +219,10 @@ def _source_budget(
     assumed: Assumptions,
 ) -> SourceBudget:
     mean_intensity = source.sent_flux_w / (4.0 * math.pi)
-    extinction_per_m, leaks = extinction_among_robots_per_m(snapshot), leak(camera, source).out_of_band_shares
+    extinction_per_m, leaks = (
+        extinction_among_robots_per_m(snapshot)[0],
+        leak(camera, source).out_of_band_shares,
+    )
     return SourceBudget(
         sources=tuple(names),
         drives={name: drive_text(ranged[name]) for name in names},

@@ -15,10 +15,10 @@ from nir_render.camera.optics.lens import Intrinsics, intrinsics_of
 from nir_render.camera.timing.drive import mean_level
 from nir_render.camera.timing.exposure_control import Setting
 from nir_render.scene.documents.camera import Camera
-from nir_render.scene.fog_depth import optical_depth
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import PlacedSource, Snapshot
 from nir_render.simulation.flare_spread import flare_spread
+from nir_render.transport.world.fog_depth import optical_depth
 from nir_render.transport.world.pattern import pattern_of, relative_intensity
 from perception.types import Calibration
 

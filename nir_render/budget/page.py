@@ -32,7 +32,8 @@ _MOST_SOURCES = 8  # of a kind of camera: these bound the size of the page
 RULES = {
     "electrons": (
         "Φ/4π · e^(−σ_t d)/d² · A_ap · cos θ · C(θ) · t: of a source that is fully lit and sends its "
-        "mean intensity, through the scene's fog all the way. No body hides anything."
+        "mean intensity, through the scene's fog all the way; where it varies over height, the mean at "
+        "the heights of robots' sources. No body hides anything."
     ),
     "peak px": (
         "the most electrons in one pixel, with the background and the dark current; it clips where "

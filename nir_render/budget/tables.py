@@ -169,7 +169,7 @@ def fog_sentence(fog: Mapping[str, Any]) -> str:
         text += f"; {number:.3g} droplets per cm³, {volume:.3g} cm³ of them in a m³"
     if fog["profile"] is not None:
         points = ", ".join(f"{density:g} at {height_m:g} m" for height_m, density in fog["profile"])
-        text += f". Of that by height: {points}; linear between, and the budget at the sources' height"
+        text += f". So where its profile over height is 1; that is {points}, linear between"
     return f"{text}."
 
 

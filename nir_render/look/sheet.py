@@ -68,8 +68,8 @@ def _title(scene: Scene, snapshot: Snapshot) -> str:
     fog = snapshot.fog
     if fog is not None and fog.extinction_per_m > 0.0:
         where = "" if fog.top_m is None else f" below {metres(fog.top_m)}"
-        by_height = "" if fog.profile is None else ", by height"
-        parts.append(f"fog of {fog.extinction_per_m:.3g} /m{where}{by_height}")
+        by_height = "" if fog.profile is None else "up to "
+        parts.append(f"fog of {by_height}{fog.densest_per_m():.3g} /m{where}")
     if snapshot.sun is not None:
         parts.append(
             f"sun {math.degrees(snapshot.sun.elevation_rad):.0f}° high from "

@@ -9,6 +9,7 @@ from nir_render.scene.documents.camera import Camera, Rig
 from nir_render.scene.documents.document import SceneDocument
 from nir_render.scene.documents.emitters import Source
 from nir_render.scene.documents.files import PresetDocument, preset_names
+from nir_render.scene.documents.fog import MOST_HEIGHTS
 from nir_render.scene.documents.lens import Lens
 from nir_render.scene.documents.sensor import Sensor
 from nir_render.scene.documents.spectral.bandpass import Bandpass
@@ -97,6 +98,8 @@ def _describe_curves(definitions: dict[str, Any]) -> None:
         properties["file"] = {"type": "string", "description": f"CSV with the header {header}"}
         properties["points"] = points
     definitions["TabulatedPhase"]["required"].remove("points")
+    profile = definitions["Fog"]["properties"]["profile"]
+    profile["anyOf"] = [{**points, "maxItems": MOST_HEIGHTS}, {"type": "null"}]
     for name, key in (
         ("Diffuse", "reflectance"),
         ("Mirror", "reflectance"),

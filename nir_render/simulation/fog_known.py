@@ -16,7 +16,6 @@ from nir_render.errors import InputError
 from nir_render.scattering.forward import scattered_forward
 from nir_render.scattering.optics import ANGLE_RAD
 from nir_render.scene.documents.ambient.droplets import Droplets
-from nir_render.scene.fog_depth import extinction_among_robots_per_m
 from nir_render.scene.scene import Scene
 from nir_render.scene.snapshot import Snapshot
 from perception.types import Calibration, ForwardLight
@@ -36,7 +35,10 @@ def knowing_fog(
     droplets: tuple[str, ...] = USUAL,
     extinction_sigma_per_m: float = _EXACT_PER_M,
 ) -> Calibration:
-    """Return a calibration of a robot that knows the extinction of the scene's fog, where sources are.
+    """Return a calibration of a robot that knows the extinction of the scene's fog.
+
+    Of fog that varies over height that is the mean over the heights of robots' sources, and what it varies by
+    over these counts in its σ.
 
     Parameters
     ----------
@@ -60,12 +62,28 @@ def knowing_fog(
         raise InputError("there is no fog to know of; give the scene one, such as fog: {visibility: 50 m}")
     if not droplets:
         raise InputError("droplets: none is named; name one of those that the fog may be of, or more")
+    mean_per_m, spread_per_m = extinction_among_robots_per_m(snapshot)
     return replace(
         known,
-        extinction_per_m=extinction_among_robots_per_m(snapshot),
+        extinction_per_m=mean_per_m,
         forward_light=forward_light(droplets),
-        sigma={**known.sigma, "extinction_per_m": extinction_sigma_per_m},
+        sigma={**known.sigma, "extinction_per_m": math.hypot(extinction_sigma_per_m, spread_per_m)},
     )
+
+
+def extinction_among_robots_per_m(snapshot: Snapshot) -> tuple[float, float]:
+    """Return the extinction of a scene's fog at the heights of robots' sources: mean and standard deviation.
+
+    0 in clear air.
+    """
+    fog = snapshot.fog
+    if fog is None:
+        return 0.0, 0.0
+    heights_m = [placed.pose.position_m[2] for placed in snapshot.carried_sources.values()]
+    if fog.profile is None or not heights_m:
+        return fog.extinction_per_m, 0.0
+    densities = np.interp(heights_m, *np.array(fog.profile).T)
+    return fog.extinction_per_m * float(densities.mean()), fog.extinction_per_m * float(densities.std())
 
 
 def forward_light(droplets: tuple[str, ...]) -> tuple[ForwardLight, ...]:

@@ -55,7 +55,7 @@ def estimated_extinction(
 
     Least squares for σ and the error k of the range constant, each with its prior; a source whose own flux
     differs (σ_K once more) is one of many. What is off by 4 σ is left out. It may be an odd source, or fog
-    that is thinner on its way: so the mean square of what it is off by, over all sources, counts in σ.
+    that is thinner on its way: then what it is off by counts in σ. Less than that is not seen, and not in σ.
 
     Parameters
     ----------
@@ -102,9 +102,22 @@ def estimated_extinction(
         if (again == kept).all():
             break
         kept = again
-    uneven2 = np.where(kept, 0.0, (off**2 - expected2) / slope**2).mean()
-    estimate = replace(estimate, sigma_per_m=math.hypot(estimate.sigma_per_m, math.sqrt(max(uneven2, 0.0))))
-    return estimate if estimate.sigma_per_m < DETERMINED * prior.sigma_per_m else None
+    uneven_per_m = _unevenness_per_m(slope, off, expected2, kept, prior)
+    if not (uneven_per_m > 0.0 or estimate.sigma_per_m < DETERMINED * prior.sigma_per_m):
+        return None
+    return replace(estimate, sigma_per_m=math.hypot(estimate.sigma_per_m, uneven_per_m))
+
+
+def _unevenness_per_m(
+    slope: Array, off: Array, expected2: Array, kept: NDArray[np.bool_], prior: Extinction
+) -> float:
+    """Return what the extinction of ways differs by, as far as sources that were left out tell of it.
+
+    One that would need more than 4 σ of what was known before is an odd source, not odd fog. Others count by
+    the lengths of ways.
+    """
+    fog = ~kept & (abs(off) < OUTLIER_SIGMAS * prior.sigma_per_m * slope)
+    return math.sqrt(float((off**2 - expected2)[fog].sum() / (slope**2).sum()))
 
 
 def _line(

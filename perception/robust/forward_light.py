@@ -81,8 +81,8 @@ def forward_shares(lights: tuple[ForwardLight, ...], depth: float) -> tuple[Arra
     """Return the light within angles over what comes straight, at an optical depth; the angles.
 
     Between tabulated depths the share per depth is interpolated, and held beyond them. After the shares stand
-    those of each kind that the fog may be of, less them, over the root of how many kinds there are: the sum of
-    their squares is the variance of the shares.
+    those of each kind that the fog may be of, less them, over the root of how many kinds there are: the sum
+    of their squares is the variance of the shares.
 
     Parameters
     ----------

@@ -33,6 +33,8 @@ from nir_render.scene.text.units import (
 # Koschmieder: an extinction of σ dims a contrast to 2 % over a distance of −ln 0.02 / σ = 3.912/σ.
 _VISIBILITY_TIMES_EXTINCTION = 3.912
 
+_LEAST_DENSITY = 1e-6  # less is none in float32
+
 MOST_HEIGHTS = 63
 """So many points a profile may have."""
 
@@ -111,8 +113,8 @@ class Fog(Document):
     meteorologist's, 3.912/σ_t at 550 nm: it becomes the extinction at 940 nm when the scene is loaded, by the
     droplets' σ(940)/σ(550), without droplets by that of `radiation_heavy`, 1.0275 ± 0.014 (assumed).
 
-    `profile` are [height, density] points, the density at heights over that of `extinction`: linear between
-    them, below and above as at the ends; where that is 0, the fog ends there. Without it density is one.
+    `profile` are [z, density] points, the density at heights over that of `extinction`: linear between them,
+    below and above as at the ends; where that is 0, the fog ends there. Without it density is one.
 
     `droplets` say all else by Mie theory. Without them `albedo` is the share of what is lost that is
     scattered, and not absorbed, and `phase` where to.
@@ -187,9 +189,11 @@ class Fog(Document):
                 f"profile: has {len(self.profile)} points; wanted {MOST_HEIGHTS} at most, linear between them"
             )
         densest = max(density for _, density in self.profile)
-        if densest == 0.0:
-            raise ValueError("profile: is 0 at every height; leave the fog out for clear air")
-        if densest * self.extinction_per_m > EXTINCTION.most:
+        if densest < _LEAST_DENSITY:
+            raise ValueError(
+                f"profile: is below {_LEAST_DENSITY:g} at every height; leave the fog out for clear air"
+            )
+        if self.densest_per_m() > EXTINCTION.most:
             raise ValueError(
                 f"profile: {densest:g} times the extinction is beyond {EXTINCTION.most:g} 1/m; check both"
             )
@@ -206,6 +210,20 @@ class Fog(Document):
         if self.size_m is not None and min(self.size_m) <= 0.0:
             raise ValueError("size: each extent must be greater than 0")
         return self
+
+    @model_validator(mode="after")
+    def _profile_within_region(self) -> Self:
+        low_m, high_m = self.region_m()
+        if self.profile is not None and low_m[2] >= high_m[2]:
+            raise ValueError(
+                f"profile: begins at {low_m[2]:g} m, and the fog ends at {high_m[2]:g} m; its heights "
+                "are z in the world, as those of 'top' and 'center'"
+            )
+        return self
+
+    def densest_per_m(self) -> float:
+        """Return the extinction where the fog is densest."""
+        return self.extinction_per_m * max((density for _, density in self.profile or ()), default=1.0)
 
     def region_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lowest and highest corner of the box that the fog fills, shape (3,); ±inf where open."""

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from nir_render.geometry import sunflower
 from nir_render.scene.documents.fog import Fog
-from nir_render.scene.fog_depth import optical_depth
 from nir_render.scene.pose import Pose
 from nir_render.transport.backend.variant import blocked
 from nir_render.transport.direct.ways import SmallLights, Ways
 from nir_render.transport.world.facets import PANE, Facets, pane_transmittance, reflectance
+from nir_render.transport.world.fog_depth import optical_depth
 from nir_render.transport.world.pattern import relative_intensity
 
 Array = NDArray[np.float64]

@@ -283,15 +283,18 @@ def default_depth(
     """Return the longest path where a scene does not say it: the thicker the fog, the longer.
 
     `low_m` and `high_m` are corners of the box that holds the bodies; with the robots it says how far light
-    goes in fog. That length in optical depths is how often fog turns it on the way; that of sun and sky,
-    which comes in everywhere, goes further.
+    goes in fog. That length in optical depths is how often fog turns it on the way, of fog that varies over
+    height that of level ways where it is densest; that of sun and sky, which comes in everywhere, goes
+    further.
     """
     if fog is None:
         return CLEAR_DEPTH
     places_m = np.array([low_m, high_m, *(robot.pose.position_m for robot in snapshot.robots.values())])
     low_m, high_m = np.maximum(places_m.min(axis=0), fog.low_m), np.minimum(places_m.max(axis=0), fog.high_m)
-    extinction_per_m = fog.mean_extinction_per_m(low_m[2], high_m[2])
-    optical_depth = extinction_per_m * float(np.linalg.norm(np.maximum(high_m - low_m, 0.0)))
+    across_m = np.maximum(high_m - low_m, 0.0)
+    level_per_m = fog.densest_per_m(low_m[2], high_m[2])
+    upwards_per_m = fog.mean_extinction_per_m(low_m[2], high_m[2])
+    optical_depth = float(np.linalg.norm(across_m * [level_per_m, level_per_m, upwards_per_m]))
     open_air = snapshot.sun is not None or snapshot.skylight is not None
     least, per_turn = _OPEN_FOG_DEPTH if open_air else _FOG_DEPTH
     return int(min(least + per_turn * optical_depth, _MOST_DEPTH))

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from nir_render.scattering.optics import ANGLE_RAD
 from nir_render.scene.documents.fog import HenyeyGreenstein, TabulatedPhase
-from nir_render.scene.fog_depth import HeightProfile, height_profile
 from nir_render.scene.snapshot import Snapshot
+from nir_render.transport.world.fog_depth import HeightProfile, height_profile
 from nir_render.transport.world.phase import PhaseTable, henyey_greenstein, phase_table, tabulated
 
 
@@ -25,6 +25,14 @@ class Medium:
     high_m: NDArray[np.float64]
     phase: PhaseTable
     profile: HeightProfile | None = None
+
+    def densest_per_m(self, low_m: float, high_m: float) -> float:
+        """Return the largest extinction between two heights."""
+        if self.profile is None:
+            return self.extinction_per_m
+        ends = self.profile.at(np.clip(np.array([low_m, high_m]), *self.profile.height_m[[0, -1]]))
+        within = (self.profile.height_m > low_m) & (self.profile.height_m < high_m)
+        return self.extinction_per_m * float(np.append(ends, self.profile.density[within]).max())
 
     def mean_extinction_per_m(self, low_m: float = -np.inf, high_m: float = np.inf) -> float:
         """Return the mean extinction between two heights, at most those of the profile."""

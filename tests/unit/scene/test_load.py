@@ -160,7 +160,7 @@ BAD: list[tuple[Mapping[str, Any], str]] = [
     ({"sun": {**SUN, "azimut": "1 deg"}}, "sun: unknown key 'azimut'; did you mean 'azimuth'?"),
     ({"fog": "heavy"}, "fog: 'heavy' stands where keys with values are wanted, such as {visibility: 50 m}"),
     ({"fog": {"extintion": "0.05 /m"}}, "fog: unknown key 'extintion'; did you mean 'extinction'?"),
-    ({"fog": {"visibility": "50 m", "density": 3}}, "fog: unknown key 'density'; known keys: albedo, center, droplets, extinction, phase, size, top, visibility"),
+    ({"fog": {"visibility": "50 m", "density": 3}}, "fog: unknown key 'density'; known keys: albedo, center, droplets, extinction, phase, profile, size, top, visibility"),
     ({"fog": {"visibility": 50}}, "fog: visibility: 50 is a bare number; write it with its unit, such as '50 m'"),
     ({"fog": {**FOG, "phase": "hg"}}, "fog.phase: 'hg' stands where keys with values are wanted, 'type' among them; known: henyey_greenstein, table"),
     ({"fog": {**FOG, "phase": {"g": 0.9}}}, "fog.phase: the key 'type' is missing; known: henyey_greenstein, table, mie; write it such as {type: henyey"),

@@ -55,19 +55,6 @@ def light_chance(choice: Choice, lights: Lights, cell: UInt, row: UInt, active: 
     return dr.gather(mi.Float, choice.chance, cell * lights.count + row, active)
 
 
-def lights_of_tier(lights: Lights, tier: UInt | None, active: Mask) -> tuple[UInt, UInt]:
-    """Return where the lights of a tier begin in `by_tier`, and how many they are; all of one tier."""
-    if tier is None:
-        return mi.UInt32(0), lights.count
-    first, end = (dr.gather(mi.UInt32, lights.first_of_tier, tier + k, active) for k in range(2))
-    return first, end - first
-
-
-def row_of_tier(lights: Lights, tier: UInt | None, place: UInt, active: Mask) -> UInt:
-    """Return the light at a place in `by_tier`."""
-    return place if tier is None else dr.gather(mi.UInt32, lights.by_tier, place, active)
-
-
 def versine_of(radius: Float, distance2: Float) -> Float:
     """Return 1 − cos of half the angle that a sphere fills; the difference itself would lose its digits."""
     sine2 = dr.minimum(radius * radius / distance2, 1.0)

@@ -2,8 +2,10 @@
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel.tables import HEIGHTS, FogTable, HeightTable, along_table
-from nir_render.transport.indirect.kernel.types import Float, Point, UInt, Vector
+from nir_render.transport.indirect.kernel.types import Float, Mask, Point, UInt, Vector
 from nir_render.transport.world.phase import CELLS
+
+_FIRST = 8.0  # typical free paths, over which a flight counts as level or not
 
 
 def fog_interval(fog: FogTable, origin: Point, direction: Vector, reach: Float) -> tuple[Float, Float]:
@@ -42,35 +44,47 @@ def extinction_at(fog: FogTable, place: Point) -> Float:
 
 def draw_flight(fog: FogTable, origin: Point, direction: Vector, begin: Float, end: Float, u: Float) -> Float:
     """Return a distance in the fog on a stretch of a ray, drawn by the extinction, never beyond its end."""
-    whole = absorbed_share(optical_depth(fog, origin, direction, begin, end))
-    depth = -dr.log(1.0 - u * whole)
     if fog.profile is None:
-        return dr.minimum(begin + depth / fog.extinction, end)
-    profile = fog.profile
-    low, high = origin.z + direction.z * begin, origin.z + direction.z * end
-    level = dr.abs(high - low) <= profile.level
-    even = begin + depth / (fog.extinction * dr.maximum(_mean_density(profile, low, high), 1e-30))
-    wanted = _column(profile, low) + direction.z * depth / fog.extinction
-    rising = (_height_of(profile, wanted) - origin.z) / dr.select(level, 1.0, direction.z)
-    return dr.clip(dr.select(level, even, rising), begin, end)
+        whole = absorbed_share(optical_depth(fog, origin, direction, begin, end))
+        return dr.minimum(begin - dr.log(1.0 - u * whole) / fog.extinction, end)
+    profile, (level, rate, depth) = fog.profile, _flight(fog, origin, direction, begin, end)
+    flown = -dr.log(1.0 - u * absorbed_share(depth))
+    column = _column(profile, origin.z + direction.z * begin) + direction.z * flown / fog.extinction
+    rising = (_height_of(profile, column) - origin.z) / dr.select(level, 1.0, direction.z)
+    return dr.clip(dr.select(level, begin + flown / rate, rising), begin, end)
 
 
 def flight_density(
     fog: FogTable, origin: Point, direction: Vector, begin: Float, end: Float, distance: Float
 ) -> Float:
     """Return the density per metre with which `draw_flight` draws a distance."""
-    depth = optical_depth(fog, origin, direction, begin, end)
-    whole = absorbed_share(depth)
     if fog.profile is None:
+        whole = absorbed_share(optical_depth(fog, origin, direction, begin, end))
         return fog.extinction * dr.exp(-fog.extinction * (distance - begin)) / whole
-    low, high = origin.z + direction.z * begin, origin.z + direction.z * end
-    even = depth / dr.maximum(end - begin, 1e-30)
-    level = dr.abs(high - low) <= fog.profile.level
-    here = dr.select(level, even, extinction_at(fog, origin + direction * distance))
-    before = dr.select(
-        level, even * (distance - begin), optical_depth(fog, origin, direction, begin, distance)
-    )
-    return here * dr.exp(-before) / whole
+    level, rate, depth = _flight(fog, origin, direction, begin, end)
+    here = dr.select(level, rate, extinction_at(fog, origin + direction * distance))
+    before = optical_depth(fog, origin, direction, begin, distance)
+    before = dr.select(level, rate * (distance - begin), before)
+    whole = absorbed_share(depth)
+    return dr.select(whole > 0.0, here * dr.exp(-before) / dr.maximum(whole, 1e-30), 0.0)
+
+
+def _flight(
+    fog: FogTable, origin: Point, direction: Vector, begin: Float, end: Float
+) -> tuple[Mask, Float, Float]:
+    """Return whether a stretch counts as level, the even extinction for it, and the depth to draw by.
+
+    On level ones, whose heights would lose their digits, flights are drawn as in even fog of the extinction
+    over the first metres: weights, which are by the true one, make up for it.
+    """
+    profile = fog.profile
+    assert profile is not None  # else fog is even
+    first = dr.minimum(end - begin, _FIRST / fog.typical)
+    level = dr.abs(direction.z) * first <= profile.level
+    near = optical_depth(fog, origin, direction, begin, begin + first) / dr.maximum(first, 1e-30)
+    rate = dr.maximum(near, 1e-3 * fog.typical)
+    even = rate * dr.maximum(end - begin, 0.0)
+    return level, rate, dr.select(level, even, optical_depth(fog, origin, direction, begin, end))
 
 
 def _density(profile: HeightTable, height: Float) -> Float:
@@ -80,17 +94,24 @@ def _density(profile: HeightTable, height: Float) -> Float:
     return dr.gather(mi.Float, profile.density, cell) + step * dr.gather(mi.Float, profile.slope, cell)
 
 
-def _mean_density(profile: HeightTable, low: Float, high: Float) -> Float:
-    """Return the mean density between heights, in whichever order.
+def _mean_density(profile: HeightTable, one: Float, other: Float) -> Float:
+    """Return the mean density between two heights.
 
-    That in the middle where it is linear between them, and where they are nearly equal: else digits are lost.
+    What lies in the cells of both is reckoned apart from whole cells between them: in differences of columns,
+    as those of a thin layer under a high one, float32 would lose its digits.
     """
-    rise, lower = high - low, dr.minimum(low, high)
-    cells = (_cell_below(profile.height, dr.maximum(height, profile.lowest)) for height in (low, high))
-    level = (next(cells) == next(cells)) & (lower >= profile.lowest)
-    level = level | (dr.abs(rise) <= profile.level)
-    mean = (_column(profile, high) - _column(profile, low)) / dr.select(level, 1.0, rise)
-    return dr.maximum(dr.select(level, _density(profile, 0.5 * (low + high)), mean), 0.0)
+    low, high = dr.minimum(one, other), dr.maximum(one, other)
+    inner_low, inner_high = dr.maximum(low, profile.lowest), dr.maximum(high, profile.lowest)
+    first, last = (_cell_below(profile.height, height) for height in (inner_low, inner_high))
+    after, before = (dr.gather(mi.Float, profile.height, cell) for cell in (first + 1, last))
+    at_low, at_high = _density(profile, inner_low), _density(profile, inner_high)
+    at_after, at_before = (dr.gather(mi.Float, profile.density, cell) for cell in (first + 1, last))
+    columns = (dr.gather(mi.Float, profile.column, cell) for cell in (last, first + 1))
+    parts = 0.5 * ((after - inner_low) * (at_low + at_after) + (inner_high - before) * (at_before + at_high))
+    within = 0.5 * (inner_high - inner_low) * (at_low + at_high)
+    total = dr.select(first == last, within, parts + next(columns) - next(columns))
+    total = total + (inner_low - low - (inner_high - high)) * profile.below
+    return dr.select(high > low, total / dr.maximum(high - low, 1e-30), _density(profile, low))
 
 
 def _column(profile: HeightTable, height: Float) -> Float:

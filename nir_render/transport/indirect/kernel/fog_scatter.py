@@ -102,11 +102,11 @@ def _light_for_stretch(
     chance returned is then the one that makes the estimate right on average.
     """
     few = weighs_all(scene)
-    first, count = connect.lights_of_tier(scene.lights, state.tier, active) if few else (0, _CANDIDATES)
+    first, count = scene.lights.of_tier(state.tier, active) if few else (0, _CANDIDATES)
 
     def weigh(k: UInt) -> tuple[UInt, Float]:
         if few:
-            row, chance = connect.row_of_tier(scene.lights, state.tier, first + k, active), 1.0
+            row, chance = scene.lights.row_of_tier(state.tier, first + k, active), 1.0
         else:
             row, chance = _candidate(scene, state, begin, end, k, number)
         return row, brought_to_stretch(scene, row, state.origin, state.direction, begin, end, active) / chance

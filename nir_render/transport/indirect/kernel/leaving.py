@@ -92,8 +92,8 @@ def leave_in_fog(
     turned = number(draws.FLIGHT) < chance
 
     rough = surface & ~turned & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    from_fog = _share_from_fog(scene, state)
-    share = dr.select(turned, from_fog, dr.select(rough, _FROM_SURFACE, 0.0))
+    from_fog, from_surface = _shares_into_halos(scene, state)
+    share = dr.select(turned, from_fog, dr.select(rough, from_surface, 0.0))
     in_halo = number(draws.HALO) < share
     place = dr.select(turned, scattering.place, sampled.place)
     light = number(draws.HALO_LIGHT)
@@ -110,10 +110,10 @@ def leave_in_fog(
     density = dr.select(in_halo, density, sampled.density)
     smooth = sampled.smooth & ~in_halo
     weight = dr.select(in_halo, value[0], sampled.weight * sampled.density) / dr.maximum(
-        dr.lerp(density, halo, _FROM_SURFACE), 1e-30
+        dr.lerp(density, halo, from_surface), 1e-30
     )
     weight = dr.select(
-        rough, dr.select(smooth, sampled.weight / (1.0 - _FROM_SURFACE), weight), sampled.weight
+        rough, dr.select(smooth, sampled.weight / (1.0 - from_surface), weight), sampled.weight
     )
     left = dr.select(in_halo, value[0] / dr.maximum(density, 1e-30), sampled.left)
     stays = (1.0 - lost) / (1.0 - chance)
@@ -128,15 +128,16 @@ def leave_in_fog(
     )
 
 
-def _share_from_fog(scene: DeviceScene, state: PathState) -> Float:
-    """Return the share of directions from fog that go into halos; none for the sky alone, which has none."""
-    lights = scene.lights
+def _shares_into_halos(scene: DeviceScene, state: PathState) -> tuple[Float, Float]:
+    """Return the shares of directions from fog and from surfaces that go into halos: 0 for the sky alone."""
+    lights, shares = scene.lights, (mi.Float(_FROM_FOG), mi.Float(_FROM_SURFACE))
     if not lights.sky_alone:
-        return mi.Float(_FROM_FOG)
+        return shares
     if state.tier is None:
-        return mi.Float(0.0)
+        return mi.Float(0.0), mi.Float(0.0)
     serves = state.tier == dr.gather(mi.UInt32, lights.tier, mi.UInt32(lights.sky))
-    return dr.select(serves, 0.0, _FROM_FOG)
+    from_fog, from_surface = (dr.select(serves, 0.0, share) for share in shares)
+    return from_fog, from_surface
 
 
 class _Halos:
@@ -165,7 +166,7 @@ class _Halos:
         self.place, self.heading, self.turned, self.active = place, heading, turned, active
         self.tier, self.total = tier, None
         if weighs_all(scene):
-            self.first, self.count = connect.lights_of_tier(self.lights, tier, active)
+            self.first, self.count = self.lights.of_tier(tier, active)
             self.row, _, self.total = draws.draw_by_weight(self.count, self._weighed, u)
         else:
             cell = connect.guide_cell(scene.choice, place, tier)
@@ -196,7 +197,7 @@ class _Halos:
 
     def _weighed(self, k: UInt) -> tuple[UInt, Float]:
         """Return a light of the tier, and how much of its halo a path brings on, roughly: never nothing."""
-        row = connect.row_of_tier(self.lights, self.tier, self.first + k, self.active)
+        row = self.lights.row_of_tier(self.tier, self.first + k, self.active)
         axis, distance = self._axis(row)
         spread = dr.gather(mi.Float, self.lights.spread, row, self.active)
         weight = dr.gather(mi.Float, self.lights.power, row, self.active)

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.scene.documents.fog import MOST_HEIGHTS
-from nir_render.scene.fog_depth import HeightProfile
 from nir_render.spectra.skies import CieSky
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.guide import Guide
@@ -15,13 +14,16 @@ from nir_render.transport.indirect.kernel.sky import SkyTable, upload_sky
 from nir_render.transport.indirect.kernel.types import Float, Int, Mask, MitsubaScene, Point, UInt, Vector
 from nir_render.transport.world.emitters import RECTANGLE, SKY, SPHERE, SUN, Emitters
 from nir_render.transport.world.facets import PANE, Facets
+from nir_render.transport.world.fog_depth import HeightProfile
 from nir_render.transport.world.medium import Medium
 from nir_render.transport.world.pattern import Pattern
 from nir_render.transport.world.phase import CELLS
 
 _EDGELESS_M = 1e30  # stands for infinity, whose products with 0 are not numbers
 HEIGHTS = MOST_HEIGHTS + 1
-_LEVEL = 1e-4  # of a profile's height: of less rise, differences of columns would lose their digits
+_LEVEL = (
+    1e-3  # of a profile's height: of less rise, heights that flights are drawn to would lose their digits
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,17 @@ class Lights:
     has_spheres: bool
     has_rectangles: bool
     has_images: bool
+
+    def of_tier(self, tier: UInt | None, active: Mask) -> tuple[UInt, UInt]:
+        """Return where the lights of a tier begin in `by_tier`, and how many they are; all of one tier."""
+        if tier is None:
+            return mi.UInt32(0), self.count
+        first, end = (dr.gather(mi.UInt32, self.first_of_tier, tier + k, active) for k in range(2))
+        return first, end - first
+
+    def row_of_tier(self, tier: UInt | None, place: UInt, active: Mask) -> UInt:
+        """Return the light at a place in `by_tier`."""
+        return place if tier is None else dr.gather(mi.UInt32, self.by_tier, place, active)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +115,10 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class HeightTable:
-    """The density of fog over height, over that of its extinction (`scene.fog_depth.HeightProfile`).
+    """The density of fog over height, over that of its extinction (`world.fog_depth.HeightProfile`).
 
     Of each of `HEIGHTS` points; those beyond the highest of the profile are endlessly high. `level` is the
-    rise below which a way counts as level, `below` the density below the lowest point.
+    rise below which a flight counts as level, `below` the density below the lowest point.
     """
 
     height: Float

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.scene.documents.fog import Fog
-from nir_render.scene.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 
@@ -77,24 +76,9 @@ def optical_depth(fog: Fog, start_m: Array, direction: Array, length_m: Array) -
     profile = height_profile(fog)
     if profile is None:
         return np.asarray(fog.extinction_per_m * fog_m)
-    inside = fog_m > 0.0
-    ends_m = [start_m[:, 2] + direction[:, 2] * np.where(inside, at_m, 0.0) for at_m in (enter_m, leave_m)]
+    rises = (fog_m > 0.0) & (direction[:, 2] != 0.0)  # endless level ways have a height
+    ends_m = [start_m[:, 2] + direction[:, 2] * np.where(rises, at_m, 0.0) for at_m in (enter_m, leave_m)]
     return np.asarray(fog.extinction_per_m * profile.mean(*ends_m) * fog_m)
-
-
-def extinction_among_robots_per_m(snapshot: Snapshot) -> float:
-    """Return the extinction of a scene's fog where robots carry their sources: the mean over these heights.
-
-    That is what a robot may know who knows one number of it; 0 in clear air.
-    """
-    fog = snapshot.fog
-    if fog is None:
-        return 0.0
-    profile = height_profile(fog)
-    heights_m = [placed.pose.position_m[2] for placed in snapshot.carried_sources.values()]
-    if profile is None or not heights_m:
-        return fog.extinction_per_m
-    return fog.extinction_per_m * float(profile.at(np.array(heights_m)).mean())
 
 
 def _within_box_m(

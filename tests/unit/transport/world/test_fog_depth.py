@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nir_render.scene.documents.fog import Fog
-from nir_render.scene.fog_depth import optical_depth
+from nir_render.transport.world.fog_depth import optical_depth
 
 INF = math.inf
 POINTS = [(0.5, 1.0), (1.0, 0.5), (1.2, 0.0), (2.0, 2.0), (2.5, 0.25)]
@@ -84,7 +84,7 @@ def test_fog_ends_where_its_profile_ends_at_nothing() -> None:
     ("profile", "says"),
     [
         ([["0 m", 1.0]], "at least two points"),
-        ([["0 m", 0.0], ["1 m", 0.0]], "is 0 at every height"),
+        ([["0 m", 0.0], ["1 m", 0.0]], "below 1e-06 at every height"),
         ([["1 m", 1.0], ["0 m", 0.5]], "increasing height"),
         ([["0 m", -1.0], ["1 m", 0.5]], "negative"),
         ([["0 m", 1e11], ["1 m", 0.5]], "beyond"),
