@@ -219,10 +219,8 @@ def _source_budget(
     assumed: Assumptions,
 ) -> SourceBudget:
     mean_intensity = source.sent_flux_w / (4.0 * math.pi)
-    extinction_per_m, leaks = (
-        extinction_among_robots_per_m(snapshot)[0],
-        leak(camera, source).out_of_band_shares,
-    )
+    extinction_per_m, _ = extinction_among_robots_per_m(snapshot)
+    leaks = leak(camera, source).out_of_band_shares
     return SourceBudget(
         sources=tuple(names),
         drives={name: drive_text(ranged[name]) for name in names},

@@ -88,10 +88,8 @@ def _flight(
 
 
 def _density(profile: HeightTable, height: Float) -> Float:
-    within = dr.maximum(height, profile.lowest)
-    cell = _cell_below(profile.height, within)
-    step = within - dr.gather(mi.Float, profile.height, cell)
-    return dr.gather(mi.Float, profile.density, cell) + step * dr.gather(mi.Float, profile.slope, cell)
+    cell, step = _place_in_cell(profile, dr.maximum(height, profile.lowest))
+    return _density_in_cell(profile, cell, step)
 
 
 def _mean_density(profile: HeightTable, one: Float, other: Float) -> Float:
@@ -102,26 +100,27 @@ def _mean_density(profile: HeightTable, one: Float, other: Float) -> Float:
     """
     low, high = dr.minimum(one, other), dr.maximum(one, other)
     inner_low, inner_high = dr.maximum(low, profile.lowest), dr.maximum(high, profile.lowest)
-    first, last = (_cell_below(profile.height, height) for height in (inner_low, inner_high))
-    after, before = (dr.gather(mi.Float, profile.height, cell) for cell in (first + 1, last))
-    at_low, at_high = _density(profile, inner_low), _density(profile, inner_high)
+    (first, low_step), (last, high_step) = (
+        _place_in_cell(profile, height) for height in (inner_low, inner_high)
+    )
+    at_low = _density_in_cell(profile, first, low_step)
+    at_high = _density_in_cell(profile, last, high_step)
+    after = dr.gather(mi.Float, profile.height, first + 1)
     at_after, at_before = (dr.gather(mi.Float, profile.density, cell) for cell in (first + 1, last))
     columns = (dr.gather(mi.Float, profile.column, cell) for cell in (last, first + 1))
-    parts = 0.5 * ((after - inner_low) * (at_low + at_after) + (inner_high - before) * (at_before + at_high))
+    parts = 0.5 * ((after - inner_low) * (at_low + at_after) + high_step * (at_before + at_high))
     within = 0.5 * (inner_high - inner_low) * (at_low + at_high)
     total = dr.select(first == last, within, parts + next(columns) - next(columns))
     total = total + (inner_low - low - (inner_high - high)) * profile.below
-    return dr.select(high > low, total / dr.maximum(high - low, 1e-30), _density(profile, low))
+    return dr.select(high > low, total / dr.maximum(high - low, 1e-30), at_low)
 
 
 def _column(profile: HeightTable, height: Float) -> Float:
     """Return ∫ of the density from the lowest point to a height, below it negative."""
     within = dr.maximum(height, profile.lowest)
-    cell = _cell_below(profile.height, within)
-    step = within - dr.gather(mi.Float, profile.height, cell)
-    density, slope = (dr.gather(mi.Float, table, cell) for table in (profile.density, profile.slope))
-    column = dr.gather(mi.Float, profile.column, cell) + step * (density + 0.5 * slope * step)
-    return column + (height - within) * profile.below
+    cell, step = _place_in_cell(profile, within)
+    mean = _density_in_cell(profile, cell, 0.5 * step)
+    return dr.gather(mi.Float, profile.column, cell) + step * mean + (height - within) * profile.below
 
 
 def _height_of(profile: HeightTable, column: Float) -> Float:
@@ -133,6 +132,16 @@ def _height_of(profile: HeightTable, column: Float) -> Float:
     root = dr.safe_sqrt(density * density + 2.0 * slope * left)
     height = dr.gather(mi.Float, profile.height, cell) + 2.0 * left / dr.maximum(density + root, 1e-30)
     return height + dr.minimum(column, 0.0) / dr.maximum(profile.below, 1e-30)
+
+
+def _place_in_cell(profile: HeightTable, height: Float) -> tuple[UInt, Float]:
+    """Return the cell of a height, not below the lowest, and how far above its begin that is."""
+    cell = _cell_below(profile.height, height)
+    return cell, height - dr.gather(mi.Float, profile.height, cell)
+
+
+def _density_in_cell(profile: HeightTable, cell: UInt, step: Float) -> Float:
+    return dr.gather(mi.Float, profile.density, cell) + step * dr.gather(mi.Float, profile.slope, cell)
 
 
 def _cell_below(table: Float, value: Float) -> UInt:
