@@ -83,10 +83,15 @@ def diffuse_image(
     image = np.zeros((rows, columns))
     edges = indirect.edges
     enlargement = None if edges is None else edges.enlargement
+    multiple = indirect.multiple
     parts = by_spectrum(light, snapshot, indirect.radiance_per_w, fluxes)
     patches = [] if edges is None else by_spectrum(light, snapshot, edges.radiance_per_w, fluxes)
-    for part, patch in zip_longest(parts, patches):
-        whole = enlarge(part.values, rows, columns, enlargement, None if patch is None else patch.values)
+    averaged = [] if multiple is None else by_spectrum(light, snapshot, multiple.radiance_per_w, fluxes)
+    for part, patch, turned in zip_longest(parts, patches, averaged):
+        values = part.values
+        if multiple is not None:
+            values = values + (multiple.averages.of(turned.values) - turned.values)
+        whole = enlarge(values, rows, columns, enlargement, None if patch is None else patch.values)
         image += diffuse_electrons(camera, whole, part.emitter, 1.0, part.node)
     return image
 

@@ -22,6 +22,7 @@ from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
 from nir_render.camera.mean_frame import MeanFrame, Rates
 from nir_render.camera.optics.apertures import Aperture, aperture_weights, flare_apertures
 from nir_render.camera.sensor.read_out import dark_variance_e2
+from nir_render.light.averages import BlockVariance
 from nir_render.light.enlarge import ALL_ROWS, Enlargement, enlarge, enlarge_variance, without_edges
 from nir_render.light.light import Light
 from nir_render.randomness import generator
@@ -29,7 +30,7 @@ from nir_render.scene.documents.camera import Camera
 from nir_render.scene.snapshot import Snapshot
 
 Array = NDArray[np.float64]
-_Parts = list[tuple[Array, Array, Array | None]]
+_Parts = list[tuple[Array, BlockVariance, Array | None]]
 
 _TINY_E2 = 1e-12  # a noiseless sensor in the dark has no noise to compare with
 _NEARLY_ALL = 0.99
@@ -253,7 +254,7 @@ def _behind_lens_e2(light: Light, camera: Camera, parts: _Parts) -> Array:
     for _ in range(draws):
         noise_e = np.zeros((rows, columns))
         for factor, variance, patch in parts:
-            of_blocks = np.sqrt(variance) * random.standard_normal(variance.shape)
+            of_blocks = variance.drawn(random)
             of_patch = None if patch is None else np.sqrt(patch) * random.standard_normal(patch.shape)
             noise_e += factor * enlarge(of_blocks, rows, columns, enlargement, of_patch)
         total_e2 += (blur(camera, noise_e) ** 2).sum(axis=1)
@@ -313,7 +314,7 @@ def _of_apertures_e2(light: Light, camera: Camera, parts: _Parts, apertures: lis
     enlargement = _enlargement(light) or without_edges(camera.sensor.rows, camera.sensor.columns)
     for factor, variance, patch in parts:
         of_blocks, of_patch = aperture_weights(apertures, factor, light.indirect.scale, enlargement)
-        total += of_blocks.multiply(of_blocks) @ variance.ravel()
+        total += variance.of_sums(of_blocks)
         if patch is not None:
             total += of_patch.multiply(of_patch) @ patch
     return total
@@ -357,10 +358,20 @@ def _variances(light: Light, snapshot: Snapshot, exposure_s: float, levels: Arra
     if light.indirect is None:
         return []
     squares = (group_fluxes(light, snapshot) * (1.0 if levels is None else levels)) ** 2
-    edges = light.indirect.edges
+    edges, multiple = light.indirect.edges, light.indirect.multiple
     parts = variance_by_spectrum(light, snapshot, exposure_s, light.indirect.variance, squares)
     patches = [] if edges is None else by_spectrum(light, snapshot, edges.variance, squares)
+    factors, whole = [factor for factor, _ in parts], [variance for _, variance in parts]
+    if multiple is None:
+        blocks = [BlockVariance(variance) for variance in whole]
+    else:
+        averaged, covariances = (
+            [part.values for part in by_spectrum(light, snapshot, array, squares)]
+            for array in (multiple.variance, multiple.covariance)
+        )
+        around = multiple.averages
+        blocks = [BlockVariance(*one, around) for one in zip(whole, averaged, covariances, strict=True)]
     return [
-        (factor, variance, None if patch is None else patch.values)
-        for (factor, variance), patch in zip_longest(parts, patches)
+        (factor, block, None if patch is None else patch.values)
+        for factor, block, patch in zip_longest(factors, blocks, patches)
     ]

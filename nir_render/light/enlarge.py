@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
+from nir_render.light.averages import BlockVariance
 from perception.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -83,14 +84,14 @@ def enlarge(
 
 
 def enlarge_variance(
-    variance: Array,
+    variance: BlockVariance,
     rows: int,
     columns: int,
     enlargement: Enlargement | None = None,
     patch: Array | None = None,
     chosen: slice = ALL_ROWS,
 ) -> Array:
-    """Return the variance of each pixel of an enlarged image of independent blocks.
+    """Return the variance of each pixel of an enlarged image.
 
     Parameters
     ----------
@@ -99,25 +100,28 @@ def enlarge_variance(
     chosen
         Which rows of the image are wanted.
     """
-    if variance.shape == (rows, columns):
-        return variance[chosen]
+    of_blocks = variance.whole.shape
+    if of_blocks == (rows, columns):
+        return variance.of_blocks()[chosen]
     row = np.arange(rows)[chosen]
-    down = _linear(row, rows, variance.shape[0])
-    across = _linear(np.arange(columns), columns, variance.shape[1])
-    image = _of_pairs(
-        np.ascontiguousarray(variance, dtype=np.float64),
-        down.indices.reshape(-1, 2),
-        down.data.reshape(-1, 2) ** 2,
-        across.indices.reshape(-1, 2),
-        across.data.reshape(-1, 2) ** 2,
-    )
+    down = _linear(row, rows, of_blocks[0])
+    across = _linear(np.arange(columns), columns, of_blocks[1])
+    places = [axis.indices.reshape(-1, 2) for axis in (down, across)]
+    shares = [np.asarray(axis.data).reshape(-1, 2) for axis in (down, across)]
+    neighbours = variance.of_neighbours()
+    if neighbours is None:
+        whole = np.ascontiguousarray(variance.whole, dtype=np.float64)
+        image = _of_pairs(whole, places[0], shares[0] ** 2, places[1], shares[1] ** 2)
+    else:
+        image = _of_fours(neighbours, places[0], shares[0], places[1], shares[1])
     if enlargement is not None:
-        weights, pixels, patched = enlargement.matrix(variance.size), enlargement.pixels, enlargement.patch
+        blocks = of_blocks[0] * of_blocks[1]
+        weights, pixels, patched = enlargement.matrix(blocks), enlargement.pixels, enlargement.patch
         if len(row) < rows:
             fitted, pixels = _in_rows(pixels, columns, row, rows)
             rendered, patched = _in_rows(patched, columns, row, rows)
             weights, patch = weights[fitted], None if patch is None else patch[rendered]
-        image.ravel()[pixels] = weights.multiply(weights) @ variance.ravel()
+        image.ravel()[pixels] = variance.of_sums(weights)
         if patch is not None:
             image.ravel()[patched] = patch
     return image
@@ -147,6 +151,35 @@ def _of_pairs(
         for pixel in range(len(column)):
             one, other = line[column[pixel, 0]], line[column[pixel, 1]]
             image[at, pixel] = column_weight[pixel, 0] * one + column_weight[pixel, 1] * other
+    return image
+
+
+@compiled
+def _of_fours(
+    neighbours: Array,
+    row: NDArray[np.int32],
+    row_weight: Array,
+    column: NDArray[np.int32],
+    column_weight: Array,
+) -> Array:
+    """Return for each pixel the variance of the weighted sum of its four blocks, shape (rows, columns).
+
+    `neighbours` are the blocks' covariances (`BlockVariance.of_neighbours`).
+    """
+    image = np.empty((len(row), len(column)))
+    own, right, below, below_right, below_left = neighbours
+    for at in range(len(row)):
+        top, bottom = row[at]
+        for pixel in range(len(column)):
+            left, beside = column[pixel]
+            a, b = row_weight[at, 0] * column_weight[pixel, 0], row_weight[at, 0] * column_weight[pixel, 1]
+            c, d = row_weight[at, 1] * column_weight[pixel, 0], row_weight[at, 1] * column_weight[pixel, 1]
+            total = a * a * own[top, left] + b * b * own[top, beside]
+            total += c * c * own[bottom, left] + d * d * own[bottom, beside]
+            total += 2.0 * (a * b * right[top, left] + c * d * right[bottom, left])
+            total += 2.0 * (a * c * below[top, left] + b * d * below[top, beside])
+            total += 2.0 * (a * d * below_right[top, left] + b * c * below_left[top, beside])
+            image[at, pixel] = total
     return image
 
 

@@ -2,13 +2,18 @@
 
 import html
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nir_render.light.averages import Averages, averages
 from nir_render.light.enlarge import Enlargement
 from nir_render.spectra.nodes import Node, nodes_at
+
+MAY_BE_MISSING = {"may_be_missing": True}
+"""Metadata of a field that files leave out where it is None: lights without it keep their hash."""
 
 
 class _ReadOnly:
@@ -102,6 +107,37 @@ class Edges(_ReadOnly):
 
 
 @dataclass(frozen=True, eq=False)
+class Multiple(_ReadOnly):
+    """The part of indirect light in blocks that was turned twice or more: it changes slowly in the image.
+
+    Frames are made of its averages over blocks around, of the same surface (`light.averages`), which have a
+    twentieth of its noise.
+
+    Attributes
+    ----------
+    radiance_per_w, variance
+        Of this part alone, as those of `Indirect`, which contain it.
+    covariance
+        Of the means of this part and of the rest, same shape.
+    surface
+        A number for the surface in each block, shape (row, column); −1 where a block stands alone.
+    """
+
+    radiance_per_w: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    covariance: NDArray[np.float32]
+    surface: NDArray[np.int32]
+
+    @cached_property
+    def averages(self) -> Averages:
+        """How blocks are averaged."""
+        return averages(self.surface)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {known.name: getattr(self, known.name) for known in fields(self)}
+
+
+@dataclass(frozen=True, eq=False)
 class Indirect(_ReadOnly):
     """All other light: off walls and floor, mirrored more than once, through glass, from lamps, off fog.
 
@@ -121,6 +157,8 @@ class Indirect(_ReadOnly):
     edges
         How these arrays are enlarged where surfaces meet; None where the scale is 1 and where they are not
         known, and everything is interpolated.
+    multiple
+        What of this light is averaged over blocks, in fog; None where nothing is.
     """
 
     radiance_per_w: NDArray[np.float32]
@@ -129,6 +167,7 @@ class Indirect(_ReadOnly):
     samples: int
     counts: NDArray[np.int32] | None = None
     edges: Edges | None = None
+    multiple: Multiple | None = field(default=None, metadata=MAY_BE_MISSING)
 
 
 @dataclass(frozen=True, eq=False)

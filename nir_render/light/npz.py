@@ -77,6 +77,8 @@ def _taken_apart(value: Any, name: str = "light") -> tuple[Any, dict[str, NDArra
     fields: dict[str, Any] = {}
     arrays: dict[str, NDArray[Any]] = {}
     for field in (field for field in dataclasses.fields(value) if field.init):
+        if field.metadata.get("may_be_missing") and getattr(value, field.name) is None:
+            continue
         fields[field.name], inner = _taken_apart(getattr(value, field.name), f"{name}.{field.name}")
         arrays |= inner
     return {"class": type(value).__name__, "fields": fields}, arrays

@@ -192,7 +192,11 @@ def _reference_light(
     assert own.indirect is not None  # or it would be None above too
     samples = own.indirect.samples
     many = replace(
-        own.indirect, radiance_per_w=film.mean(), variance=film.variance(), samples=renders * samples
+        own.indirect,
+        radiance_per_w=film.mean(),
+        variance=film.variance(),
+        samples=renders * samples,
+        multiple=None,  # of so many samples nothing need be averaged
     )
     third_edges = None
     if own.indirect.edges is not None:

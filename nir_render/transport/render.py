@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.optics.apertures import pixels_around_flares
 from nir_render.errors import InputError
-from nir_render.light.enlarge import Enlargement, part_of, with_patch
+from nir_render.light.enlarge import Enlargement, part_of, with_patch, without_edges
 from nir_render.light.light import DirectTable, Indirect, Light
 from nir_render.light.nodes import direct_over_nodes, indirect_over_nodes
 from nir_render.scene.bodies import place_of_shape, solid_around
@@ -22,8 +22,11 @@ from nir_render.transport.cache import LightCache
 from nir_render.transport.cache_key import Sampled, Site, geometry_key, light_key, plan_key, versions
 from nir_render.transport.direct.table import bodies_of, direct_table
 from nir_render.transport.indirect import groups, sample_plan, stock
+from nir_render.transport.indirect.averaging import Averaging, averaging_of
+from nir_render.transport.indirect.enlargement import Labels
 from nir_render.transport.indirect.guide import group_power
 from nir_render.transport.indirect.kernel.tables import DeviceScene
+from nir_render.transport.indirect.labels import labels_of
 from nir_render.transport.indirect.sharpen import enlargement_of, flare_pilot, halo_reach_px, sharpened
 from nir_render.transport.wavelengths import carried_wavelengths
 from nir_render.transport.world import mitsuba_scene
@@ -139,7 +142,7 @@ class _Rendering:
 
     def _pilot(self) -> Light:
         key = groups.light_seed(self.seed, "pilot", self.site.name, self._geometry)
-        return self._light(groups.pilot(self.site.snapshot, self._built, self._rays, key))
+        return self._light(groups.pilot(self.site.snapshot, self._built, self._rays, key, self._averaging))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
@@ -166,6 +169,7 @@ class _Rendering:
             samples,
             wavelengths_m=self.wavelengths_m,
             built=self._built,
+            averaging=self._averaging,
         )
         if light is None:
             return None
@@ -215,10 +219,24 @@ class _Rendering:
         return cast("DeviceScene", self.kept[key])
 
     @cached_property
+    def _labels(self) -> Labels:
+        return labels_of(self._built, self._rays.origin_m, self._rays.corners)
+
+    @cached_property
+    def _averaging(self) -> Averaging | None:
+        snapshot, rays = self.site.snapshot, self._rays
+        scale = snapshot.render.indirect.scale
+        if snapshot.fog is None or scale == 1:
+            return None
+        return averaging_of(snapshot, self._labels, rays.origin_m, rays.corners, scale)
+
+    @cached_property
     def _enlargement(self) -> Enlargement:
         site = self.site
         scale = site.snapshot.render.indirect.scale
-        enlargement = enlargement_of(site.snapshot, self._built, self._rays, scale)
+        if scale == 1:
+            return without_edges(*(count - 1 for count in self._rays.corners.shape[:2]))
+        enlargement = enlargement_of(site.snapshot, self._labels, self._rays, scale)
         reach_px = halo_reach_px(site.snapshot, self._rays, scale)
         if reach_px == 0.0:
             return enlargement

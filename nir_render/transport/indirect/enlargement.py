@@ -7,20 +7,16 @@ edge cuts has its share of each surface. All of it is linear in the light, with 
 `light.enlarge` applies them.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.light.enlarge import Enlargement
-from perception.compiled import compiled
+from nir_render.light.planes import fit_planes
 
 Array = NDArray[np.float64]
 
-_REACH = 2  # blocks on each side from which a plane is fitted
-_KERNEL_BLOCKS = 1.4  # σ of the Gaussian weights of that fit
-_RIDGE = 0.03  # σ² in squared blocks that stands against a slope: what few blocks say of it counts less
 _MOST_NOISE = 2.0  # variance that a fitted pixel may have, in variances of a block
 _FAR_OFF = 0.15  # how much nearer or farther a pixel may be than the blocks that tell of it
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
@@ -43,6 +39,8 @@ class Labels:
         One over the distance of what is in the middle of each pixel, 0 where nothing is, as `middle`.
     shining
         Whether a lamp is seen there, by label.
+    even
+        Whether it is a flat matt surface of one reflectance, or nothing at all, by label.
     """
 
     middle: NDArray[np.int32]
@@ -50,15 +48,16 @@ class Labels:
     within: NDArray[np.int32]
     nearness_per_m: NDArray[np.float32]
     shining: NDArray[np.bool_]
+    even: NDArray[np.bool_]
 
 
 def fit_enlargement(labels: Labels, scale: int) -> Enlargement:
     """Return how light in blocks of scale × scale pixels is enlarged, where these pixels have labels."""
     rows, columns = labels.middle.shape
-    pure = _pure(labels, scale)
+    pure = labels_of_blocks(labels, scale)
     rough = np.flatnonzero(~_between_equals(pure, rows, columns, scale))
     pixel, label, share = _parts(labels, rough)
-    block, weight, found = _fit(pure, pixel, label, scale, columns)
+    block, weight, found = fit_planes(pure, pixel, label, scale, columns)
     found &= (weight**2).sum(axis=1) < _MOST_NOISE
     found &= ~_foreshortened(labels, scale, block, weight)
     cut, lone = _chosen(pixel, labels.shining[label], ~found, rows * columns)
@@ -95,7 +94,7 @@ def _evenly(pixels: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     return pixels[np.sort(order[:most])]
 
 
-def _pure(labels: Labels, scale: int) -> NDArray[np.int32]:
+def labels_of_blocks(labels: Labels, scale: int) -> NDArray[np.int32]:
     """Return the label of each block that shows one surface alone, −1 for others."""
     rows, columns = labels.middle.shape
     in_blocks = labels.middle.reshape(rows // scale, scale, columns // scale, scale)
@@ -137,58 +136,6 @@ def _parts(
     label = np.concatenate([labels.middle.ravel()[whole], within[row, place]])
     order = np.argsort(pixel, kind="stable")
     return pixel[order], label[order], np.concatenate([np.ones(len(whole)), share])[order]
-
-
-@compiled
-def _fit(
-    pure: NDArray[np.int32], pixel: NDArray[np.int64], label: NDArray[np.int32], scale: int, columns: int
-) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Return blocks around parts of pixels, their weights, shape (parts, blocks), and which parts have any.
-
-    The weights give the value at the pixel of the plane a + b x + c y that fits the blocks of the part's
-    label best, each block counted by a Gaussian of its distance; b and c are held towards 0 (ridge
-    regression), so that a single block is continued flat.
-    """
-    side = 2 * _REACH + 1
-    block = np.zeros((len(pixel), side * side), dtype=np.int64)
-    weight, found = np.zeros(block.shape), np.zeros(len(pixel), dtype=np.bool_)
-    x, y, kernel = np.empty(side * side), np.empty(side * side), np.empty(side * side)
-    for part in range(len(pixel)):
-        row, column = (
-            (pixel[part] // columns + 0.5) / scale - 0.5,
-            (pixel[part] % columns + 0.5) / scale - 0.5,
-        )
-        top, left = int(np.rint(row)) - _REACH, int(np.rint(column)) - _REACH
-        total, mean_x, mean_y = 0.0, 0.0, 0.0
-        for one in range(side * side):
-            block_row, block_column = top + one // side, left + one % side
-            y[one], x[one], kernel[one] = block_row - row, block_column - column, 0.0
-            if not (0 <= block_row < pure.shape[0] and 0 <= block_column < pure.shape[1]):
-                continue
-            block[part, one] = block_row * pure.shape[1] + block_column
-            if pure[block_row, block_column] == label[part]:
-                kernel[one] = math.exp(-0.5 * (x[one] ** 2 + y[one] ** 2) / _KERNEL_BLOCKS**2)
-                total += kernel[one]
-        if total == 0.0:
-            continue
-        found[part] = True
-        for one in range(side * side):
-            kernel[one] /= total
-            mean_x += kernel[one] * x[one]
-            mean_y += kernel[one] * y[one]
-        xx, yy, xy = _RIDGE, _RIDGE, 0.0
-        for one in range(side * side):
-            x[one], y[one] = x[one] - mean_x, y[one] - mean_y
-            xx += kernel[one] * x[one] * x[one]
-            yy += kernel[one] * y[one] * y[one]
-            xy += kernel[one] * x[one] * y[one]
-        # The value at the pixel, x = y = 0: the mean of the blocks, and from there along the slopes.
-        determinant = xx * yy - xy**2
-        along_x = (yy * mean_x - xy * mean_y) / determinant
-        along_y = (xx * mean_y - xy * mean_x) / determinant
-        for one in range(side * side):
-            weight[part, one] = kernel[one] * (1.0 - along_x * x[one] - along_y * y[one])
-    return block, weight, found
 
 
 def _foreshortened(labels: Labels, scale: int, block: NDArray[np.int64], weight: Array) -> NDArray[np.bool_]:

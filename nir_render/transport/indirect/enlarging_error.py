@@ -159,26 +159,31 @@ def _squares(mean: MeanFrame, fluxes: Array, pixels: Numbers, samples: int) -> A
     """Return the squares of the errors of pixels in electrons, noise of expectation 0, shape (pixels,)."""
     from nir_render.transport.indirect.groups import rays_of  # Mitsuba loads only where light is rendered
     from nir_render.transport.indirect.guide import group_power
-    from nir_render.transport.indirect.sharpen import rendered_again
+    from nir_render.transport.indirect.sharpen import MULTIPLE, rendered_again
 
     light, camera, snapshot = mean.light, mean.camera, mean.rates.snapshot
     assert light.indirect is not None
     assert light.indirect.edges is not None
     scale = light.indirect.scale
     weights = weights_of(pixels, scale, light.indirect.edges.enlargement)
-    used = np.unique(weights.indices).astype(np.int64)
-    weights = csr_array(weights[:, used])
+    made_of = {scale: weights}
+    if light.indirect.multiple is not None:
+        made_of[MULTIPLE] = csr_array(weights @ light.indirect.multiple.averages.matrix)
+    used = {kind: np.unique(one.nonzero()[1]).astype(np.int64) for kind, one in made_of.items()}
+    made_of = {kind: csr_array(one[:, used[kind]]) for kind, one in made_of.items()}
     rays = rays_of(camera, snapshot.camera(light.camera).pose)
     power = group_power(snapshot, camera)
-    wanted = {1: pixels, scale: used}
-    renders = rendered_again(snapshot, rays, light.seed, power, wanted, samples, light.wavelengths_m)
+    wanted = {1: pixels, scale: used[scale]}
+    renders = rendered_again(
+        snapshot, rays, light.seed, power, wanted, samples, light.wavelengths_m, used.get(MULTIPLE)
+    )
     square_e2 = np.ones(len(pixels))
     for radiance_per_w in renders:
         error_e = np.zeros(len(pixels))
-        full = by_spectrum(light, snapshot, radiance_per_w[1], fluxes)
-        in_blocks = by_spectrum(light, snapshot, radiance_per_w[scale], fluxes)
-        for of_pixels, of_blocks in zip(full, in_blocks, strict=True):
-            response = electrons_per_radiance(camera, of_pixels.emitter, mean.exposure_s, of_pixels.node)
-            error_e += response.ravel()[pixels] * (weights @ of_blocks.values - of_pixels.values)
+        for kind, radiance in radiance_per_w.items():
+            for part in by_spectrum(light, snapshot, radiance, fluxes):
+                response = electrons_per_radiance(camera, part.emitter, mean.exposure_s, part.node)
+                values = -part.values if kind == 1 else made_of[kind] @ part.values
+                error_e += response.ravel()[pixels] * values
         square_e2 *= error_e
     return square_e2

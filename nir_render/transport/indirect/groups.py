@@ -14,17 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.optics.lens import corner_directions
-from nir_render.light.light import Indirect
+from nir_render.light.averages import averages
+from nir_render.light.light import Indirect, Multiple
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import CLEAR_DEPTH
-from nir_render.scene.documents.materials import Dielectric, Pane, texture_of
-from nir_render.scene.documents.shapes import Box
+from nir_render.scene.documents.materials import Dielectric, Diffuse, Pane, texture_of
+from nir_render.scene.documents.shapes import Box, Rectangle
 from nir_render.scene.pose import Pose
 from nir_render.scene.snapshot import Snapshot
 from nir_render.spectra.nodes import BAND_M
 from nir_render.spectra.skies import CieSky, cie_sky
 from nir_render.transport.backend.variant import dr, mi, shape_number, traces_one_scene
+from nir_render.transport.indirect.averaging import Averaging
 from nir_render.transport.indirect.guide import guide
 from nir_render.transport.indirect.kernel.begin import Film
 from nir_render.transport.indirect.kernel.nodes import NodeTable, upload_nodes
@@ -84,6 +86,7 @@ def indirect(
     values_at_once: int = _VALUES_AT_ONCE,
     wavelengths_m: tuple[float, ...] = (BAND_M,),
     built: DeviceScene | None = None,
+    averaging: Averaging | None = None,
 ) -> Indirect | None:
     """Return the indirect light of all groups, or None where nothing reflects or scatters and no lamp shines.
 
@@ -105,6 +108,8 @@ def indirect(
         The nodes: all go along the same paths.
     built
         The scene on the device, if it is there: `world_on_device` of the same snapshot, power and nodes.
+    averaging
+        What of the light is averaged over blocks, None for nothing.
     """
     if not snapshot.has_indirect_light():
         return None
@@ -116,22 +121,28 @@ def indirect(
     pixels = np.arange(counts.size)
     if built is None:
         built = world_on_device(snapshot, power, wavelengths_m)
-    radiance, variance = render_pixels(
-        snapshot, built, rays, seed, pixels, counts.ravel(), settings.scale, values_at_once
+    narrow = None if averaging is None else averaging.narrow
+    arrays = render_pixels(
+        snapshot, built, rays, seed, pixels, counts.ravel(), settings.scale, values_at_once, narrow
     )
+    radiance, variance, *apart = (array.reshape(*array.shape[:2], *shape) for array in arrays)
     return Indirect(
-        radiance_per_w=radiance.reshape(*radiance.shape[:2], *shape),
-        variance=variance.reshape(*variance.shape[:2], *shape),
+        radiance_per_w=radiance,
+        variance=variance,
         scale=settings.scale,
         samples=int(np.median(counts)),
         counts=None if (counts == counts.flat[0]).all() else counts.astype(np.int32),
+        multiple=None if averaging is None else Multiple(apart[0], apart[1], apart[2], averaging.surface),
     )
 
 
-def pilot(snapshot: Snapshot, built: DeviceScene, rays: Rays, seed: int) -> Indirect | None:
+def pilot(
+    snapshot: Snapshot, built: DeviceScene, rays: Rays, seed: int, averaging: Averaging | None
+) -> Indirect | None:
     """Return a few samples in some pixels of the film, every fourth along each axis: what noise there is.
 
-    A small film's are closer, so that there are a thousand. The arguments are those of `indirect`.
+    Where light is averaged over blocks, the variance is what averages of like blocks would have. A small
+    film's pixels are closer, so that there are a thousand. The arguments are those of `indirect`.
     """
     if not snapshot.has_indirect_light():
         return None
@@ -141,7 +152,15 @@ def pilot(snapshot: Snapshot, built: DeviceScene, rays: Rays, seed: int) -> Indi
     row, column = (middles(count, step) for count in (rows, columns))
     pixels = (row[:, None] * columns + column).ravel()
     counts = np.full(pixels.size, PILOT_SAMPLES)
-    radiance, variance = render_pixels(snapshot, built, rays, seed, pixels, counts, scale)
+    if averaging is None:
+        radiance, variance = render_pixels(snapshot, built, rays, seed, pixels, counts, scale)
+    else:
+        radiance, variance, _, multiple, covariance = render_pixels(
+            snapshot, built, rays, seed, pixels, counts, scale, narrow=averaging.narrow
+        )
+        around = averages(averaging.surface)
+        own, squares = around.own[pixels], (around.weight[pixels] ** 2).sum(axis=1)
+        variance = np.maximum(variance + (squares - 1.0) * multiple + 2.0 * (own - 1.0) * covariance, 0.0)
     shape = (*radiance.shape[:2], row.size, column.size)
     return Indirect(radiance.reshape(shape), variance.reshape(shape), scale * step, PILOT_SAMPLES)
 
@@ -166,7 +185,8 @@ def render_pixels(
     counts: NDArray[np.int64],
     scale: int,
     values_at_once: int = _VALUES_AT_ONCE,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    narrow: float | None = None,
+) -> list[NDArray[np.float32]]:
     """Return radiance per unit of each group in some pixels of a film, at each node, and its variance.
 
     Parameters
@@ -183,14 +203,16 @@ def render_pixels(
         A pixel of the film is scale × scale of the sensor's.
     values_at_once
         Float32 numbers that one launch may fill.
+    narrow
+        If given, there are three more arrays, as of `sample_means`.
 
     Returns
     -------
     Shape (groups, nodes, pixels) each.
     """
     groups = len(snapshot.groups)
-    layers = groups * built.node_count
-    radiance, variance = (_array((layers, pixels.size)) for _ in range(2))
+    layers = groups * built.node_count * (1 if narrow is None else 2)
+    arrays = [_array((groups * built.node_count, pixels.size)) for _ in range(2 if narrow is None else 5)]
     for count in np.unique(counts):
         places = np.flatnonzero(counts == count)
         batches = min(BATCHES, int(count))
@@ -201,9 +223,10 @@ def render_pixels(
             # Neighbours are written as one block: that is a fifth of a render of 512 groups.
             whole = some[-1] - some[0] + 1 == some.size
             there = slice(some[0], some[-1] + 1) if whole else some
-            radiance[:, there], variance[:, there] = sample_means(built, film, seed, groups, int(count))
-    shape = (groups, built.node_count, pixels.size)
-    return radiance.reshape(shape), variance.reshape(shape)
+            found = sample_means(built, film, seed, groups, int(count), narrow)
+            for array, values in zip(arrays, found, strict=True):
+                array[:, there] = values
+    return [array.reshape(groups, built.node_count, pixels.size) for array in arrays]
 
 
 def light_seed(*key: object) -> int:
@@ -259,6 +282,7 @@ def world_on_device(
         fog=None if fog is None else upload_fog(fog),
         max_depth=snapshot.render.indirect.max_depth or default_depth(snapshot, fog, low_m, high_m),
         pictures=any(texture_of(snapshot.materials[one.material]) for one in snapshot.shapes.values()),
+        even_shapes=columns["even"].astype(bool),
         nodes=_node_table(of_nodes, columns["material"], len(wavelengths_m)),
     )
 
@@ -316,7 +340,7 @@ def _shape_columns(
     ]
     size = max((number for _, number in numbers), default=0) + 1
     columns = {name: np.full(size, -1, dtype=np.int64) for name in ("light", "facet", "material")}
-    columns |= {name: np.zeros(size, dtype=np.int64) for name in ("box", "glass", "pane")}
+    columns |= {name: np.zeros(size, dtype=np.int64) for name in ("box", "glass", "pane", "even")}
     light_of_body = {
         f"lamp_{name.removeprefix('lamps.')}" if name.startswith("lamps.") else f"source_{group}": group
         for group, name in enumerate(snapshot.groups)
@@ -337,6 +361,8 @@ def _shape_columns(
         columns["box"][number] = box
         columns["glass"][number] = isinstance(material, Dielectric)
         columns["pane"][number] = isinstance(material, Pane)
+        matt = isinstance(material, Diffuse) and texture_of(material) is None
+        columns["even"][number] = matt and isinstance(shape, Rectangle | Box)
     return columns
 
 

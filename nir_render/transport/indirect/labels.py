@@ -47,6 +47,7 @@ def labels_of(built: DeviceScene, origin_m: NDArray[np.float64], corners: NDArra
         within=labels[1 + rows * columns :].reshape(edge.size, _PLACES),
         nearness_per_m=nearness_per_m.reshape(rows, columns),
         shining=_shows_lamp(built, keys),
+        even=_is_even(built, keys),
     )
 
 
@@ -171,3 +172,10 @@ def _shows_lamp(built: DeviceScene, keys: NDArray[np.int64]) -> NDArray[np.bool_
         rest, part = np.divmod(rest, _key_base(built))
         shows |= (part > 0) & lamp[np.maximum(part - 1, 0) // _FACES]
     return shows
+
+
+def _is_even(built: DeviceScene, keys: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which keys are those of flat matt surfaces of one reflectance alone, or of nothing."""
+    behind, part = np.divmod(keys, _key_base(built))
+    shape = np.maximum(part - 1, 0) // _FACES
+    return np.asarray((behind == 0) & ((part == 0) | built.even_shapes[shape]))

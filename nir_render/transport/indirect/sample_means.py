@@ -1,6 +1,8 @@
 """Samples of pixels, walked in batches: mean radiance and its variance."""
 
 import logging
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +17,17 @@ from nir_render.transport.indirect.kernel.tables import DeviceScene
 BATCHES = 8
 _NOTHING = 1e-28  # 1/(m² sr)²
 
-Means = tuple[NDArray[np.float32], NDArray[np.float32]]
+Means = list[NDArray[np.float32]]
 
 
-def sample_means(built: DeviceScene, film: Film, seed: int, groups: int, samples: int) -> Means:
+def sample_means(
+    built: DeviceScene, film: Film, seed: int, groups: int, samples: int, narrow: float | None = None
+) -> Means:
     """Return radiance per unit of each group in some pixels, and its variance, (groups × nodes, pixels).
 
-    The samples make up to 8 batches, independent of each other; the variance is that of their mean.
+    The samples make up to 8 batches, independent of each other; the variance is that of their mean. With
+    `narrow`, as in `kernel.tables.DeviceScene`, there are three more arrays: mean and variance of the light
+    that was turned twice or more, which is in the others too, and the covariance of this mean and the rest's.
 
     No contribution is so large that sums of them are not finite. Where one is not, the machine went wrong
     (seen once: a single block of a film that other runs render right), and the same samples are walked again.
@@ -32,7 +38,7 @@ def sample_means(built: DeviceScene, film: Film, seed: int, groups: int, samples
         They are not finite the second time either.
     """
     for _ in range(2):
-        means = _sample_means(built, film, seed, groups, samples)
+        means = _sample_means(built, film, seed, groups, samples, narrow)
         wrong = sum(int((~np.isfinite(array)).sum()) for array in means)
         if not wrong:
             return means
@@ -44,24 +50,49 @@ def sample_means(built: DeviceScene, film: Film, seed: int, groups: int, samples
     )
 
 
-def _sample_means(built: DeviceScene, film: Film, seed: int, groups: int, samples: int) -> Means:
+def _sample_means(
+    built: DeviceScene, film: Film, seed: int, groups: int, samples: int, narrow: float | None
+) -> Means:
     batches = min(BATCHES, samples)
     pixels, lanes = film.pixel_count, film.pixel_count * batches
     lane = dr.arange(mi.UInt32, lanes)
     pixel = dr.gather(mi.UInt32, film.index, lane % film.pixels)
     draw = lane_draws(pixel, lane // film.pixels, seed, dr.opaque(mi.UInt32, samples // batches))
+    if narrow is not None:
+        built = replace(built, narrow=dr.opaque(mi.Float, narrow))
     sums = walk(built, film, pixel, draw, lanes, groups, dr.opaque(mi.UInt32, built.max_depth))
     layers = groups * built.node_count
     place = dr.arange(mi.UInt32, layers * pixels)
     layer = place // film.pixels
     first = layer * dr.opaque(mi.UInt32, lanes) + (place - layer * film.pixels)
-    means = [
-        dr.gather(mi.Float, sums, first + batch * film.pixels) / mi.Float(draw.samples)
-        for batch in range(batches)
-    ]
-    mean = sum(means[1:], means[0]) / batches
+    of_part = dr.opaque(mi.UInt32, layers * lanes)
+
+    def of_batches(part: int) -> list[Any]:
+        """Return the mean of each batch: of all light, or of that turned once at most, and of the rest."""
+        return [
+            dr.gather(mi.Float, sums, first + batch * film.pixels + part * of_part) / mi.Float(draw.samples)
+            for batch in range(batches)
+        ]
+
+    def covariance(ones: list[Any], others: list[Any]) -> Any:
+        """Return that of two means, from their batches'."""
+        one, other = mean_of(ones), mean_of(others)
+        products = ((a - one) * (b - other) for a, b in zip(ones, others, strict=True))
+        return sum(products, mi.Float(0)) / max(batches * (batches - 1), 1)
+
+    def mean_of(ones: list[Any]) -> Any:
+        return sum(ones[1:], ones[0]) / batches
+
+    means = of_batches(0)
+    found = []
+    if narrow is not None:
+        few, many = means, of_batches(1)
+        means = [one + other for one, other in zip(few, many, strict=True)]
+        found = [mean_of(many), covariance(many, many), covariance(few, many)]
+    mean = mean_of(means)
     square = sum((dr.square(batch_mean - mean) for batch_mean in means), mi.Float(0))
     # Squares of rounding errors are nothing either (see `paths`).
     variance = dr.select(square > _NOTHING, square, 0.0) / max(batches * (batches - 1), 1)
-    dr.eval(mean, variance)
-    return np.array(mean).reshape(layers, pixels), np.array(variance).reshape(layers, pixels)
+    found = [mean, variance, *found]
+    dr.eval(found)
+    return [np.array(one).reshape(layers, pixels) for one in found]

@@ -5,16 +5,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.light.enlarge import Enlargement, with_patch, without_edges
+from nir_render.light.enlarge import Enlargement, with_patch
 from nir_render.light.light import Edges, Indirect
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.indirect import groups
+from nir_render.transport.indirect.averaging import narrow_versine
 from nir_render.transport.indirect.enlargement import Labels, fit_enlargement
 from nir_render.transport.indirect.kernel.tables import DeviceScene
-from nir_render.transport.indirect.labels import labels_of
 from nir_render.transport.world.medium import medium
 
 FLARE_PILOT_SAMPLES = 256
+MULTIPLE = 0
+"""In place of a scale: light of many turns."""
+_FEWER_SAMPLES = 16
 # Fog that throws more than this of the light scattered once, over straight light and optical depth, within
 # half a block of a source has halos that blocks smear: so many blocks about each are rendered by the pixel.
 _SHARP_SHARE, _HALO_BLOCKS = 0.04, 3.0
@@ -26,14 +29,11 @@ _GLOW_BLOCKS, _GLOW_BESIDE_BLOCKS, _BESIDE_BLOCKS = 6.0, 24.0, 2.0
 _GLOW_PIXELS = 10_000
 
 
-def enlargement_of(snapshot: Snapshot, built: DeviceScene, rays: groups.Rays, scale: int) -> Enlargement:
-    """Return how light in blocks of scale × scale pixels is enlarged; of scale 1 nothing is.
+def enlargement_of(snapshot: Snapshot, labels: Labels, rays: groups.Rays, scale: int) -> Enlargement:
+    """Return how light in blocks of scale × scale pixels, which have labels, is enlarged.
 
     Where sources shine on surfaces close by pixels are rendered one by one.
     """
-    if scale == 1:
-        return without_edges(*(count - 1 for count in rays.corners.shape[:2]))
-    labels = labels_of(built, rays.origin_m, rays.corners)
     enlargement = fit_enlargement(labels, scale)
     glowing, left_out = pixels_in_glow(snapshot, labels, rays, scale)
     if not len(glowing):
@@ -182,6 +182,7 @@ def rendered_again(
     pixels: dict[int, NDArray[np.int64]],
     samples: int,
     wavelengths_m: tuple[float, ...],
+    averaged: NDArray[np.int64] | None = None,
 ) -> list[dict[int, NDArray[np.float32]]]:
     """Return the indirect light of some pixels of films, twice, independent of each other and of the light.
 
@@ -195,18 +196,33 @@ def rendered_again(
         In each pixel, a power of two.
     wavelengths_m
         The nodes.
+    averaged
+        Where light of many turns is averaged, the numbers of the blocks whose average it is: films of blocks
+        are without that light then, and it comes apart, of few samples as it is the mean of many blocks.
 
     Returns
     -------
-    By scale, radiance per unit of each group, shape (groups, nodes, pixels).
+    By scale, radiance per unit of each group, shape (groups, nodes, pixels); at `MULTIPLE` that of many turns
+    in the blocks `averaged`.
     """
     built = groups.world_on_device(snapshot, power, wavelengths_m)
+    own_scale = snapshot.render.indirect.scale
+    narrow = None if averaged is None else narrow_versine(rays.corners, own_scale)
+
+    def rendered(
+        name: tuple[object, ...], some: NDArray[np.int64], samples: int, scale: int, narrow: float | None
+    ) -> list[NDArray[np.float32]]:
+        key, counts = groups.light_seed(seed, "again", *name), np.full(some.size, samples)
+        return groups.render_pixels(snapshot, built, rays, key, some, counts, scale, narrow=narrow)
+
     renders: list[dict[int, NDArray[np.float32]]] = []
     for number in range(2):
         radiance = {}
         for scale, some in pixels.items():
-            key = groups.light_seed(seed, "again", number, scale)
-            counts = np.full(some.size, samples)
-            radiance[scale], _ = groups.render_pixels(snapshot, built, rays, key, some, counts, scale)
+            whole, _, *apart = rendered((number, scale), some, samples, scale, narrow if scale > 1 else None)
+            radiance[scale] = whole - apart[0] if apart else whole
+        if averaged is not None:
+            few = max(samples // _FEWER_SAMPLES, groups.PILOT_SAMPLES)
+            radiance[MULTIPLE] = rendered((number, "multiple"), averaged, few, own_scale, narrow)[2]
         renders.append(radiance)
     return renders

@@ -1,9 +1,12 @@
 """Light in blocks enlarged to pixels, on images made by hand: a slanted edge, a ramp, a small bright body."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
+from nir_render.light.averages import BlockVariance
 from nir_render.light.enlarge import (
     Enlargement,
     enlarge,
@@ -34,7 +37,8 @@ def _labels(fine: np.ndarray, shining: tuple[bool, ...] = (False, False, False))
     middle = fine[FINE // 2 :: FINE, FINE // 2 :: FINE].astype(np.int32)
     edge = np.flatnonzero((places != middle.ravel()[:, None]).any(axis=1))
     nearness = np.full(middle.shape, 0.5, dtype=np.float32)
-    return Labels(middle, edge, places[edge].astype(np.int32), nearness, np.array(shining))
+    even = np.ones(len(shining), dtype=bool)
+    return Labels(middle, edge, places[edge].astype(np.int32), nearness, np.array(shining), even)
 
 
 def _pixels(fine: np.ndarray) -> np.ndarray:
@@ -119,7 +123,9 @@ def test_patches_stay_few_and_are_everywhere() -> None:
     edge = np.arange(ROWS * COLUMNS)
     nearness = np.ones(middle.shape, dtype=np.float32)
     within = np.repeat(middle.reshape(-1, 1), 4, axis=1)
-    how = fit_enlargement(Labels(middle, edge, within, nearness, np.zeros(2, dtype=bool)), 4)
+    how = fit_enlargement(
+        Labels(middle, edge, within, nearness, np.zeros(2, dtype=bool), np.ones(2, dtype=bool)), 4
+    )
     assert how.patch.size == int(0.05 * ROWS * COLUMNS)
     assert how.left_out == ROWS * COLUMNS - how.patch.size
     row, column = np.divmod(how.patch, COLUMNS)
@@ -134,7 +140,7 @@ def test_a_surface_seen_at_a_grazing_angle_is_not_continued_far() -> None:
     """A floor below row 42.3 whose nearness doubles within the block that its end cuts."""
     labels = _labels(_fine_labels("level"))
     nearness = np.maximum(np.arange(ROWS) + 0.5 - 40.0, 0.5)[:, None] * np.ones(COLUMNS)
-    far = Labels(labels.middle, labels.edge, labels.within, nearness.astype(np.float32), labels.shining)
+    far = replace(labels, nearness_per_m=nearness.astype(np.float32))
     rows = {*(fit_enlargement(far, 4).patch // COLUMNS).tolist()}
     assert {42, 43} <= rows
     assert max(rows) < 52  # where 4 rows on nearness changes by a third or less, it is interpolated
@@ -159,20 +165,20 @@ def test_the_variance_is_that_of_independent_blocks() -> None:
     how = fit_enlargement(_labels(_fine_labels("slanted")), 4)
     variance = rng.uniform(0.5, 2.0, (ROWS // 4, COLUMNS // 4))
     patch = rng.uniform(3.0, 4.0, how.patch.size)
-    told = enlarge_variance(variance, ROWS, COLUMNS, how, patch).ravel()
+    told = enlarge_variance(BlockVariance(variance), ROWS, COLUMNS, how, patch).ravel()
     every = np.setdiff1d(np.arange(ROWS * COLUMNS), how.patch)
     weights = weights_of(every, 4, how).toarray()
     np.testing.assert_allclose(told[every], weights**2 @ variance.ravel(), rtol=1e-6)
     np.testing.assert_array_equal(told[how.patch], patch)
     assert told[how.pixels].max() < 2.0 * 2.0
     for rows in (slice(1, None, 3), slice(3, None, 7), slice(5, 9)):  # of some rows alone: the same
-        some = enlarge_variance(variance, ROWS, COLUMNS, how, patch, rows)
+        some = enlarge_variance(BlockVariance(variance), ROWS, COLUMNS, how, patch, rows)
         np.testing.assert_array_equal(some, told.reshape(ROWS, COLUMNS)[rows])
     # Between blocks, weights ⅞ and ⅛, or ⅝ and ⅜, along each axis.
-    plain = enlarge_variance(np.ones((8, 8)), 32, 32)
+    plain = enlarge_variance(BlockVariance(np.ones((8, 8))), 32, 32)
     assert plain[2, 2] == pytest.approx(((7 / 8) ** 2 + (1 / 8) ** 2) ** 2)
     assert plain[3, 4] == pytest.approx(((5 / 8) ** 2 + (3 / 8) ** 2) ** 2)
-    np.testing.assert_array_equal(enlarge_variance(variance, *variance.shape), variance)
+    np.testing.assert_array_equal(enlarge_variance(BlockVariance(variance), *variance.shape), variance)
 
 
 def test_a_part_of_an_enlargement_says_the_same_of_its_pixels() -> None:

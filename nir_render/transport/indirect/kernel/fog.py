@@ -155,12 +155,17 @@ def absorbed_share(depth: Float) -> Float:
     return dr.select(depth < 0.05, series, 1.0 - dr.exp(-depth))
 
 
-def phase_function(fog: FogTable, versine: Float) -> Float:
+def versine(one: Vector, other: Vector) -> Float:
+    """Return 1 − cos θ of two unit directions, with its digits where θ is small."""
+    return 0.5 * dr.squared_norm(other - one)
+
+
+def phase_function(fog: FogTable, turn: Float) -> Float:
     """Return the phase function, 1/sr, for a turn of which 1 − cos is given."""
-    cell = _cell(_angle(versine))
+    cell = _cell(_angle(turn))
     low = dr.gather(mi.Float, fog.versine, cell)
     high = dr.gather(mi.Float, fog.versine, cell + 1)
-    share = dr.clip((versine - low) / (high - low), 0.0, 1.0)
+    share = dr.clip((turn - low) / (high - low), 0.0, 1.0)
     return dr.lerp(dr.gather(mi.Float, fog.density, cell), dr.gather(mi.Float, fog.density, cell + 1), share)
 
 

@@ -21,6 +21,7 @@ from nir_render.transport.indirect.kernel.fog import (
     optical_depth,
     phase_function,
     table_slope,
+    versine,
 )
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import (
@@ -77,7 +78,7 @@ def scatter_on_stretch(
     distance, density = _place_on_stretch(scene, row, state, begin, end, number(draws.FOG_PLACE), active)
     place = state.origin + state.direction * distance
     aim = connect.aim_at_light(scene.lights, row, place, number(draws.FOG_U), number(draws.FOG_V), active)
-    turn = 0.5 * dr.squared_norm(aim.direction - state.direction)
+    turn = versine(state.direction, aim.direction)
     before = optical_depth(fog, state.origin, state.direction, begin, distance)
     weight = extinction_at(fog, place) * fog.albedo * dr.exp(-before) / density
     phase = phase_function(fog, turn)
@@ -87,7 +88,10 @@ def scatter_on_stretch(
         brought = brought * state.dealt
     seen = active & (brought > 0.0) & dr.isfinite(brought)
     share, kept = connect.arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
-    add(brought * share, nodes.times(state.shares, kept), row, seen & (share > 0.0))
+    turns = None
+    if scene.narrow is not None:
+        turns = state.turns + dr.select(turn > scene.narrow, mi.UInt32(1), mi.UInt32(0))
+    add(brought * share, nodes.times(state.shares, kept), row, seen & (share > 0.0), turns)
     return FogScattering(lost, place, weight, active)
 
 
@@ -151,7 +155,7 @@ def brought_to_stretch(
     if lights.sun >= 0:
         kind = dr.gather(mi.UInt32, lights.kind, row, active)
         to_sun = dr.gather(mi.Vector3f, lights.normal, row, active)
-        turn = 0.5 * dr.squared_norm(to_sun - direction)
+        turn = versine(direction, to_sun)
         lost = absorbed_share(optical_depth(fog, origin, direction, begin, end))
         of_sun = phase_function(fog, turn) * lost / fog.typical
         weight = dr.select(kind == SUN, of_sun, weight)

@@ -9,7 +9,13 @@ from typing import Any
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws
-from nir_render.transport.indirect.kernel.fog import draw_angle, draw_scattering, phase_function, table_slope
+from nir_render.transport.indirect.kernel.fog import (
+    draw_angle,
+    draw_scattering,
+    phase_function,
+    table_slope,
+    versine,
+)
 from nir_render.transport.indirect.kernel.fog_scatter import TURNED, FogScattering, weighs_all
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import (
@@ -103,7 +109,7 @@ def leave_in_fog(
     direction = dr.select(in_halo, halos.direction(u, v), plain)
     halo = halos.density(direction)
 
-    phase = phase_function(fog, 0.5 * dr.squared_norm(direction - state.direction))
+    phase = phase_function(fog, versine(state.direction, direction))
     turned_weight = scattering.weight * phase / dr.lerp(phase, halo, from_fog)
 
     value, density = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direction), in_halo & rough)
@@ -205,8 +211,7 @@ class _Halos:
         if self.lights.sky >= 0:  # it has no halo
             kind = dr.gather(mi.UInt32, self.lights.kind, row, self.active)
             weight = dr.select(kind == SKY, 0.0, weight)
-        turn = 0.5 * dr.squared_norm(axis - self.heading)
-        ahead = phase_function(self.fog, turn) + dr.minimum(
+        ahead = phase_function(self.fog, versine(self.heading, axis)) + dr.minimum(
             self._density(axis, self.heading), _BRIGHTEST_PER_SR
         )
         return row, dr.maximum(dr.select(self.turned, weight * ahead, weight), 1e-12)

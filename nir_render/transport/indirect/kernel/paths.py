@@ -1,8 +1,7 @@
 """The walk of light paths on the device: one lane is one pixel of one batch, and walks its samples in turn.
 
 Every lane goes on to its next sample as soon as a path ends, so none waits for its neighbours' longer paths.
-A lane alone adds to its place in the result, in the order of its samples: the sums are the same bits on any
-number of threads.
+A lane alone adds to its places in the result, in its samples' order: the same bits on any number of threads.
 
 Each step is a stretch of a path, from a vertex to the next: fog on the way scatters light of one light
 towards the vertex (a place drawn where the phase function and the inverse square put it, Kulla & Fajardo
@@ -18,7 +17,7 @@ from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws, nodes
 from nir_render.transport.indirect.kernel.begin import Film, camera_direction, deal_of
 from nir_render.transport.indirect.kernel.draws import Draws, power_heuristic
-from nir_render.transport.indirect.kernel.fog import fog_interval
+from nir_render.transport.indirect.kernel.fog import fog_interval, versine
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
 from nir_render.transport.indirect.kernel.tables import DeviceScene, Surfaces
@@ -68,14 +67,18 @@ def walk(
 
     Returns
     -------
-    Flat array, (group, node, batch, pixel).
+    Flat array, (group, node, batch, pixel); where the scene counts turns (turned once at most or more often,
+    group, node, batch, pixel).
     """
     lane = dr.arange(mi.UInt32, lanes)
-    out = dr.zeros(mi.Float, groups * scene.node_count * lanes)
+    out = dr.zeros(mi.Float, (1 if scene.narrow is None else 2) * groups * scene.node_count * lanes)
     stride = dr.opaque(mi.UInt32, lanes)
+    of_part = dr.opaque(mi.UInt32, groups)
 
-    def add(value: Float, shares: Shares, row: UInt, active: Mask) -> None:
+    def add(value: Float, shares: Shares, row: UInt, active: Mask, turns: UInt | None) -> None:
         group = dr.gather(mi.UInt32, scene.lights.group, row, active)
+        if turns is not None:
+            group = dr.select(turns > 1, group + of_part, group)
         if scene.nodes is not None:
             group = group * scene.nodes.count
         for node, part in enumerate([value * share for share in shares] or [value]):
@@ -106,6 +109,7 @@ def walk(
         cell=mi.UInt32(zero),
         density=dr.zeros(mi.Float, lanes),
         scattered=dr.zeros(mi.Bool, lanes),
+        turns=None if scene.narrow is None else dr.zeros(mi.UInt32, lanes),
         way=dr.full(mi.Int32, _STRAIGHT, lanes),
         inside=dr.zeros(mi.Bool, lanes),
         in_fog=None if scene.fog is None else dr.zeros(mi.Bool, lanes),
@@ -138,7 +142,7 @@ def _step(
     surface = met & (light < 0) & (state.depth + 1 < max_depth)
     sampled = _ask_light(scene, state, si, passing, surface, max_depth, number, add)
     onward_path = _scatter(scene, state, si, sampled, surface, scattering, number)
-    return _survive(state, onward_path, draw, number(draws.SURVIVAL), begin, camera)
+    return _survive(state, onward_path, draw, number(draws.SURVIVAL), begin, camera, scene.narrow)
 
 
 def _meet(scene: DeviceScene, state: PathState) -> Interaction:
@@ -228,7 +232,7 @@ def _add_unasked_light(
     radiance = dr.gather(mi.Float, lights.radiance, light, active)
     radiance = radiance * connect.pattern_factor(lights, light, -state.direction, active)
     brings = weight * radiance * share
-    add(brings, state.shares, light, active & (share > 0.0) & dr.isfinite(brings))
+    add(brings, state.shares, light, active & (share > 0.0) & dr.isfinite(brings), state.turns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +280,8 @@ def _ask_light(
     share, kept = connect.arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
     shares = nodes.off_surface(scene.nodes, si, bsdf, aim.direction, mi.Bool(False), seen)
     shares = nodes.times(nodes.times(state.shares, shares), kept)
-    add(brought * share, shares, row, seen & (share > 0.0))
+    once_more = None if state.turns is None else state.turns + 1
+    add(brought * share, shares, row, seen & (share > 0.0), once_more)
     return _SurfaceSample(bsdf, sample, sampled_weight[0], cell)
 
 
@@ -347,15 +352,19 @@ def _survive(
     u: Float,
     begin: Callable[[UInt], _Begin],
     camera: Point,
+    narrow: Float | None,
 ) -> PathState:
     """Return the state of a path that goes on, by chance `u` where it is dim, or of the next sample's."""
-    leaving, evenly = onward_path.leaving, onward_path.evenly
+    leaving, evenly, left = onward_path.leaving, onward_path.evenly, state.left * onward_path.leaving.left
     whole = tuple(mi.Float(1) for _ in state.shares)
-    left = state.left * leaving.left
     survival = dr.minimum(left / _DIM, 1.0)
     goes_on = onward_path.leaves & (u < survival)
     sample_next = state.sample + dr.select(goes_on, mi.UInt32(0), mi.UInt32(1))
     direction, tier, dealt = begin(sample_next)
+    turns = state.turns
+    if turns is not None:
+        much = evenly & (~leaving.turned | (versine(state.direction, leaving.direction) > narrow))
+        turns = dr.select(goes_on, dr.select(much, turns + 1, turns), 0)
     return PathState(
         sample=sample_next,
         depth=dr.select(goes_on, state.depth + 1, 0),
@@ -369,6 +378,7 @@ def _survive(
         # Smooth surfaces on the way leave it: asking for light weighs with the same density.
         density=dr.select(leaving.smooth, state.density, leaving.density),
         scattered=goes_on & (state.scattered | evenly),
+        turns=turns,
         way=dr.select(goes_on & ~evenly, onward_path.way, _STRAIGHT),
         inside=goes_on & onward_path.inside,
         in_fog=None if state.in_fog is None else dr.select(evenly, leaving.turned, state.in_fog),

@@ -155,7 +155,9 @@ class DeviceScene:
     `opaque` is None where panes are passed one by one, in `bodies`: Dr.Jit traces one scene alone in a kernel
     on a GPU, and takes all rays into another as unhindered.
     `max_depth` is the longest path, in stretches, as Mitsuba counts; `nodes` is None where light of one
-    wavelength alone is carried. `pictures` tells whether any surface has a picture laid on it.
+    wavelength alone is carried. `pictures` tells whether any surface has a picture laid on it. With `narrow`
+    light that was turned twice or more is apart: a turn is where a surface or fog scatters light evenly, fog
+    by an angle whose versine, 1 − cos θ, is above that.
     """
 
     bodies: MitsubaScene
@@ -165,8 +167,10 @@ class DeviceScene:
     choice: Choice
     fog: FogTable | None
     max_depth: int
+    even_shapes: NDArray[np.bool_]  # which of Mitsuba's shapes are flat, matt and of one reflectance
     nodes: NodeTable | None = None
     pictures: bool = False
+    narrow: Float | None = None
 
     @property
     def node_count(self) -> int:

@@ -1,0 +1,79 @@
+"""Which light in which blocks is averaged with that of blocks around: in fog, on surfaces alike throughout.
+
+In fog most of a render's noise is in light that was turned twice and more, which is smooth in the image: what
+turns light by less than some blocks are wide counts as no turn. It is smooth on flat matt surfaces of one
+reflectance and where nothing is seen but fog, as far as the fog in front does not change other than linearly
+from block to block.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nir_render.light.averages import averages
+from nir_render.light.planes import REACH
+from nir_render.scene.snapshot import Snapshot
+from nir_render.transport.indirect.enlargement import Labels, labels_of_blocks
+from nir_render.transport.world.fog_depth import optical_depth
+
+_NARROW_BLOCKS = 2 * REACH + 1  # all that an average is made of
+_BENT = 0.01  # what fog lets through may be off by so much in the mean of the blocks around
+
+
+@dataclass(frozen=True, eq=False)
+class Averaging:
+    """What is averaged.
+
+    Attributes
+    ----------
+    surface
+        A number for the surface in each block, −1 where a block stands alone, shape (rows, columns).
+    narrow
+        A turn of light is one by an angle whose versine, 1 − cos θ, is above this.
+    """
+
+    surface: NDArray[np.int32]
+    narrow: float
+
+
+def averaging_of(
+    snapshot: Snapshot,
+    labels: Labels,
+    origin_m: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    scale: int,
+) -> Averaging | None:
+    """Return what is averaged in an image of blocks of scale × scale pixels, None where nothing is.
+
+    Parameters
+    ----------
+    origin_m, corners
+        The camera's rays (`groups.Rays`).
+    """
+    fog = snapshot.fog
+    if fog is None or fog.extinction_per_m == 0.0 or scale == 1:
+        return None
+    pure = labels_of_blocks(labels, scale)
+    surface = np.where((pure >= 0) & labels.even[pure], pure, -1).astype(np.int32)
+    if not (surface >= 0).any():
+        return None
+    at = corners[::scale, ::scale]
+    direction = at[:-1, :-1] + at[:-1, 1:] + at[1:, :-1] + at[1:, 1:]
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    rows, columns = surface.shape
+    nearness_per_m = labels.nearness_per_m.reshape(rows, scale, columns, scale).mean(axis=(1, 3)).ravel()
+    length_m = np.where(nearness_per_m > 0.0, 1.0 / np.maximum(nearness_per_m, 1e-12), np.inf)
+    start_m = np.broadcast_to(origin_m, (surface.size, 3))
+    through = np.exp(-optical_depth(fog, start_m, direction.reshape(-1, 3), length_m)).reshape(surface.shape)
+    bent = np.abs(averages(surface).of(through) - through) > _BENT
+    return Averaging(np.where(bent, -1, surface).astype(np.int32), narrow_versine(corners, scale))
+
+
+def narrow_versine(corners: NDArray[np.float64], scale: int) -> float:
+    """Return 1 − cos of the angle over all the blocks that an average is made of, in the image's middle."""
+    row, column = (count // 2 for count in corners.shape[:2])
+    beside = corners[row, column - 1 : column + 1]
+    first, second = beside / np.linalg.norm(beside, axis=1, keepdims=True)
+    angle_rad = _NARROW_BLOCKS * scale * float(np.linalg.norm(second - first))
+    return 1.0 - float(np.cos(angle_rad))
