@@ -63,6 +63,12 @@ def averages(surface: NDArray[np.int32]) -> Averages:
     return Averages(block, weight)
 
 
+def inside_weights() -> tuple[float, float]:
+    """Return what a block far inside a surface weighs in itself, and the sum of squares of all weights."""
+    around = averages(np.zeros((_SIDE, _SIDE), dtype=np.int32)).weight[_MIDDLE]
+    return float(around[_MIDDLE]), float((around**2).sum())
+
+
 @dataclass(frozen=True, eq=False)
 class BlockVariance:
     """The variance of light in blocks.

@@ -138,7 +138,7 @@ class _Rendering:
         pilot = self._kept(_PILOT, self._pilot, counts=False)
         pixels = sample_plan.flare_pixels(pilot, self.site.camera)
         flares = self._kept((_PILOT, pixels), lambda: self._flares(pixels), counts=False)
-        return sample_plan.samples_map(pilot, flares, self.site.snapshot, noise_share, shape)
+        return sample_plan.samples_map(pilot, flares, self.site.snapshot, noise_share, shape, self._alone)
 
     def _pilot(self) -> Light:
         key = groups.light_seed(self.seed, "pilot", self.site.name, self._geometry)
@@ -229,6 +229,17 @@ class _Rendering:
         if snapshot.fog is None or scale == 1:
             return None
         return averaging_of(snapshot, self._labels, rays.origin_m, rays.corners, scale)
+
+    @property
+    def _alone(self) -> NDArray[np.bool_] | None:
+        """In which blocks something is not averaged; None where nothing is."""
+        if self._averaging is None:
+            return None
+        alone = self._averaging.surface < 0
+        patch, scale = self._enlargement.patch, self.site.snapshot.render.indirect.scale
+        row, column = np.divmod(patch, self._enlargement.columns)
+        alone[row // scale, column // scale] = True
+        return alone
 
     @cached_property
     def _enlargement(self) -> Enlargement:

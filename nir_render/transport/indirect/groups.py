@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.optics.lens import corner_directions
-from nir_render.light.averages import averages
 from nir_render.light.light import Indirect, Multiple
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.camera import Camera
@@ -141,8 +140,7 @@ def pilot(
 ) -> Indirect | None:
     """Return a few samples in some pixels of the film, every fourth along each axis: what noise there is.
 
-    Where light is averaged over blocks, the variance is what averages of like blocks would have. A small
-    film's pixels are closer, so that there are a thousand. The arguments are those of `indirect`.
+    A small film's are closer, so that there are a thousand. The arguments are those of `indirect`.
     """
     if not snapshot.has_indirect_light():
         return None
@@ -152,17 +150,13 @@ def pilot(
     row, column = (middles(count, step) for count in (rows, columns))
     pixels = (row[:, None] * columns + column).ravel()
     counts = np.full(pixels.size, PILOT_SAMPLES)
-    if averaging is None:
-        radiance, variance = render_pixels(snapshot, built, rays, seed, pixels, counts, scale)
-    else:
-        radiance, variance, _, multiple, covariance = render_pixels(
-            snapshot, built, rays, seed, pixels, counts, scale, narrow=averaging.narrow
-        )
-        around = averages(averaging.surface)
-        own, squares = around.own[pixels], (around.weight[pixels] ** 2).sum(axis=1)
-        variance = np.maximum(variance + (squares - 1.0) * multiple + 2.0 * (own - 1.0) * covariance, 0.0)
-    shape = (*radiance.shape[:2], row.size, column.size)
-    return Indirect(radiance.reshape(shape), variance.reshape(shape), scale * step, PILOT_SAMPLES)
+    narrow = None if averaging is None else averaging.narrow
+    arrays = render_pixels(snapshot, built, rays, seed, pixels, counts, scale, narrow=narrow)
+    radiance, variance, *apart = (array.reshape(*array.shape[:2], row.size, column.size) for array in arrays)
+    multiple = None
+    if averaging is not None:
+        multiple = Multiple(apart[0], apart[1], apart[2], averaging.surface[np.ix_(row, column)])
+    return Indirect(radiance, variance, scale * step, PILOT_SAMPLES, multiple=multiple)
 
 
 def film_shape(rays: Rays, scale: int) -> tuple[int, int]:

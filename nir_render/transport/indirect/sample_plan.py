@@ -8,6 +8,9 @@ The need of a pixel is the count that brings its render variance to a share of s
 pilot's variance, from 8 batches, is itself noisy, and where rare paths carry the light most of its values are
 too small; its mean is right. So needs are means over 5 × 5 pixels of the pilot, and taken a tenth larger.
 
+In fog light of many turns is averaged over blocks (`averaging`), which leaves little of its noise. Blocks in
+which it is not are counted by their own noise, also where pixels in them are rendered one by one.
+
 - The frame's count is the median of the needs of the pixels that light reaches, at least 8. Each pixel gets
   its own need, up to 4 times the frame's count: more than half of all pixels then keep the target, and most
   of the rest too.
@@ -38,8 +41,9 @@ from nir_render.camera.optics.apertures import aperture_weights, flare_apertures
 from nir_render.camera.render_noise import temporal_variance_e2, variance_by_spectrum
 from nir_render.camera.timing.drive import drive_of
 from nir_render.camera.timing.exposure_control import setting_for
+from nir_render.light.averages import inside_weights
 from nir_render.light.enlarge import Enlargement
-from nir_render.light.light import Light
+from nir_render.light.light import Light, Multiple
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.snapshot import Snapshot
 
@@ -59,7 +63,12 @@ _SLIGHT = 1e-3  # what counts less in a sum than this, the largest being 1, is n
 
 
 def samples_map(
-    pilot: Light, flares: Light, snapshot: Snapshot, noise_share: float, shape: tuple[int, int]
+    pilot: Light,
+    flares: Light,
+    snapshot: Snapshot,
+    noise_share: float,
+    shape: tuple[int, int],
+    alone: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.int64]:
     """Return the samples for each pixel of the film, and those wanted without bounds, (2, rows, columns).
 
@@ -73,13 +82,20 @@ def samples_map(
         Render variance over temporal variance to reach.
     shape
         Rows and columns of the film.
+    alone
+        In which pixels of the film nothing is averaged, that shape; None: in all.
     """
     assert pilot.indirect is not None  # without indirect light nothing is sampled
     camera = snapshot.camera(pilot.camera).camera
     rates = electron_rates(pilot, snapshot, _lit_together(pilot, snapshot))
     exposure_s = planned_exposure_s(camera, float(fully_lit_frame(rates, 1.0).electrons.max()))
     sensor_e2 = temporal_variance_e2(fully_lit_frame(rates, exposure_s))
-    ratio = _share_of_one_sample(pilot, snapshot, exposure_s, sensor_e2, shape)
+    own = pilot.indirect.variance
+    ratio = _share_of_one_sample(pilot, snapshot, exposure_s, sensor_e2, shape, own)
+    if alone is not None and pilot.indirect.multiple is not None:
+        averaged = _averaged(own, pilot.indirect.multiple)
+        of_averages = _share_of_one_sample(pilot, snapshot, exposure_s, sensor_e2, shape, averaged)
+        ratio = np.where(alone, ratio, np.minimum(ratio, of_averages))
     need, scale = ratio / noise_share, camera.sensor.rows // shape[0]
     frame = max(float(np.median(need[need > 0.0])) if (need > 0.0).any() else 0.0, LEAST_SAMPLES)
     flare_like = scale**2 * ratio / _FLARE_LIKE_SHARE
@@ -133,14 +149,27 @@ def flare_blocks(light: Light, camera: Camera, scale: int, enlargement: Enlargem
     return np.unique(np.concatenate(chosen))
 
 
+def _averaged(variance: NDArray[np.float32], multiple: Multiple) -> NDArray[np.float32]:
+    """Return the variance that blocks would have amid others like them, light of many turns averaged."""
+    own, squares = inside_weights()
+    of_rest = variance - multiple.variance - 2.0 * multiple.covariance
+    averaged = of_rest + squares * multiple.variance + 2.0 * own * multiple.covariance
+    return np.where(multiple.surface < 0, variance, np.maximum(averaged, 0.0)).astype(np.float32)
+
+
 def _share_of_one_sample(
-    pilot: Light, snapshot: Snapshot, exposure_s: float, sensor_e2: Array, shape: tuple[int, int]
+    pilot: Light,
+    snapshot: Snapshot,
+    exposure_s: float,
+    sensor_e2: Array,
+    shape: tuple[int, int],
+    variance_of_groups: NDArray[np.float32],
 ) -> Array:
     """Return the variance of one sample over that of the sensor, shape of the film; never seen is 0."""
     assert pilot.indirect is not None
     parts = pilot.indirect.variance.shape[-1:-3:-1]
     noise_e2: Array = np.zeros(parts[::-1])
-    for electrons, variance in _of_spectra(pilot, snapshot, exposure_s, pilot.indirect.variance):
+    for electrons, variance in _of_spectra(pilot, snapshot, exposure_s, variance_of_groups):
         pilot_electrons: Array = np.asarray(
             cv2.resize(electrons, parts, interpolation=cv2.INTER_AREA), dtype=np.float64
         )

@@ -42,6 +42,10 @@ _CANDIDATES = 4  # for each of which `draws` has two numbers
 # How many paths turn at a place in fog for each light that is asked for there, roughly: it weighs the two
 # ways to a light, and moves nothing but noise.
 TURNED = 0.25
+# What is drawn towards lights, places and directions, is drawn so by a half, or what `leaving` says, on a
+# path's first stretches. Each time that a path goes elsewhere its weight grows; on long paths, whose light is
+# faint, that would bring much at once, and it is drawn so by this share of that.
+_FIRST_STRETCHES, _LATER = 4, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,9 +174,10 @@ def _place_on_stretch(
 ) -> tuple[Float, Float]:
     """Return a distance on a stretch, and the density per metre with which it was drawn.
 
-    Half of the draws are even in the integral of the phase function over the angle β at which the light
-    stands off the ray, which grows by D/d² for each metre; half go by the extinction, which matters where the
-    light is far. Where the integral is too short for float32, and for the sun, all go by the extinction.
+    Half of the draws, of later stretches fewer, are even in the integral of the phase function over the angle
+    β at which the light stands off the ray, which grows by D/d² for each metre; the others go by the
+    extinction, which matters where the light is far. Where the integral is too short for float32, and for the
+    sun, all go by the extinction.
     """
     fog = scene.fog
     assert fog is not None  # only called in fog
@@ -180,8 +185,9 @@ def _place_on_stretch(
     far = high - low <= 1e-4
     if scene.lights.sun >= 0:
         far = far | (dr.gather(mi.UInt32, scene.lights.kind, row, active) == SUN)
-    by_arc = ~far & (u < 0.5)
-    u = dr.select(far, u, dr.select(by_arc, 2.0 * u, 2.0 * u - 1.0))
+    arcs = 0.5 * towards_lights(state)
+    by_arc = ~far & (u < arcs)
+    u = dr.select(far, u, dr.select(by_arc, u / arcs, (u - arcs) / (1.0 - arcs)))
     angle = draw_angle(fog, fog.arc, dr.lerp(low, high, u))
     sine, cosine = dr.sincos(angle)
     distance = dr.clip(middle - off * cosine / dr.maximum(sine, 1e-9), begin, end)
@@ -191,7 +197,12 @@ def _place_on_stretch(
     slope = table_slope(fog, fog.arc, dr.atan2(off, -beside))
     arc_density = slope / dr.maximum(high - low, 1e-9) * off / (off * off + beside * beside)
     by_flight = flight_density(fog, state.origin, state.direction, begin, end, distance)
-    return distance, dr.select(far, by_flight, 0.5 * (arc_density + by_flight))
+    return distance, dr.select(far, by_flight, dr.lerp(by_flight, arc_density, arcs))
+
+
+def towards_lights(state: PathState) -> Float:
+    """Return how much is drawn towards lights on a path's stretch, over that on its first ones."""
+    return dr.select(state.depth < _FIRST_STRETCHES, mi.Float(1.0), mi.Float(_LATER))
 
 
 def _arcs(

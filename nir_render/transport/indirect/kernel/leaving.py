@@ -16,7 +16,7 @@ from nir_render.transport.indirect.kernel.fog import (
     table_slope,
     versine,
 )
-from nir_render.transport.indirect.kernel.fog_scatter import TURNED, FogScattering, weighs_all
+from nir_render.transport.indirect.kernel.fog_scatter import TURNED, FogScattering, towards_lights, weighs_all
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.indirect.kernel.types import (
     Float,
@@ -136,7 +136,8 @@ def leave_in_fog(
 
 def _shares_into_halos(scene: DeviceScene, state: PathState) -> tuple[Float, Float]:
     """Return the shares of directions from fog and from surfaces that go into halos: 0 for the sky alone."""
-    lights, shares = scene.lights, (mi.Float(_FROM_FOG), mi.Float(_FROM_SURFACE))
+    share = towards_lights(state)
+    lights, shares = scene.lights, (_FROM_FOG * share, _FROM_SURFACE * share)
     if not lights.sky_alone:
         return shares
     if state.tier is None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nir_render import DirectTable, Indirect, Light, Scene, load_scene
 from nir_render.camera.optics.lens import aperture_area_m2
 from nir_render.light.enlarge import Enlargement, without_edges
-from nir_render.light.light import Edges
+from nir_render.light.light import Edges, Multiple
 from nir_render.transport.indirect.sample_plan import (
     flare_blocks,
     flare_pixels,
@@ -71,9 +71,20 @@ def _plan(
     flares: Array | None = None,
     directions: list[list[float]] | None = None,
     how: Enlargement | None = None,
+    averaged: float = 0.0,
+    alone: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.int64]:
-    """The counts given and wanted; of `flares` the variance in each block, and in each pixel of the patch."""
+    """The counts given and wanted; of `flares` the variance in each block, and in each pixel of the patch.
+
+    `averaged` is the share of the variance that is averaged over blocks.
+    """
     pilot = _light(variance, 16, directions)
+    if averaged:
+        assert pilot.indirect is not None
+        known = pilot.indirect.variance
+        surface = np.zeros(known.shape[2:], dtype=np.int32)
+        multiple = Multiple(known, np.float32(averaged) * known, np.zeros_like(known), surface)
+        pilot = replace(pilot, indirect=replace(pilot.indirect, multiple=multiple))
     how = how or without_edges(960, 1280)
     blocks = flare_blocks(pilot, scene.camera("r1.front")[1], 2, how)
     of_flares = np.zeros(1) if flares is None else flares
@@ -81,7 +92,7 @@ def _plan(
     assert light.indirect is not None
     patch = np.broadcast_to(of_flares, (2, 1, how.patch.size)).astype(np.float32)
     indirect = replace(light.indirect, scale=2, edges=Edges(how, patch, patch))
-    return samples_map(pilot, replace(light, indirect=indirect), scene.at(0.0), share, FILM)
+    return samples_map(pilot, replace(light, indirect=indirect), scene.at(0.0), share, FILM, alone)
 
 
 def _per_radiance(scene: Scene) -> float:
@@ -143,6 +154,25 @@ def test_a_noisy_patch_gets_its_own_need_within_bounds(scene: Scene, rise: float
     assert wanted[240, 320] == 2 ** np.ceil(np.log2(need))
     assert (given < wanted).any() == (rise > 4.0)
     assert given[10, 10] == wanted[10, 10] == 16
+
+
+def test_where_light_of_many_turns_is_averaged_less_is_enough_but_not_where_blocks_stand_alone(
+    scene: Scene,
+) -> None:
+    """Of a variance v that asks for 640 samples the part that is averaged is 0.9 v: of that a nineteenth is left.
+
+    Its weights are those of a Gaussian of 1.4 blocks over 5 × 5. What stands alone has half of the frame here.
+    """
+    row = np.exp(-0.5 * (np.arange(-2, 3) / 1.4) ** 2)
+    squares = float((row**2).sum() / row.sum() ** 2) ** 2
+    alone = np.zeros(FILM, dtype=bool)
+    alone[: FILM[0] // 2] = True
+    variance = np.full((60, 80), _variance_for(scene, 640.0, 0.05))
+    given = _plan(scene, variance, 0.05, averaged=0.9, alone=alone)[0]
+    below, above = given[FILM[0] // 2 + 20, FILM[1] // 2], given[FILM[0] // 2 - 20, FILM[1] // 2]
+    needed = 640.0 * (0.1 + 0.9 * squares)
+    assert below == 2 ** np.ceil(np.log2(needed))
+    assert above > 3 * below
 
 
 def test_noise_everywhere_is_cut_to_the_budget(scene: Scene) -> None:
