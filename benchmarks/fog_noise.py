@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 import nir_render as nr
 from nir_render.camera.by_spectrum import group_emitters, group_fluxes
 from nir_render.camera.optics.response import response
-from nir_render.light.light import Indirect
 from nir_render.scene.scene import Scene
 from nir_render.transport.backend.variant import backend
 
@@ -58,15 +57,6 @@ def noise(images: Array, cpu_s: float) -> dict[str, float]:
     }
 
 
-def blocks(indirect: Indirect) -> Array:
-    """Return the radiance in blocks as frames have it, averaged where it is, shape (groups, blocks)."""
-    radiance = indirect.radiance_per_w[:, 0].astype(np.float64)
-    if indirect.multiple is not None:
-        multiple = indirect.multiple.radiance_per_w[:, 0].astype(np.float64)
-        radiance += [indirect.multiple.averages.of(one) - one for one in multiple]
-    return radiance.reshape(len(radiance), -1)
-
-
 def measure(scene: Scene, seeds: int) -> dict[str, Any]:
     """Render a scene by some seeds, and return its noise."""
     (name,) = scene.cameras()
@@ -76,7 +66,11 @@ def measure(scene: Scene, seeds: int) -> dict[str, Any]:
     cpu_s = (time.process_time() - begun) / seeds
     snapshot = scene.at(0.0)
     camera = snapshot.camera(name).camera
-    images = np.stack([blocks(light.indirect) for light in lights if light.indirect])
+    count = len(snapshot.groups)
+    films = [
+        [light.indirect.in_frames(k, 0).ravel() for k in range(count)] for light in lights if light.indirect
+    ]
+    images = np.array(films, dtype=np.float64)
     responses = [float(response(camera, one)(0.0)) for one in group_emitters(lights[0], snapshot)]
     frames = np.einsum("g,sgp->sp", group_fluxes(lights[0], snapshot) * responses, images)
     of_groups = {group: noise(images[:, k], cpu_s) for k, group in enumerate(snapshot.groups)}

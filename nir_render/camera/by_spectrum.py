@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nir_render.camera.optics.response import Response, response
 from nir_render.camera.timing.drive import drive_of
 from nir_render.errors import InputError
-from nir_render.light.light import Light
+from nir_render.light.light import Indirect, Light
 from nir_render.scene.documents.ambient.lamps import Lamp
 from nir_render.scene.documents.ambient.sun import Skylight, Sun
 from nir_render.scene.documents.camera import Camera
@@ -71,6 +71,21 @@ def by_spectrum(
             known = sums.get(key)
             sums[key] = SpectrumPart(emitter, node, values if known is None else known.values + values)
     return list(sums.values())
+
+
+def blocks_by_spectrum(
+    light: Light, indirect: Indirect, snapshot: Snapshot, weights: Array
+) -> list[SpectrumPart]:
+    """Return weighted sums of indirect radiance in blocks as frames have it, averaged where it is."""
+    parts = by_spectrum(light, snapshot, indirect.radiance_per_w, weights)
+    multiple = indirect.multiple
+    if multiple is None:
+        return parts
+    turned = by_spectrum(light, snapshot, multiple.radiance_per_w, weights)
+    return [
+        replace(part, values=part.values + (multiple.averages.of(some.values) - some.values))
+        for part, some in zip(parts, turned, strict=True)
+    ]
 
 
 def row_response(camera: Camera, light: Light, row: int, emitter: Emitter) -> tuple[float, Response]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.beams import blur, blur_reach_px, diffuse_electrons
-from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
+from nir_render.camera.by_spectrum import blocks_by_spectrum, by_spectrum, group_fluxes
 from nir_render.camera.optics.psf import Window
 from nir_render.camera.optics.veil import veil
 from nir_render.light.enlarge import enlarge
@@ -83,15 +83,10 @@ def diffuse_image(
     image = np.zeros((rows, columns))
     edges = indirect.edges
     enlargement = None if edges is None else edges.enlargement
-    multiple = indirect.multiple
-    parts = by_spectrum(light, snapshot, indirect.radiance_per_w, fluxes)
+    parts = blocks_by_spectrum(light, indirect, snapshot, fluxes)
     patches = [] if edges is None else by_spectrum(light, snapshot, edges.radiance_per_w, fluxes)
-    averaged = [] if multiple is None else by_spectrum(light, snapshot, multiple.radiance_per_w, fluxes)
-    for part, patch, turned in zip_longest(parts, patches, averaged):
-        values = part.values
-        if multiple is not None:
-            values = values + (multiple.averages.of(turned.values) - turned.values)
-        whole = enlarge(values, rows, columns, enlargement, None if patch is None else patch.values)
+    for part, patch in zip_longest(parts, patches):
+        whole = enlarge(part.values, rows, columns, enlargement, None if patch is None else patch.values)
         image += diffuse_electrons(camera, whole, part.emitter, 1.0, part.node)
     return image
 

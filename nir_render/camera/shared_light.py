@@ -110,8 +110,8 @@ def _electrons(
     `responses` keeps those of one unit of radiance, by spectrum and node.
     """
     assert light.indirect is not None
-    camera, per_unit = snapshot.camera(light.camera).camera, light.indirect.radiance_per_w
-    rows, columns = per_unit.shape[2:]
+    camera = snapshot.camera(light.camera).camera
+    rows, columns = light.indirect.radiance_per_w.shape[2:]
     emitter, scale = group_emitters(light, snapshot)[group], light.indirect.scale
     found = np.zeros((rows, columns), dtype=np.float32)
     for node in light.nodes:
@@ -119,5 +119,5 @@ def _electrons(
         if key not in responses:
             of_one = electrons_per_radiance(camera, emitter, 1.0, node)
             responses[key] = of_one.reshape(rows, scale, columns, scale).mean(axis=(1, 3)).astype(np.float32)
-        found += per_unit[group, node.index] * responses[key]
+        found += light.indirect.in_frames(group, node.index) * responses[key]
     return found

@@ -7,6 +7,7 @@ each, with A the averages, Var Σ a r + (A'a) m.
 """
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ Array = NDArray[np.float64]
 
 _SIDE = 2 * REACH + 1
 _MIDDLE = _SIDE * _SIDE // 2
+_KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,46 +29,73 @@ class Averages:
 
     Attributes
     ----------
-    block, weight
-        Numbers of the blocks around, from the upper left, row by row, and their weights, shape (blocks, 25).
+    weight
+        Of 5 × 5 blocks around each, row by row, shape (rows, columns, 25); 0 beyond the image.
     """
 
-    block: NDArray[np.int64]
-    weight: Array
+    weight: NDArray[np.float32]
 
-    @property
+    @cached_property
     def matrix(self) -> csr_array:
         """The weights as a sparse matrix, shape (blocks, blocks)."""
-        count, around = self.block.shape
-        first = np.arange(0, count * around + 1, around)
-        return csr_array((self.weight.ravel(), self.block.ravel(), first), shape=(count, count))
+        rows, columns, around = self.weight.shape
+        row, column, place = np.nonzero(self.weight)
+        other = (row + place // _SIDE - REACH) * columns + column + place % _SIDE - REACH
+        first = np.append(0, np.cumsum(np.count_nonzero(self.weight.reshape(-1, around), axis=1)))
+        count = rows * columns
+        values = self.weight[row, column, place].astype(np.float64)
+        return csr_array((values, other, first), shape=(count, count))
 
     @property
     def own(self) -> Array:
-        """What each block weighs in itself, shape (blocks,)."""
-        return self.weight[:, _MIDDLE]
+        """What each block weighs in itself, shape (rows, columns)."""
+        return self.weight[..., _MIDDLE].astype(np.float64)
+
+    @property
+    def squares(self) -> Array:
+        """The sum of squares of weights: what is left of like noise, shape (rows, columns)."""
+        return np.asarray((self.weight.astype(np.float64) ** 2).sum(axis=-1))
 
     def of(self, values: Array) -> Array:
-        """Return the averages of values, shape (rows, columns)."""
-        found: Array = np.einsum("bk,bk->b", self.weight, values.ravel()[self.block])
-        return found.reshape(values.shape)
+        """Return the averages of values, shape (rows, columns); ValueError for an image of another size."""
+        if values.shape != self.weight.shape[:2]:
+            raise ValueError(
+                f"an image of {values.shape} blocks where averages are of {self.weight.shape[:2]}"
+            )
+        return _averaged(self.weight, np.ascontiguousarray(values, dtype=np.float64))
 
 
 def averages(surface: NDArray[np.int32]) -> Averages:
-    """Return the averages over blocks of equal numbers, shape (rows, columns); those below 0 are alone."""
-    number = np.arange(surface.size)
-    label = surface.ravel()
-    block, weight, _ = fit_planes(surface, number, label, 1, surface.shape[1])
-    alone = label < 0
+    """Return the averages over blocks of equal numbers, shape (rows, columns); those below 0 are alone.
+
+    Lights of one geometry share them, the last few being kept.
+    """
+    return _averages(surface.shape, np.ascontiguousarray(surface, dtype=np.int32).tobytes())
+
+
+@lru_cache(maxsize=_KEPT)
+def _averages(shape: tuple[int, int], numbers: bytes) -> Averages:
+    surface = np.frombuffer(numbers, dtype=np.int32).reshape(shape)
+    _, weight, _ = fit_planes(surface, np.arange(surface.size), surface.ravel(), 1, shape[1])
+    alone = surface.ravel() < 0
     weight[alone] = 0.0
     weight[alone, _MIDDLE] = 1.0
-    return Averages(block, weight)
+    return Averages(weight.astype(np.float32).reshape(*shape, -1))
 
 
-def inside_weights() -> tuple[float, float]:
-    """Return what a block far inside a surface weighs in itself, and the sum of squares of all weights."""
-    around = averages(np.zeros((_SIDE, _SIDE), dtype=np.int32)).weight[_MIDDLE]
-    return float(around[_MIDDLE]), float((around**2).sum())
+@compiled
+def _averaged(weight: NDArray[np.float32], values: Array) -> Array:
+    rows, columns = values.shape
+    found = np.zeros((rows, columns))
+    for row in range(rows):
+        for column in range(columns):
+            total = 0.0
+            for place in range(_SIDE * _SIDE):
+                share = weight[row, column, place]
+                if share != 0.0:
+                    total += share * values[row + place // _SIDE - REACH, column + place % _SIDE - REACH]
+            found[row, column] = total
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +121,8 @@ class BlockVariance:
         """Return the variance of each block, same shape."""
         if self.multiple is None or self.covariance is None or self.around is None:
             return self.whole
-        squares = Averages(self.around.block, self.around.weight**2)
-        own = self.around.own.reshape(self.whole.shape)
-        return self._rest() + squares.of(self.multiple) + 2.0 * own * self.covariance
+        squares = Averages(self.around.weight**2)
+        return self._rest() + squares.of(self.multiple) + 2.0 * self.around.own * self.covariance
 
     def of_sums(self, weights: csr_array) -> Array:
         """Return the variance of sums over blocks, of weights of shape (sums, blocks)."""
@@ -133,29 +161,27 @@ class BlockVariance:
 
 
 @compiled
-def _of_neighbours(weight: Array, rest: Array, multiple: Array, covariance: Array) -> Array:
+def _of_neighbours(weight: NDArray[np.float32], rest: Array, multiple: Array, covariance: Array) -> Array:
     rows, columns = rest.shape
     found = np.zeros((5, rows, columns))
     for row in range(rows):
         for column in range(columns):
-            here = row * columns + column
             for kind in range(5):
                 down, across = (kind >= 2) * 1, (kind == 1 or kind == 3) * 1 - (kind == 4) * 1
-                if row + down >= rows or column + across >= columns or column + across < 0:
+                if row + down >= rows or not 0 <= column + across < columns:
                     continue
-                there = here + down * columns + across
+                there_row, there_column = row + down, column + across
                 total = 0.0
                 for above in range(_SIDE):
                     for left in range(_SIDE):
-                        share = weight[here, above * _SIDE + left]
+                        share = weight[row, column, above * _SIDE + left]
                         if share == 0.0 or above < down or not 0 <= left - across < _SIDE:
                             continue
-                        other = weight[there, (above - down) * _SIDE + left - across]
+                        other = weight[there_row, there_column, (above - down) * _SIDE + left - across]
                         total += share * other * multiple[row + above - REACH, column + left - REACH]
                 # What one block's own rest has to do with its light in the other's average.
-                total += weight[there, _MIDDLE - down * _SIDE - across] * covariance[row, column]
-                total += (
-                    weight[here, _MIDDLE + down * _SIDE + across] * covariance[row + down, column + across]
-                )
+                step = down * _SIDE + across
+                total += weight[there_row, there_column, _MIDDLE - step] * covariance[row, column]
+                total += weight[row, column, _MIDDLE + step] * covariance[there_row, there_column]
                 found[kind, row, column] = total + (rest[row, column] if kind == 0 else 0.0)
     return found

@@ -2,7 +2,6 @@
 
 import html
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -108,10 +107,10 @@ class Edges(_ReadOnly):
 
 @dataclass(frozen=True, eq=False)
 class Multiple(_ReadOnly):
-    """The part of indirect light in blocks that was turned twice or more: it changes slowly in the image.
+    """Light in fog that was turned twice or more, by fog at least once: it changes slowly in the image.
 
-    Frames are made of its averages over blocks around, of the same surface (`light.averages`), which have a
-    twentieth of its noise.
+    Frames are made of its averages over blocks around, of the same surface (`light.averages`): inside a large
+    surface these have a nineteenth of its variance.
 
     Attributes
     ----------
@@ -120,7 +119,7 @@ class Multiple(_ReadOnly):
     covariance
         Of the means of this part and of the rest, same shape.
     surface
-        A number for the surface in each block, shape (row, column); −1 where a block stands alone.
+        A number for the surface in each block of the film, shape (row, column); −1 where one stands alone.
     """
 
     radiance_per_w: NDArray[np.float32]
@@ -128,13 +127,10 @@ class Multiple(_ReadOnly):
     covariance: NDArray[np.float32]
     surface: NDArray[np.int32]
 
-    @cached_property
+    @property
     def averages(self) -> Averages:
         """How blocks are averaged."""
         return averages(self.surface)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {known.name: getattr(self, known.name) for known in fields(self)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +141,7 @@ class Indirect(_ReadOnly):
     ----------
     radiance_per_w
         Mean radiance over each pixel for one watt of each group, in 1/(m² sr), float32, shape
-        (group, node, row, column).
+        (group, node, row, column). Noise of pixels is independent here; see `in_frames`.
     variance
         Variance of that mean, from batches, same shape.
     scale
@@ -168,6 +164,14 @@ class Indirect(_ReadOnly):
     counts: NDArray[np.int32] | None = None
     edges: Edges | None = None
     multiple: Multiple | None = field(default=None, metadata=MAY_BE_MISSING)
+
+    def in_frames(self, group: int, node: int) -> NDArray[np.float32]:
+        """Return a group's mean radiance per watt as frames have it, averaged where it is, (row, column)."""
+        whole: NDArray[np.float32] = self.radiance_per_w[group, node]
+        if self.multiple is None:
+            return whole
+        part = self.multiple.radiance_per_w[group, node]
+        return np.asarray(whole + (self.multiple.averages.of(part) - part), dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nir_render.camera.optics.apertures import pixels_around_flares
 from nir_render.errors import InputError
+from nir_render.light.averages import averages
 from nir_render.light.enlarge import Enlargement, part_of, with_patch, without_edges
 from nir_render.light.light import DirectTable, Indirect, Light
 from nir_render.light.nodes import direct_over_nodes, indirect_over_nodes
@@ -138,19 +139,27 @@ class _Rendering:
         pilot = self._kept(_PILOT, self._pilot, counts=False)
         pixels = sample_plan.flare_pixels(pilot, self.site.camera)
         flares = self._kept((_PILOT, pixels), lambda: self._flares(pixels), counts=False)
-        return sample_plan.samples_map(pilot, flares, self.site.snapshot, noise_share, shape, self._alone)
+        return sample_plan.samples_map(pilot, flares, self.site.snapshot, noise_share, shape)
 
     def _pilot(self) -> Light:
         key = groups.light_seed(self.seed, "pilot", self.site.name, self._geometry)
-        return self._light(groups.pilot(self.site.snapshot, self._built, self._rays, key, self._averaging))
+        averaging = self._averaging
+        if averaging is not None:  # pixels that are rendered one by one count as they are
+            scale = self.site.snapshot.render.indirect.scale
+            averaging = averaging.without(self._enlargement.patch, self._enlargement.columns, scale)
+        return self._light(groups.pilot(self.site.snapshot, self._built, self._rays, key, averaging))
 
     def _flares(self, pixels: NDArray[np.int64]) -> Light:
         site = self.site
         key = groups.light_seed(self.seed, "flares", site.name, self._geometry)
         enlargement = part_of(self._enlargement, pixels)
         scale = site.snapshot.render.indirect.scale
-        blocks = sample_plan.flare_blocks(self._light(None), site.camera, scale, enlargement)
-        return self._light(flare_pilot(site.snapshot, self._built, self._rays, key, blocks, enlargement))
+        averaging = self._averaging
+        around = None if averaging is None else averages(averaging.surface)
+        blocks = sample_plan.flare_blocks(self._light(None), site.camera, scale, enlargement, around)
+        return self._light(
+            flare_pilot(site.snapshot, self._built, self._rays, key, blocks, enlargement, averaging)
+        )
 
     def _indirect(self, samples: Samples | None) -> Indirect | None:
         site = self.site
@@ -229,17 +238,6 @@ class _Rendering:
         if snapshot.fog is None or scale == 1:
             return None
         return averaging_of(snapshot, self._labels, rays.origin_m, rays.corners, scale)
-
-    @property
-    def _alone(self) -> NDArray[np.bool_] | None:
-        """In which blocks something is not averaged; None where nothing is."""
-        if self._averaging is None:
-            return None
-        alone = self._averaging.surface < 0
-        patch, scale = self._enlargement.patch, self.site.snapshot.render.indirect.scale
-        row, column = np.divmod(patch, self._enlargement.columns)
-        alone[row // scale, column // scale] = True
-        return alone
 
     @cached_property
     def _enlargement(self) -> Enlargement:

@@ -3,6 +3,7 @@
 A room in fog with a source and a lamp, a curved post, a mirror and a box, seen by a small camera.
 """
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,43 +63,64 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(path)
 
 
-@pytest.fixture
-def matt_room(tmp_path: Path) -> Scene:
-    path = tmp_path / "room.yaml"
-    path.write_text("\n".join(line for line in ROOM.splitlines() if "silver" not in line))
-    return load_scene(path)
-
-
 def _rays(scene: Scene) -> groups.Rays:
     placed = scene.at(0.0).camera("r1.c")
     return groups.rays_of(placed.camera, placed.pose)
 
 
-def test_once_turned_is_what_paths_of_two_stretches_bring(matt_room: Scene) -> None:
-    """By the same random numbers, where every scattering is a turn: the parts add up to the whole, too.
-
-    There is no mirror in this room, by which light may go on without a turn.
-    """
-    snapshot, rays = matt_room.at(0.0), _rays(matt_room)
+def _parts(scene: Scene, narrow: float | None, max_depth: int = 0) -> list[np.ndarray]:
+    """Return the arrays of some pixels."""
+    snapshot, rays = scene.at(0.0), _rays(scene)
     built = groups.world_on_device(snapshot, np.ones(len(snapshot.groups)))
+    built = replace(built, max_depth=max_depth or built.max_depth)
     pixels = np.arange(0, 1200, 7)
     counts = np.full(pixels.size, 32)
-    args = snapshot, built, rays, 5, pixels, counts, SCALE
-    plain = groups.render_pixels(*args)
-    whole, variance, multiple, of_multiple, covariance = groups.render_pixels(*args, narrow=0.0)
-    short = groups.render_pixels(snapshot, replace(built, max_depth=2), *args[2:])[0]
+    return groups.render_pixels(snapshot, built, rays, 5, pixels, counts, SCALE, narrow=narrow)
+
+
+def test_light_of_many_turns_is_what_longer_paths_bring(room: Scene, tmp_path: Path) -> None:
+    """By the same random numbers; in fog without surfaces every vertex is a turn, and the second is one too many."""
+    path = tmp_path / "fog.yaml"
+    path.write_text(ROOM[: ROOM.index("shapes:")] + ROOM[ROOM.index("lamps:") :])
+    fog = load_scene(path)
+    plain, short = _parts(fog, None), _parts(fog, None, max_depth=2)
+    whole, variance, multiple, of_multiple, covariance = _parts(fog, 0.0)
     largest = float(whole.max())
     np.testing.assert_allclose(whole, plain[0], rtol=1e-4, atol=1e-6 * largest)
-    np.testing.assert_allclose(whole - multiple, short, rtol=1e-4, atol=2e-6 * largest)
-    assert (variance >= 0.0).all()
+    np.testing.assert_allclose(whole - multiple, short[0], rtol=1e-4, atol=2e-6 * largest)
+    assert multiple.sum() > 0.2 * whole.sum()
     of_rest = variance - of_multiple - 2.0 * covariance
     assert of_rest.min() > -1e-4 * float(variance.max())
-    # The wider a turn must be, the more counts as turned once: none at all where all must go back.
+    # Whatever counts as a turn, after one scattering light has not turned twice.
+    for narrow in (0.0, 0.05):
+        assert not _parts(room, narrow, max_depth=2)[2].any()
+    # The wider a turn must be, the more has turned once at most; and where nothing is one, all.
     rest = [
-        float((array[0] - array[2]).sum())
-        for array in (groups.render_pixels(*args, narrow=narrow) for narrow in (0.0, 0.01, 0.2))
+        float((whole - multiple).sum())
+        for whole, _, multiple, *_ in (_parts(fog, one) for one in (0.0, 0.01, 0.2))
     ]
     assert 1.02 * rest[0] < 1.01 * rest[1] < rest[2] < float(whole.sum())
+    assert not _parts(fog, 2.0)[2].any()
+
+
+def test_narrow_turns_are_none_however_light_is_found(room: Scene) -> None:
+    """Of fog of g = 0.99 0.65 % is turned by more than 0.9 rad; all others are no turns, and walls are black.
+
+    The lamp is large: paths find it by themselves, too, and both ways to it are weighted.
+    """
+    scene = room.with_(
+        {"fog.phase.g": 0.99, "materials.paint.reflectance": 1e-6, "materials.silver.reflectance": 1e-6}
+    )
+    whole, _, multiple, *_ = _parts(scene, 1.0 - float(np.cos(0.9)))
+    assert 0.0 <= multiple.sum() < 0.02 * whole.sum()
+    assert _parts(scene, 0.0)[2].sum() > 0.1 * whole.sum()
+
+
+def test_what_surfaces_alone_turn_is_not_averaged(room: Scene) -> None:
+    """In air with next to no fog, though the light of the walls is turned by them time and again."""
+    scene = room.with_({"fog.extinction": "1e-7 /m"})
+    whole, _, multiple, *_ = _parts(scene, 0.0)
+    assert multiple.sum() < 1e-4 * whole.sum()
 
 
 def test_what_is_averaged_are_flat_matt_surfaces_of_one_reflectance_and_empty_fog(room: Scene) -> None:
@@ -130,6 +152,18 @@ def test_what_is_averaged_are_flat_matt_surfaces_of_one_reflectance_and_empty_fo
     assert narrow_versine(_rays(room).corners, SCALE) == pytest.approx(1.0 - np.cos(20.0 / 60.0), rel=0.01)
 
 
+def test_fog_over_height_seen_against_nothing_has_a_depth(room: Scene) -> None:
+    changes = {"fog": {"extinction": "0.1 /m", "profile": [["0 m", 1.0], ["2 m", 0.2]]}}
+    scene = room.with_({**changes, "shapes.wall.center": "[6, 0, -4] m"})
+    light = render(scene, "r1.c", seed=1)
+    assert light.indirect is not None
+    assert light.indirect.multiple is not None
+    assert np.isfinite(light.indirect.multiple.averages.of(np.ones((ROWS // SCALE, COLUMNS // SCALE)))).all()
+    surface = light.indirect.multiple.surface
+    # Far off it thickens quickly towards the horizon: there blocks stand alone, high above it they do not.
+    assert (surface[2] >= 0).all()
+
+
 def test_clear_air_and_full_resolution_are_as_they_are(room: Scene) -> None:
     for changes in ({"fog": None}, {"render.indirect.scale": 1}):
         light = render(room.with_(changes), "r1.c", seed=1)
@@ -140,7 +174,7 @@ def test_clear_air_and_full_resolution_are_as_they_are(room: Scene) -> None:
 def test_a_light_with_averages_is_kept_in_a_file(room: Scene, tmp_path: Path) -> None:
     light = render(room, "r1.c", seed=1)
     write_light(tmp_path / "light.npz", light)
-    again = read_light(tmp_path / "light.npz")
+    again = pickle.loads(pickle.dumps(read_light(tmp_path / "light.npz")))
     flux = group_fluxes(light, room.at(0.0))
     assert light.indirect is not None
     assert again.indirect is not None
@@ -183,6 +217,13 @@ def test_the_noise_is_what_the_light_says_and_half_of_what_it_was(room: Scene) -
         discs.append(Aperture(rows, columns, down**2 + across**2 <= radius**2))
     sums = np.array([[disc.sum(image) for disc in discs] for image in averaged])
     of_discs = np.mean([aperture_variances_e2(one, snapshot, EXPOSURE_S, discs) for one in lights], axis=0)
+    # Averages are as bright, in tiles of 20 pixels.
+    bright, before_bright = (
+        images.mean(axis=0).reshape(ROWS // 20, 20, COLUMNS // 20, 20).mean(axis=(1, 3))
+        for images in (averaged, plain)
+    )
+    np.testing.assert_allclose(bright, before_bright, rtol=0.02)
+    assert bright.sum() == pytest.approx(before_bright.sum(), rel=0.002)
     # A variance of 96 numbers is known to 14.5 %.
     np.testing.assert_allclose(sums.var(axis=0, ddof=1) / of_discs, 1.0, atol=3.5 * 0.145)
 

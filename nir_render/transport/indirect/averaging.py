@@ -1,9 +1,9 @@
 """Which light in which blocks is averaged with that of blocks around: in fog, on surfaces alike throughout.
 
-In fog most of a render's noise is in light that was turned twice and more, which is smooth in the image: what
-turns light by less than some blocks are wide counts as no turn. It is smooth on flat matt surfaces of one
-reflectance and where nothing is seen but fog, as far as the fog in front does not change other than linearly
-from block to block.
+In fog most of a render's noise is in light that was turned twice and more, by fog at least once. It is smooth
+in the image, where turns in fog by less than some blocks are wide do not count: on flat matt surfaces of one
+reflectance and where nothing is seen but fog, as far as the fog in front changes only linearly from block to
+block.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from nir_render.transport.indirect.enlargement import Labels, labels_of_blocks
 from nir_render.transport.world.fog_depth import optical_depth
 
 _NARROW_BLOCKS = 2 * REACH + 1  # all that an average is made of
+_FAR_M = 1e6  # in place of endless ways, whose depth in fog over height is no number
 _BENT = 0.01  # what fog lets through may be off by so much in the mean of the blocks around
 
 
@@ -35,6 +36,13 @@ class Averaging:
 
     surface: NDArray[np.int32]
     narrow: float
+
+    def without(self, pixels: NDArray[np.int32], columns: int, scale: int) -> "Averaging":
+        """Return what is averaged where blocks with some pixels, numbered row by row, stand alone."""
+        surface = self.surface.copy()
+        row, column = np.divmod(pixels, columns)
+        surface[row // scale, column // scale] = -1
+        return Averaging(surface, self.narrow)
 
 
 def averaging_of(
@@ -63,7 +71,7 @@ def averaging_of(
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     rows, columns = surface.shape
     nearness_per_m = labels.nearness_per_m.reshape(rows, scale, columns, scale).mean(axis=(1, 3)).ravel()
-    length_m = np.where(nearness_per_m > 0.0, 1.0 / np.maximum(nearness_per_m, 1e-12), np.inf)
+    length_m = 1.0 / np.maximum(nearness_per_m, 1.0 / _FAR_M)
     start_m = np.broadcast_to(origin_m, (surface.size, 3))
     through = np.exp(-optical_depth(fog, start_m, direction.reshape(-1, 3), length_m)).reshape(surface.shape)
     bent = np.abs(averages(surface).of(through) - through) > _BENT
@@ -76,4 +84,4 @@ def narrow_versine(corners: NDArray[np.float64], scale: int) -> float:
     beside = corners[row, column - 1 : column + 1]
     first, second = beside / np.linalg.norm(beside, axis=1, keepdims=True)
     angle_rad = _NARROW_BLOCKS * scale * float(np.linalg.norm(second - first))
-    return 1.0 - float(np.cos(angle_rad))
+    return 1.0 - float(np.cos(min(angle_rad, np.pi)))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from nir_render.camera.beams import electrons_per_radiance
-from nir_render.camera.by_spectrum import by_spectrum, group_fluxes
+from nir_render.camera.by_spectrum import blocks_by_spectrum, by_spectrum, group_fluxes
 from nir_render.camera.mean_frame import MeanFrame
 from nir_render.camera.render_noise import temporal_variance_e2
 from nir_render.light.enlarge import Enlargement, weights_of
@@ -111,7 +111,7 @@ def _chances(mean: MeanFrame, fluxes: Array, enlargement: Enlargement) -> Array:
     assert light.indirect is not None
     blocks_e = np.zeros(light.indirect.radiance_per_w.shape[2:])
     even = np.ones((enlargement.rows, enlargement.columns))
-    for part in by_spectrum(light, mean.rates.snapshot, light.indirect.radiance_per_w, fluxes):
+    for part in blocks_by_spectrum(light, light.indirect, mean.rates.snapshot, fluxes):
         per_radiance = electrons_per_radiance(mean.camera, part.emitter, mean.exposure_s, part.node)
         size = blocks_e.shape[::-1]
         blocks_e += part.values * cv2.resize(per_radiance, size, interpolation=cv2.INTER_AREA)

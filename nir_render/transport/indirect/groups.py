@@ -155,7 +155,7 @@ def pilot(
     radiance, variance, *apart = (array.reshape(*array.shape[:2], row.size, column.size) for array in arrays)
     multiple = None
     if averaging is not None:
-        multiple = Multiple(apart[0], apart[1], apart[2], averaging.surface[np.ix_(row, column)])
+        multiple = Multiple(apart[0], apart[1], apart[2], averaging.surface)
     return Indirect(radiance, variance, scale * step, PILOT_SAMPLES, multiple=multiple)
 
 

@@ -8,8 +8,8 @@ The need of a pixel is the count that brings its render variance to a share of s
 pilot's variance, from 8 batches, is itself noisy, and where rare paths carry the light most of its values are
 too small; its mean is right. So needs are means over 5 × 5 pixels of the pilot, and taken a tenth larger.
 
-In fog light of many turns is averaged over blocks (`averaging`), which leaves little of its noise. Blocks in
-which it is not are counted by their own noise, also where pixels in them are rendered one by one.
+In fog light of many turns is averaged over blocks (`averaging`): sums are made of blocks around then, too,
+and of their noise little is left. A pixel that is rendered one by one has no averages.
 
 - The frame's count is the median of the needs of the pixels that light reaches, at least 8. Each pixel gets
   its own need, up to 4 times the frame's count: more than half of all pixels then keep the target, and most
@@ -30,6 +30,8 @@ of a bracket's exposures. In a frame in which the brightest are dark, the share 
 has can be larger; `render_noise` tells it frame by frame.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +43,9 @@ from nir_render.camera.optics.apertures import aperture_weights, flare_apertures
 from nir_render.camera.render_noise import temporal_variance_e2, variance_by_spectrum
 from nir_render.camera.timing.drive import drive_of
 from nir_render.camera.timing.exposure_control import setting_for
-from nir_render.light.averages import inside_weights
+from nir_render.light.averages import Averages
 from nir_render.light.enlarge import Enlargement
-from nir_render.light.light import Light, Multiple
+from nir_render.light.light import Indirect, Light
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.snapshot import Snapshot
 
@@ -68,7 +70,6 @@ def samples_map(
     snapshot: Snapshot,
     noise_share: float,
     shape: tuple[int, int],
-    alone: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.int64]:
     """Return the samples for each pixel of the film, and those wanted without bounds, (2, rows, columns).
 
@@ -82,20 +83,16 @@ def samples_map(
         Render variance over temporal variance to reach.
     shape
         Rows and columns of the film.
-    alone
-        In which pixels of the film nothing is averaged, that shape; None: in all.
     """
     assert pilot.indirect is not None  # without indirect light nothing is sampled
     camera = snapshot.camera(pilot.camera).camera
-    rates = electron_rates(pilot, snapshot, _lit_together(pilot, snapshot))
+    plain = replace(
+        pilot, indirect=replace(pilot.indirect, multiple=None)
+    )  # a pilot's pixels are no neighbours
+    rates = electron_rates(plain, snapshot, _lit_together(pilot, snapshot))
     exposure_s = planned_exposure_s(camera, float(fully_lit_frame(rates, 1.0).electrons.max()))
     sensor_e2 = temporal_variance_e2(fully_lit_frame(rates, exposure_s))
-    own = pilot.indirect.variance
-    ratio = _share_of_one_sample(pilot, snapshot, exposure_s, sensor_e2, shape, own)
-    if alone is not None and pilot.indirect.multiple is not None:
-        averaged = _averaged(own, pilot.indirect.multiple)
-        of_averages = _share_of_one_sample(pilot, snapshot, exposure_s, sensor_e2, shape, averaged)
-        ratio = np.where(alone, ratio, np.minimum(ratio, of_averages))
+    ratio = _share_of_one_sample(pilot, snapshot, exposure_s, sensor_e2, shape)
     need, scale = ratio / noise_share, camera.sensor.rows // shape[0]
     frame = max(float(np.median(need[need > 0.0])) if (need > 0.0).any() else 0.0, LEAST_SAMPLES)
     flare_like = scale**2 * ratio / _FLARE_LIKE_SHARE
@@ -133,15 +130,19 @@ def flare_pixels(light: Light, camera: Camera) -> Numbers:
     return np.concatenate([np.empty(0, dtype=np.int64), *numbers])
 
 
-def flare_blocks(light: Light, camera: Camera, scale: int, enlargement: Enlargement) -> Numbers:
+def flare_blocks(
+    light: Light, camera: Camera, scale: int, enlargement: Enlargement, around: Averages | None = None
+) -> Numbers:
     """Return the numbers of the film's pixels that sums over flares' apertures are made of, shape (n,).
 
-    Of a large aperture they are an even part.
+    Of a large aperture they are an even part. `around` is how light is averaged, if it is.
     """
     chosen = [np.empty(0, dtype=np.int64)]
     apertures = flare_apertures(light, camera)
     even = np.ones((enlargement.rows, enlargement.columns))
     of_blocks, _ = aperture_weights(apertures, even, scale, enlargement)
+    if around is not None:
+        of_blocks = csr_array(abs(of_blocks) + abs(of_blocks @ around.matrix))
     for row in range(len(apertures)):
         part = slice(*of_blocks.indptr[row : row + 2])
         blocks = np.sort(of_blocks.indices[part][_counted(of_blocks.data[part])]).astype(np.int64)
@@ -149,35 +150,44 @@ def flare_blocks(light: Light, camera: Camera, scale: int, enlargement: Enlargem
     return np.unique(np.concatenate(chosen))
 
 
-def _averaged(variance: NDArray[np.float32], multiple: Multiple) -> NDArray[np.float32]:
-    """Return the variance that blocks would have amid others like them, light of many turns averaged."""
-    own, squares = inside_weights()
-    of_rest = variance - multiple.variance - 2.0 * multiple.covariance
-    averaged = of_rest + squares * multiple.variance + 2.0 * own * multiple.covariance
-    return np.where(multiple.surface < 0, variance, np.maximum(averaged, 0.0)).astype(np.float32)
-
-
 def _share_of_one_sample(
+    pilot: Light, snapshot: Snapshot, exposure_s: float, sensor_e2: Array, shape: tuple[int, int]
+) -> Array:
+    """Return the variance of one sample over that of the sensor, shape of the film; never seen is 0.
+
+    Where light is averaged it is that of one sample in this block and in all around.
+    """
+    assert pilot.indirect is not None
+    multiple = pilot.indirect.multiple
+    known = pilot, snapshot, exposure_s, sensor_e2, shape
+    ratio = _share_of(*known, pilot.indirect.variance)
+    if multiple is not None:
+        own, squares = multiple.averages.own, multiple.averages.squares
+        ratio += (squares - 1.0) * _share_of(*known, multiple.variance)
+        ratio += 2.0 * (own - 1.0) * _share_of(*known, multiple.covariance)
+    return np.maximum(ratio, 0.0) * (pilot.indirect.samples * _CAUTION)
+
+
+def _share_of(
     pilot: Light,
     snapshot: Snapshot,
     exposure_s: float,
     sensor_e2: Array,
     shape: tuple[int, int],
-    variance_of_groups: NDArray[np.float32],
+    of_groups: NDArray[np.float32],
 ) -> Array:
-    """Return the variance of one sample over that of the sensor, shape of the film; never seen is 0."""
+    """Return a variance of the pilot's pixels over that of the sensor, mean over neighbours, on the film."""
     assert pilot.indirect is not None
     parts = pilot.indirect.variance.shape[-1:-3:-1]
     noise_e2: Array = np.zeros(parts[::-1])
-    for electrons, variance in _of_spectra(pilot, snapshot, exposure_s, variance_of_groups):
+    for electrons, variance in _of_spectra(pilot, snapshot, exposure_s, of_groups):
         pilot_electrons: Array = np.asarray(
             cv2.resize(electrons, parts, interpolation=cv2.INTER_AREA), dtype=np.float64
         )
         noise_e2 += pilot_electrons**2 * variance
     shares = noise_e2 * cv2.resize(1.0 / sensor_e2, parts, interpolation=cv2.INTER_AREA)
     means = cv2.blur(shares, (_NEIGHBOURS, _NEIGHBOURS), borderType=cv2.BORDER_REPLICATE)
-    ratio = np.asarray(cv2.resize(means, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float64)
-    return np.maximum(ratio, 0.0) * (pilot.indirect.samples * _CAUTION)
+    return np.asarray(cv2.resize(means, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float64)
 
 
 def _needs_of_flares(
@@ -200,27 +210,40 @@ def _needs_of_flares(
     enlargement, apertures = edges.enlargement, flare_apertures(flares, camera)
     need = np.zeros(shape[0] * shape[1])
     in_block = _blocks_under(enlargement.patch.astype(np.int64), scale, enlargement)
+    multiple = flares.indirect.multiple
+    around = None if multiple is None else multiple.averages
     of_blocks, of_patch = aperture_weights(apertures, np.ones_like(sensor_e2), scale, enlargement)
-    block = np.union1d(of_blocks.indices, in_block)  # all that any sum is made of
+    spread = of_blocks if around is None else csr_array(of_blocks @ around.matrix)
+    block = np.union1d(np.union1d(of_blocks.indices, spread.indices), in_block)  # all that any sum is made of
     under = np.searchsorted(block, in_block)
     fold = csr_array((np.ones(len(under)), (np.arange(len(under)), under)), shape=(len(under), len(block)))
 
-    def squared(of_blocks: csr_array, of_patch: csr_array) -> tuple[csr_array, csr_array]:
+    def squared(of_blocks: csr_array, of_patch: csr_array) -> tuple[list[csr_array], csr_array]:
+        """Return squares of weights: of blocks, of averages and both where there are any, of the patch."""
         some = of_blocks[:, block]
-        return some.multiply(some).tocsr(), of_patch.multiply(of_patch).tocsr()
+        pairs = [(some, some)]
+        if around is not None:
+            averaged = csr_array(of_blocks @ around.matrix)[:, block]
+            pairs += [(averaged, averaged), (some, averaged)]
+        return [one.multiply(other).tocsr() for one, other in pairs], of_patch.multiply(of_patch).tocsr()
 
     counts, alone = squared(of_blocks, of_patch)
-    size = np.sqrt((counts + alone @ fold).toarray())
-    sampled = np.isin(block, known := flare_blocks(flares, camera, scale, enlargement))
+    size = np.sqrt((sum(counts[1:2], counts[0]) + alone @ fold).toarray())
+    known = flare_blocks(flares, camera, scale, enlargement, around)
+    sampled = np.isin(block, known)
     brought_e2, brought_alone_e2 = (np.zeros(size.shape) for _ in range(2))
-    spectra = _of_spectra(flares, snapshot, exposure_s, flares.indirect.variance)
+    variances = _parts_of(flares.indirect)
+    spectra = [_of_spectra(flares, snapshot, exposure_s, one) for one in variances]
     patches = _of_spectra(flares, snapshot, exposure_s, edges.variance)
-    for (electrons, variance), (_, variance_alone) in zip(spectra, patches, strict=True):
+    for of_parts, (_, variance_alone) in zip(zip(*spectra, strict=True), patches, strict=True):
+        electrons = of_parts[0][0]
         counts, alone = squared(*aperture_weights(apertures, electrons, scale, enlargement))
-        of_block = np.zeros(len(block))
-        of_block[sampled] = variance.ravel()[np.isin(known, block)]
-        brought_e2 += counts.toarray() * of_block
+        for count, (_, variance) in zip(counts, of_parts, strict=True):
+            of_block = np.zeros(len(block))
+            of_block[sampled] = variance.ravel()[np.isin(known, block)]
+            brought_e2 += count.toarray() * of_block
         brought_alone_e2 += (alone.multiply(variance_alone.ravel()[None])).tocsr() @ fold
+    brought_e2 = np.maximum(brought_e2, 0.0)
     for row, aperture in enumerate(apertures):
         used = _counted(size[row])
         sampled_size = size[row, used[sampled[used]]].sum()
@@ -232,6 +255,15 @@ def _needs_of_flares(
         per_size /= noise_share * aperture.sum(sensor_e2)
         need[block[used]] = np.maximum(need[block[used]], per_size * size[row, used])
     return need.reshape(shape)
+
+
+def _parts_of(light: Indirect) -> list[NDArray[np.float32]]:
+    """Return the variance that counts by each kind of squares of weights: of blocks, of averages, of both."""
+    multiple = light.multiple
+    if multiple is None:
+        return [light.variance]
+    of_rest = light.variance - multiple.variance - 2.0 * multiple.covariance
+    return [of_rest, multiple.variance, 2.0 * multiple.covariance]
 
 
 def _counted(weights: Array) -> Numbers:

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.light.enlarge import Enlargement, with_patch
-from nir_render.light.light import Edges, Indirect
+from nir_render.light.light import Edges, Indirect, Multiple
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.indirect import groups
-from nir_render.transport.indirect.averaging import narrow_versine
+from nir_render.transport.indirect.averaging import Averaging, narrow_versine
 from nir_render.transport.indirect.enlargement import Labels, fit_enlargement
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.world.medium import medium
@@ -151,6 +151,7 @@ def flare_pilot(
     seed: int,
     blocks: NDArray[np.int64],
     enlargement: Enlargement,
+    averaging: Averaging | None = None,
 ) -> Indirect:
     """Return a pilot in chosen blocks, as an image of one row, and in each pixel of the patch.
 
@@ -160,18 +161,24 @@ def flare_pilot(
         As for `groups.render_pixels`.
     blocks
         Numbers of the film's pixels, row by row, shape (n,).
+    averaging
+        What is averaged, None for nothing.
     """
     scale, samples = snapshot.render.indirect.scale, FLARE_PILOT_SAMPLES
-    patch = enlargement.patch.astype(np.int64)
-    parts = [
-        groups.render_pixels(
-            snapshot, built, rays, groups.light_seed(seed, name), pixels, np.full(pixels.size, samples), size
-        )
-        for name, pixels, size in (("blocks", blocks, scale), ("edges", patch, 1))
-    ]
-    (radiance, variance), (alone, variance_alone) = parts
-    edges = Edges(enlargement, alone, variance_alone)
-    return Indirect(radiance[:, :, None], variance[:, :, None], scale, samples, edges=edges)
+
+    def rendered(
+        name: str, pixels: NDArray[np.int64], size: int, narrow: float | None
+    ) -> list[NDArray[np.float32]]:
+        key, counts = groups.light_seed(seed, name), np.full(pixels.size, samples)
+        return groups.render_pixels(snapshot, built, rays, key, pixels, counts, size, narrow=narrow)
+
+    narrow = None if averaging is None else averaging.narrow
+    radiance, variance, *apart = (array[:, :, None] for array in rendered("blocks", blocks, scale, narrow))
+    edges = Edges(enlargement, *rendered("edges", enlargement.patch.astype(np.int64), 1, None))
+    multiple = None
+    if averaging is not None:
+        multiple = Multiple(apart[0], apart[1], apart[2], averaging.surface)
+    return Indirect(radiance, variance, scale, samples, edges=edges, multiple=multiple)
 
 
 def rendered_again(

@@ -183,10 +183,10 @@ def draw_scattering(fog: FogTable, direction: Vector, u: Float, v: Float) -> Vec
     root = dr.safe_sqrt(p0 * p0 + share * (p1 * p1 - p0 * p0))
     place = share * (p0 + p1) / dr.maximum(p0 + root, 1e-30)
     low, high = dr.gather(mi.Float, fog.versine, cell), dr.gather(mi.Float, fog.versine, cell + 1)
-    versine = dr.lerp(low, high, dr.clip(place, 0.0, 1.0))
-    sine = dr.safe_sqrt(versine * (2.0 - versine))
+    turn = dr.lerp(low, high, dr.clip(place, 0.0, 1.0))
+    sine = dr.safe_sqrt(turn * (2.0 - turn))
     sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * v)
-    return mi.Frame3f(direction).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, 1.0 - versine))
+    return mi.Frame3f(direction).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, 1.0 - turn))
 
 
 def arc_integral(fog: FogTable, angle: Float) -> Float:
@@ -214,8 +214,8 @@ def draw_angle(fog: FogTable, table: Float, value: Float) -> Float:
     return dr.lerp(low, high, share)
 
 
-def _angle(versine: Float) -> Float:
-    return 2.0 * dr.asin(dr.minimum(dr.safe_sqrt(0.5 * versine), 1.0))
+def _angle(turn: Float) -> Float:
+    return 2.0 * dr.asin(dr.minimum(dr.safe_sqrt(0.5 * turn), 1.0))
 
 
 def _cell(angle: Float) -> UInt:

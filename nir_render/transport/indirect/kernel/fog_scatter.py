@@ -23,7 +23,7 @@ from nir_render.transport.indirect.kernel.fog import (
     table_slope,
     versine,
 )
-from nir_render.transport.indirect.kernel.tables import DeviceScene
+from nir_render.transport.indirect.kernel.tables import TURN_IN_FOG, DeviceScene
 from nir_render.transport.indirect.kernel.types import (
     AddLight,
     Float,
@@ -94,7 +94,7 @@ def scatter_on_stretch(
     share, kept = connect.arriving_share(scene, row, place, aim, state.depth, max_depth, seen)
     turns = None
     if scene.narrow is not None:
-        turns = state.turns + dr.select(turn > scene.narrow, mi.UInt32(1), mi.UInt32(0))
+        turns = state.turns + dr.select(turn > scene.narrow, mi.UInt32(TURN_IN_FOG), 0)
     add(brought * share, nodes.times(state.shares, kept), row, seen & (share > 0.0), turns)
     return FogScattering(lost, place, weight, active)
 

@@ -20,7 +20,7 @@ from nir_render.transport.indirect.kernel.draws import Draws, power_heuristic
 from nir_render.transport.indirect.kernel.fog import fog_interval, versine
 from nir_render.transport.indirect.kernel.fog_scatter import FogScattering, scatter_on_stretch
 from nir_render.transport.indirect.kernel.leaving import NextDirection, leave_in_fog, leave_surface
-from nir_render.transport.indirect.kernel.tables import DeviceScene, Surfaces
+from nir_render.transport.indirect.kernel.tables import TURN, TURN_IN_FOG, DeviceScene, Surfaces
 from nir_render.transport.indirect.kernel.types import (
     AddLight,
     Float,
@@ -67,8 +67,7 @@ def walk(
 
     Returns
     -------
-    Flat array, (group, node, batch, pixel); where the scene counts turns (turned once at most or more often,
-    group, node, batch, pixel).
+    Flat array, (group, node, batch, pixel); where turns are counted the light of many comes behind the other.
     """
     lane = dr.arange(mi.UInt32, lanes)
     out = dr.zeros(mi.Float, (1 if scene.narrow is None else 2) * groups * scene.node_count * lanes)
@@ -78,7 +77,7 @@ def walk(
     def add(value: Float, shares: Shares, row: UInt, active: Mask, turns: UInt | None) -> None:
         group = dr.gather(mi.UInt32, scene.lights.group, row, active)
         if turns is not None:
-            group = dr.select(turns > 1, group + of_part, group)
+            group = dr.select((turns >= TURN_IN_FOG) & ((turns & 0xFFFF) > 1), group + of_part, group)
         if scene.nodes is not None:
             group = group * scene.nodes.count
         for node, part in enumerate([value * share for share in shares] or [value]):
@@ -280,7 +279,7 @@ def _ask_light(
     share, kept = connect.arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
     shares = nodes.off_surface(scene.nodes, si, bsdf, aim.direction, mi.Bool(False), seen)
     shares = nodes.times(nodes.times(state.shares, shares), kept)
-    once_more = None if state.turns is None else state.turns + 1
+    once_more = None if state.turns is None else state.turns + TURN
     add(brought * share, shares, row, seen & (share > 0.0), once_more)
     return _SurfaceSample(bsdf, sample, sampled_weight[0], cell)
 
@@ -363,8 +362,9 @@ def _survive(
     direction, tier, dealt = begin(sample_next)
     turns = state.turns
     if turns is not None:
-        much = evenly & (~leaving.turned | (versine(state.direction, leaving.direction) > narrow))
-        turns = dr.select(goes_on, dr.select(much, turns + 1, turns), 0)
+        in_fog = leaving.turned & (versine(state.direction, leaving.direction) > narrow)
+        of_surface = dr.select(evenly & ~leaving.turned, mi.UInt32(TURN), 0)
+        turns = dr.select(goes_on, turns + dr.select(in_fog, mi.UInt32(TURN_IN_FOG), of_surface), 0)
     return PathState(
         sample=sample_next,
         depth=dr.select(goes_on, state.depth + 1, 0),

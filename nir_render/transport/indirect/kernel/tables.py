@@ -19,6 +19,9 @@ from nir_render.transport.world.medium import Medium
 from nir_render.transport.world.pattern import Pattern
 from nir_render.transport.world.phase import CELLS
 
+# What a turn adds to the count of a path's turns: the low half counts all, the high half those in fog.
+TURN = 1
+TURN_IN_FOG = TURN + 2**16
 _EDGELESS_M = 1e30  # stands for infinity, whose products with 0 are not numbers
 HEIGHTS = MOST_HEIGHTS + 1
 _LEVEL = (
@@ -156,8 +159,8 @@ class DeviceScene:
     on a GPU, and takes all rays into another as unhindered.
     `max_depth` is the longest path, in stretches, as Mitsuba counts; `nodes` is None where light of one
     wavelength alone is carried. `pictures` tells whether any surface has a picture laid on it. With `narrow`
-    light that was turned twice or more is apart: a turn is where a surface or fog scatters light evenly, fog
-    by an angle whose versine, 1 − cos θ, is above that.
+    light that was turned twice or more, by fog at least once, is apart: a turn is where a surface or fog
+    scatters light evenly, fog by an angle whose versine, 1 − cos θ, is above that.
     """
 
     bodies: MitsubaScene

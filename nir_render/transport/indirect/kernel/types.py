@@ -21,7 +21,7 @@ Ray = Any  # mi.Ray3f
 Random = Callable[[Any], Float]  # a number in [0, 1) for a path's vertex, by what it is for (see `draws`)
 Shares = tuple[Float, ...]  # what each node keeps of a path's light (see `nodes`); of one node alone none
 # Adds radiance per unit of a light's emission, the nodes' shares of it, to the result; the last is how often
-# the light was turned on its way, None where that is not asked.
+# the light was turned on its way (`tables.TURN`, `tables.TURN_IN_FOG`), None where that is not asked.
 AddLight = Callable[[Float, Shares, UInt, Mask, UInt | None], None]
 
 
@@ -40,7 +40,7 @@ class PathState:
     cell: UInt
     density: Float  # with which a surface there draws its direction; in fog `TURNED` of the phase function
     scattered: Mask  # whether there is such a vertex
-    turns: UInt | None  # how many such vertices turned the path by more than a little; None: not counted
+    turns: UInt | None  # how often the path was turned, by what; None: not counted
     way: Int
     inside: Mask  # a transparent solid
     in_fog: Mask | None  # whether that vertex is fog's; None in clear air

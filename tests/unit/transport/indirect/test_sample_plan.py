@@ -72,17 +72,18 @@ def _plan(
     directions: list[list[float]] | None = None,
     how: Enlargement | None = None,
     averaged: float = 0.0,
-    alone: NDArray[np.bool_] | None = None,
+    alone: slice = slice(0),
 ) -> NDArray[np.int64]:
     """The counts given and wanted; of `flares` the variance in each block, and in each pixel of the patch.
 
-    `averaged` is the share of the variance that is averaged over blocks.
+    `averaged` is the share of the variance that is averaged over blocks, but for the rows `alone` of the film.
     """
     pilot = _light(variance, 16, directions)
     if averaged:
         assert pilot.indirect is not None
         known = pilot.indirect.variance
-        surface = np.zeros(known.shape[2:], dtype=np.int32)
+        surface = np.zeros(FILM, dtype=np.int32)
+        surface[alone] = -1
         multiple = Multiple(known, np.float32(averaged) * known, np.zeros_like(known), surface)
         pilot = replace(pilot, indirect=replace(pilot.indirect, multiple=multiple))
     how = how or without_edges(960, 1280)
@@ -92,7 +93,7 @@ def _plan(
     assert light.indirect is not None
     patch = np.broadcast_to(of_flares, (2, 1, how.patch.size)).astype(np.float32)
     indirect = replace(light.indirect, scale=2, edges=Edges(how, patch, patch))
-    return samples_map(pilot, replace(light, indirect=indirect), scene.at(0.0), share, FILM, alone)
+    return samples_map(pilot, replace(light, indirect=indirect), scene.at(0.0), share, FILM)
 
 
 def _per_radiance(scene: Scene) -> float:
@@ -165,10 +166,8 @@ def test_where_light_of_many_turns_is_averaged_less_is_enough_but_not_where_bloc
     """
     row = np.exp(-0.5 * (np.arange(-2, 3) / 1.4) ** 2)
     squares = float((row**2).sum() / row.sum() ** 2) ** 2
-    alone = np.zeros(FILM, dtype=bool)
-    alone[: FILM[0] // 2] = True
     variance = np.full((60, 80), _variance_for(scene, 640.0, 0.05))
-    given = _plan(scene, variance, 0.05, averaged=0.9, alone=alone)[0]
+    given = _plan(scene, variance, 0.05, averaged=0.9, alone=slice(FILM[0] // 2))[0]
     below, above = given[FILM[0] // 2 + 20, FILM[1] // 2], given[FILM[0] // 2 - 20, FILM[1] // 2]
     needed = 640.0 * (0.1 + 0.9 * squares)
     assert below == 2 ** np.ceil(np.log2(needed))
