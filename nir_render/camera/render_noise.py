@@ -300,7 +300,7 @@ def aperture_variances_e2(
 ) -> Array:
     """Return the variance that rendering adds to the sum over each aperture, shape (apertures,).
 
-    Pixels of one block share its noise: `aperture_weights` says how much of it comes into the sum. `levels`
+    Pixels of one block share its noise, and blocks what is averaged over them. `levels`
     is that of `render_variance_e2`.
     """
     camera = snapshot.camera(light.camera).camera

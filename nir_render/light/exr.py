@@ -7,7 +7,9 @@ declared unit. Where the samples differ from pixel to pixel, a part `samples` co
 no pixels; it goes beside the image as a table.
 
 The pixels are those that were rendered: `scale` × `scale` of the camera's. What keeps edges sharp when a
-frame is made of them (`Indirect.edges`) is left out, as the attribute `edges` says; a light cache keeps it.
+frame is made of them (`Indirect.edges`) is left out, as the attribute `edges` says, and so is what is averaged
+over blocks in fog (`Indirect.multiple`), as `averaged` says: values and variances here are those before, of
+independent blocks. A light cache keeps all of it.
 """
 
 from pathlib import Path
@@ -18,6 +20,7 @@ import OpenEXR
 
 from nir_render.light.light import Light
 
+_AVERAGED = "in frames light of many turns is averaged over blocks; not here"
 _LEFT_OUT = "left out: frames made of this file are blurred where surfaces meet"
 
 
@@ -36,6 +39,7 @@ def write_light(path: Path, light: Light) -> None:
         "scale": light.indirect.scale,
         "samples": light.indirect.samples,
         "edges": "none" if light.indirect.edges is None else _LEFT_OUT,
+        "averaged": "no" if light.indirect.multiple is None else _AVERAGED,
     }
     parts = []
     for group, name in enumerate(light.groups):

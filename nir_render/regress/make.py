@@ -179,7 +179,7 @@ def _reference_light(
     """Render a light often; its own, which a check renders again, is none of those in the mean."""
     own = render(scene, setting.camera, setting.middle_s)
     step()
-    film, edges = _Moments(), _Moments()
+    film, edges, turned, shared = (_Moments() for _ in range(4))
     for number in range(renders):
         seed = int(generator(scene.document.seed, "regress", setting.camera, number).integers(2**62))
         indirect = render(scene, setting.camera, setting.middle_s, seed).indirect
@@ -189,15 +189,24 @@ def _reference_light(
         film.add(indirect.radiance_per_w, indirect.variance)
         if indirect.edges is not None:
             edges.add(indirect.edges.radiance_per_w, indirect.edges.variance)
+        if indirect.multiple is not None:
+            turned.add(indirect.multiple.radiance_per_w, indirect.multiple.variance)
+            shared.add(indirect.multiple.radiance_per_w, indirect.multiple.covariance)
     assert own.indirect is not None  # or it would be None above too
     samples = own.indirect.samples
     many = replace(
-        own.indirect,
-        radiance_per_w=film.mean(),
-        variance=film.variance(),
-        samples=renders * samples,
-        multiple=None,  # of so many samples nothing need be averaged
+        own.indirect, radiance_per_w=film.mean(), variance=film.variance(), samples=renders * samples
     )
+    if own.indirect.multiple is not None:
+        many = replace(
+            many,
+            multiple=replace(
+                own.indirect.multiple,
+                radiance_per_w=turned.mean(),
+                variance=turned.variance(),
+                covariance=shared.variance(),
+            ),
+        )
     third_edges = None
     if own.indirect.edges is not None:
         many = replace(

@@ -79,7 +79,7 @@ def aperture_weights(
     """Return what blocks, and the pixels of the patch, count in sums over apertures.
 
     The sum a'x of a weighted image over pixels x = W b, where b are blocks and W enlarges them, is (a'W) b:
-    so its variance is (a'W)² times those of the blocks, which are independent of each other.
+    so its variance is that of a sum over blocks (`light.averages.BlockVariance.of_sums`).
 
     Parameters
     ----------

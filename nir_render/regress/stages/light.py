@@ -69,7 +69,9 @@ def compare_indirect(
     if old != new:
         return [_failed(f"{label}film", f"{old[-1]} × {old[-2]} → {new[-1]} × {new[-2]} pixels")], []
     tests = list(_film_tests(reference, before, after, _names(light), label, alike))
-    findings: list[Finding] = []
+    findings = _averaging_findings(before, after, label)
+    if before.multiple is not None and after.multiple is not None:
+        tests += _multiple_tests(before, after, _names(light), label, alike)
     if alike and own_samples:
         finding, path_tests = _path_tests(reference, before, after, _names(light), label, own_samples)
         findings.append(finding)
@@ -157,6 +159,42 @@ def _film_tests(
         error = parts.error[: parts.tiles].reshape(tiles[0], tiles[1])
         pair = ImagePair(f"{label}{name}", UNIT, one.mean, other.mean, error)
         yield GroupTests(f"{label}{name}", parts, before.scale, pair)
+
+
+def _averaging_findings(before: Indirect, after: Indirect, label: str) -> list[Finding]:
+    """Return what is to be said of blocks whose light of many turns is averaged; nothing where none is."""
+    what = f"{label}averaged blocks"
+    if after.multiple is None:
+        return [] if before.multiple is None else [_failed(what, "there are none any more")]
+    if before.multiple is None:
+        words = "the reference has none: 'nir-render regress update --all' adds them"
+        return [Finding("transport", what, "skipped", words)]
+    old, new = before.multiple.surface >= 0, after.multiple.surface >= 0
+    others, allowed = int((old != new).sum()), _EDGE_PIXELS + int(_EDGE_SHARE * old.sum())
+    words = f"{others} of {int(old.sum())} are others"
+    outcome: Word = "fail" if others > allowed else "pass"
+    same = np.array_equal(before.multiple.surface, after.multiple.surface)
+    return [Finding("transport", what, outcome, words, f"{allowed + 1} others", same_bits=same)]
+
+
+def _multiple_tests(
+    before: Indirect, after: Indirect, names: list[str], label: str, alike: bool
+) -> Iterator[GroupTests]:
+    """Compare the light of many turns, group by group; it is in the whole light, too."""
+    assert before.multiple is not None  # the caller has looked
+    assert after.multiple is not None
+    parts = (before.multiple, before.samples), (after.multiple, after.samples)
+    for group, name in enumerate(names):
+        one, other = (
+            MonteCarloImage(
+                by_group_and_node(part.radiance_per_w)[group].astype(np.float64),
+                by_group_and_node(part.variance)[group].astype(np.float64),
+                samples,
+            )
+            for part, samples in parts
+        )
+        tests = compare_parts(one, other, None, alike=alike)
+        yield GroupTests(f"{label}{name}, turned often", tests, before.scale, None)
 
 
 def _path_tests(

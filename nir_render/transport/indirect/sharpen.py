@@ -17,7 +17,7 @@ from nir_render.transport.world.medium import medium
 FLARE_PILOT_SAMPLES = 256
 MULTIPLE = 0
 """In place of a scale: light of many turns."""
-_FEWER_SAMPLES = 16
+_FEWER_SAMPLES = 16  # as an average over 5 × 5 blocks has a nineteenth of a block's variance
 # Fog that throws more than this of the light scattered once, over straight light and optical depth, within
 # half a block of a source has halos that blocks smear: so many blocks about each are rendered by the pixel.
 _SHARP_SHARE, _HALO_BLOCKS = 0.04, 3.0
