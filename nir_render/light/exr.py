@@ -6,9 +6,9 @@ with the variance of each mean. Values are per watt of the group (`perWattOf`): 
 declared unit. Where the samples differ from pixel to pixel, a part `samples` counts them. The direct part has
 no pixels; it goes beside the image as a table.
 
-The pixels are those that were rendered: `scale` × `scale` of the camera's. What keeps edges sharp when a
-frame is made of them (`Indirect.edges`) is left out, as the attribute `edges` says, and so is what is averaged
-over blocks in fog (`Indirect.multiple`), as `averaged` says: values and variances here are those before, of
+The pixels are those that were rendered: `scale` × `scale` of the camera's. What keeps edges sharp in frames
+made of them (`Indirect.edges`) is left out, as the attribute `edges` says, and so is what is averaged over
+blocks in fog (`Indirect.multiple`), as `averaged` says: values and variances here are those before, of
 independent blocks. A light cache keeps all of it.
 """
 
