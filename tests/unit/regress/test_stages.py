@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import nir_render as nr
-from nir_render.light.light import DirectTable, Indirect, Light
+from nir_render.light.light import DirectTable, Indirect, Light, Multiple
 from nir_render.regress.checking import check_scenes
 from nir_render.regress.findings import percent
 from nir_render.regress.make import detections_of, electrons_of, frame_of, frame_settings
@@ -95,6 +95,47 @@ def _light_finding(
 def test_indirect_light() -> None:
     assert _light_finding(0.05).startswith("pass: frame ")
     assert _light_finding(0.0505).startswith("fail: +1.0 % in rows 0–15, columns 0–15; frame +0.89 %")
+
+
+def _turned(light: Light, level: float, noise: float, seed: int, surface: int = 0) -> Light:
+    """The light, a part of which was turned often and is averaged."""
+    assert light.indirect is not None
+    draw = np.random.default_rng(seed).standard_normal(light.indirect.radiance_per_w.shape)
+    mean = (level * (1.0 + noise * draw)).astype(np.float32)
+    numbers = np.zeros(mean.shape[2:], dtype=np.int32)
+    numbers[0, :surface] = -1
+    multiple = Multiple(mean, np.full_like(mean, (noise * level) ** 2), np.zeros_like(mean), numbers)
+    return replace(light, indirect=replace(light.indirect, multiple=multiple))
+
+
+def test_light_of_many_turns_is_held_apart_in_level_and_in_where_it_is_averaged() -> None:
+    """3 % less of what is a tenth of all light is 0.3 % of the whole, within its noise."""
+    reference = cases.light(noise=0.005)
+    assert reference.indirect is not None
+    reference = replace(reference, indirect=replace(reference.indirect, samples=256))
+    known = ReferenceLight(_turned(reference, 0.005, 0.005, 2), None, None, "")
+
+    def said(light: Light) -> dict[str, str]:
+        findings, pending = compare_indirect(known, light, "", alike=True)
+        verdicts = judge([one.parts for one in pending], 1e-3)
+        findings += [
+            finding_of(one, verdict, same_bits=None, must_be_same=False)
+            for one, verdict in zip(pending, verdicts, strict=True)
+        ]
+        return {one.what: f"{one.verdict}: {one.seen}" for one in findings}
+
+    light = cases.light(noise=0.02, seed=1)
+    same = said(_turned(light, 0.005, 0.02, 3))
+    assert [text.split(":")[0] for text in same.values()] == ["pass"] * 3
+    assert same["averaged blocks"] == "pass: 0 of 768 are others"
+    less = said(_turned(light, 0.00485, 0.02, 3))
+    assert less["r2.top"].startswith("pass")
+    assert less["r2.top, turned often"].startswith("fail: −2.9 %")
+    assert said(_turned(light, 0.005, 0.02, 3, surface=20))["averaged blocks"] == "fail: 20 of 768 are others"
+    assert said(light)["averaged blocks"] == "fail: there are none any more"
+    older = ReferenceLight(reference, None, None, "")
+    (finding,), _ = compare_indirect(older, _turned(light, 0.005, 0.02, 3), "", alike=True)
+    assert finding.verdict == "skipped"
 
 
 def test_light_with_the_references_own_bits_passes_and_must_where_it_is_owed() -> None:
