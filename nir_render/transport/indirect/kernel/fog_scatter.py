@@ -59,7 +59,7 @@ class FogScattering:
     lost: Float
     place: Point
     weight: Float
-    turns: Mask
+    may_turn: Mask
 
 
 def scatter_on_stretch(

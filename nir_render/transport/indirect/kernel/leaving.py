@@ -94,7 +94,7 @@ def leave_in_fog(
     assert fog is not None  # only called in fog
     lost = scattering.lost
     chance = dr.select(surface, _TURNS * lost / (1.0 + (_TURNS - 1.0) * lost), 1.0)
-    chance = dr.select(scattering.turns, chance, 0.0)
+    chance = dr.select(scattering.may_turn, chance, 0.0)
     turned = number(draws.FLIGHT) < chance
 
     rough = surface & ~turned & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
