@@ -197,6 +197,7 @@ def _reference_light(
     many = replace(
         own.indirect, radiance_per_w=film.mean(), variance=film.variance(), samples=renders * samples
     )
+    third_multiple = None
     if own.indirect.multiple is not None:
         many = replace(
             many,
@@ -207,6 +208,7 @@ def _reference_light(
                 covariance=shared.variance(),
             ),
         )
+        third_multiple = tile_sums(by_group_and_node(turned.third()), TILE_PX) * samples**2
     third_edges = None
     if own.indirect.edges is not None:
         many = replace(
@@ -216,7 +218,8 @@ def _reference_light(
         third_edges = tile_sums(edge_image(by_group_and_node(edges.third())), TILE_PX) * samples**2
     third = tile_sums(by_group_and_node(film.third()), TILE_PX) * samples**2
     radiance = own.indirect.radiance_per_w
-    return ReferenceLight(replace(own, indirect=many), third, third_edges, light_hash(own), radiance)
+    light = replace(own, indirect=many)
+    return ReferenceLight(light, third, third_edges, light_hash(own), radiance, third_multiple)
 
 
 class _Moments:

@@ -46,6 +46,8 @@ class ReferenceLight:
     own_radiance_per_w
         The indirect light of that, shape as of `light`'s, pixels along edges apart; None without, and in
         older references.
+    third_multiple
+        As `third`, of the light of many turns alone; None where nothing is averaged.
     """
 
     light: Light
@@ -53,6 +55,7 @@ class ReferenceLight:
     third_edges: NDArray[np.float64] | None
     own_hash: str
     own_radiance_per_w: NDArray[np.float32] | None = None
+    third_multiple: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)

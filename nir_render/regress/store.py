@@ -132,7 +132,7 @@ def _write(folder: Path, reference: Reference) -> None:
         lights.append({"file": f"light.{number}.npz", "own_sha256": one.own_hash})
         if one.own_radiance_per_w is not None:
             own[str(number)] = one.own_radiance_per_w
-        parts = {"film": one.third, "edges": one.third_edges}
+        parts = {"film": one.third, "edges": one.third_edges, "multiple": one.third_multiple}
         thirds |= {f"{part}.{number}": array for part, array in parts.items() if array is not None}
     if thirds:
         run_folder.write_file(folder / "third.npz", _archive(thirds))
@@ -181,6 +181,7 @@ def _read(folder: Path) -> Reference:
             light=read_light(folder / one["file"]),
             third=thirds.get(f"film.{number}"),
             third_edges=thirds.get(f"edges.{number}"),
+            third_multiple=thirds.get(f"multiple.{number}"),
             own_hash=one["own_sha256"],
             own_radiance_per_w=own.get(str(number)),
         )

@@ -71,7 +71,7 @@ def compare_indirect(
     tests = list(_film_tests(reference, before, after, _names(light), label, alike))
     findings = _averaging_findings(before, after, label)
     if before.multiple is not None and after.multiple is not None:
-        tests += _multiple_tests(before, after, _names(light), label, alike)
+        tests += _multiple_tests(reference, before, after, _names(light), label, alike)
     if alike and own_samples:
         finding, path_tests = _path_tests(reference, before, after, _names(light), label, own_samples)
         findings.append(finding)
@@ -178,7 +178,12 @@ def _averaging_findings(before: Indirect, after: Indirect, label: str) -> list[F
 
 
 def _multiple_tests(
-    before: Indirect, after: Indirect, names: list[str], label: str, alike: bool
+    reference: ReferenceLight,
+    before: Indirect,
+    after: Indirect,
+    names: list[str],
+    label: str,
+    alike: bool,
 ) -> Iterator[GroupTests]:
     """Compare the light of many turns, group by group; it is in the whole light, too."""
     assert before.multiple is not None  # the caller has looked
@@ -193,7 +198,8 @@ def _multiple_tests(
             )
             for part, samples in parts
         )
-        tests = compare_parts(one, other, None, alike=alike)
+        third = None if reference.third_multiple is None else reference.third_multiple[group]
+        tests = compare_parts(one, other, third, alike=alike)
         yield GroupTests(f"{label}{name}, turned often", tests, before.scale, None)
 
 
