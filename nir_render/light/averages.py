@@ -1,8 +1,8 @@
 """Light of many turns, averaged over blocks of pixels around: what that makes of its noise.
 
-What has been turned twice or more changes slowly over a surface. In a block it is the value there of the
-plane that fits the blocks around best, of the same surface alone; other light is each block's own. Averages
-of neighbours share noise: of sums over blocks with weights a it is, by the rest r and the averaged part m of
+What fog has turned twice or more changes slowly over a surface. In a block it is the value there of the plane
+that fits the blocks around best, of the same surface alone; other light is each block's own. Averages of
+neighbours share noise: of sums over blocks with weights a it is, by the rest r and the averaged part m of
 each, with A the averages, Var Σ a r + (A'a) m.
 """
 
@@ -75,7 +75,7 @@ def averages(surface: NDArray[np.int32]) -> Averages:
 
 @lru_cache(maxsize=_KEPT)
 def _averages(shape: tuple[int, int], numbers: bytes) -> Averages:
-    surface = np.frombuffer(numbers, dtype=np.int32).reshape(shape)
+    surface = np.frombuffer(numbers, dtype=np.int32).reshape(shape).copy()
     _, weight, _ = fit_planes(surface, np.arange(surface.size), surface.ravel(), 1, shape[1])
     alone = surface.ravel() < 0
     weight[alone] = 0.0

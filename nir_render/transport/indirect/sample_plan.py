@@ -65,11 +65,7 @@ _SLIGHT = 1e-3  # what counts less in a sum than this, the largest being 1, is n
 
 
 def samples_map(
-    pilot: Light,
-    flares: Light,
-    snapshot: Snapshot,
-    noise_share: float,
-    shape: tuple[int, int],
+    pilot: Light, flares: Light, snapshot: Snapshot, noise_share: float, shape: tuple[int, int]
 ) -> NDArray[np.int64]:
     """Return the samples for each pixel of the film, and those wanted without bounds, (2, rows, columns).
 
@@ -86,9 +82,8 @@ def samples_map(
     """
     assert pilot.indirect is not None  # without indirect light nothing is sampled
     camera = snapshot.camera(pilot.camera).camera
-    plain = replace(
-        pilot, indirect=replace(pilot.indirect, multiple=None)
-    )  # a pilot's pixels are no neighbours
+    # The pixels of a pilot are no neighbours: nothing is averaged in its frame.
+    plain = replace(pilot, indirect=replace(pilot.indirect, multiple=None))
     rates = electron_rates(plain, snapshot, _lit_together(pilot, snapshot))
     exposure_s = planned_exposure_s(camera, float(fully_lit_frame(rates, 1.0).electrons.max()))
     sensor_e2 = temporal_variance_e2(fully_lit_frame(rates, exposure_s))
