@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nir_render.light.light import Edges, Indirect, Light
+from nir_render.light.light import Edges, Indirect, Light, Multiple
 from nir_render.regress.findings import Finding, ImagePair, Word, percent
 from nir_render.regress.reference import ReferenceLight, by_group_and_node, edge_image
 from nir_render.regress.statistics import (
@@ -145,20 +145,20 @@ def _film_tests(
     alike: bool,
 ) -> Iterator[GroupTests]:
     for group, name in enumerate(names):
-        one, other = (
-            MonteCarloImage(
-                by_group_and_node(light.radiance_per_w)[group].astype(np.float64),
-                by_group_and_node(light.variance)[group].astype(np.float64),
-                light.samples,
-            )
-            for light in (before, after)
-        )
+        one, other = (_film_image(light, light.samples, group) for light in (before, after))
         third = None if reference.third is None else reference.third[group]
         parts = compare_parts(one, other, third, alike=alike)
         tiles = -(-np.array(one.mean.shape) // TILE_PX)
         error = parts.error[: parts.tiles].reshape(tiles[0], tiles[1])
         pair = ImagePair(f"{label}{name}", UNIT, one.mean, other.mean, error)
         yield GroupTests(f"{label}{name}", parts, before.scale, pair)
+
+
+def _film_image(light: Indirect | Multiple, samples: int, group: int) -> MonteCarloImage:
+    mean, variance = (
+        by_group_and_node(array)[group].astype(np.float64) for array in (light.radiance_per_w, light.variance)
+    )
+    return MonteCarloImage(mean, variance, samples)
 
 
 def _averaging_findings(before: Indirect, after: Indirect, label: str) -> list[Finding]:
@@ -190,14 +190,7 @@ def _multiple_tests(
     assert after.multiple is not None
     parts = (before.multiple, before.samples), (after.multiple, after.samples)
     for group, name in enumerate(names):
-        one, other = (
-            MonteCarloImage(
-                by_group_and_node(part.radiance_per_w)[group].astype(np.float64),
-                by_group_and_node(part.variance)[group].astype(np.float64),
-                samples,
-            )
-            for part, samples in parts
-        )
+        one, other = (_film_image(part, samples, group) for part, samples in parts)
         third = None if reference.third_multiple is None else reference.third_multiple[group]
         tests = compare_parts(one, other, third, alike=alike)
         yield GroupTests(f"{label}{name}, turned often", tests, before.scale, None)

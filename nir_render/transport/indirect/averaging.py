@@ -6,12 +6,14 @@ reflectance and where nothing is seen but fog, as far as the fog in front change
 block.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.light.averages import averages
+from nir_render.light.light import Multiple
 from nir_render.light.planes import REACH
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.indirect.enlargement import Labels, labels_of_blocks
@@ -36,6 +38,11 @@ class Averaging:
 
     surface: NDArray[np.int32]
     narrow: float
+
+    def multiple(self, apart: Sequence[NDArray[np.float32]]) -> Multiple:
+        """Return light of many turns, of its mean, its variance, and the covariance with the rest."""
+        radiance_per_w, variance, covariance = apart
+        return Multiple(radiance_per_w, variance, covariance, self.surface)
 
     def without(self, pixels: NDArray[np.int32], columns: int, scale: int) -> "Averaging":
         """Return what is averaged where blocks with some pixels, numbered row by row, stand alone."""
@@ -66,9 +73,7 @@ def averaging_of(
     surface = np.where((pure >= 0) & labels.even[pure], pure, -1).astype(np.int32)
     if not (surface >= 0).any():
         return None
-    at = corners[::scale, ::scale]
-    direction = at[:-1, :-1] + at[:-1, 1:] + at[1:, :-1] + at[1:, 1:]
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = middle_directions(corners[::scale, ::scale])
     rows, columns = surface.shape
     nearness_per_m = labels.nearness_per_m.reshape(rows, scale, columns, scale).mean(axis=(1, 3)).ravel()
     length_m = 1.0 / np.maximum(nearness_per_m, 1.0 / _FAR_M)
@@ -80,8 +85,21 @@ def averaging_of(
 
 def narrow_versine(corners: NDArray[np.float64], scale: int) -> float:
     """Return 1 − cos of the angle over all the blocks that an average is made of, in the image's middle."""
+    return 1.0 - float(np.cos(min(_NARROW_BLOCKS * scale * pixel_angle_rad(corners), np.pi)))
+
+
+def pixel_angle_rad(corners: NDArray[np.float64]) -> float:
+    """Return the angle that a pixel fills in the image's middle, of corners of pixels."""
     row, column = (count // 2 for count in corners.shape[:2])
-    beside = corners[row, column - 1 : column + 1]
-    first, second = beside / np.linalg.norm(beside, axis=1, keepdims=True)
-    angle_rad = _NARROW_BLOCKS * scale * float(np.linalg.norm(second - first))
-    return 1.0 - float(np.cos(min(angle_rad, np.pi)))
+    first, second = unit(corners[row, column - 1 : column + 1])
+    return float(np.linalg.norm(second - first))
+
+
+def middle_directions(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit vectors to the middles of pixels or blocks that have these corners."""
+    return unit(corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1] + corners[1:, 1:])
+
+
+def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors along the last axis as unit vectors."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.camera.optics.lens import corner_directions
-from nir_render.light.light import Indirect, Multiple
+from nir_render.light.light import Indirect
 from nir_render.scene.bodies import place_of_shape
 from nir_render.scene.documents.camera import Camera
 from nir_render.scene.documents.document import CLEAR_DEPTH
@@ -131,7 +131,7 @@ def indirect(
         scale=settings.scale,
         samples=int(np.median(counts)),
         counts=None if (counts == counts.flat[0]).all() else counts.astype(np.int32),
-        multiple=None if averaging is None else Multiple(apart[0], apart[1], apart[2], averaging.surface),
+        multiple=None if averaging is None else averaging.multiple(apart),
     )
 
 
@@ -153,9 +153,7 @@ def pilot(
     narrow = None if averaging is None else averaging.narrow
     arrays = render_pixels(snapshot, built, rays, seed, pixels, counts, scale, narrow=narrow)
     radiance, variance, *apart = (array.reshape(*array.shape[:2], row.size, column.size) for array in arrays)
-    multiple = None
-    if averaging is not None:
-        multiple = Multiple(apart[0], apart[1], apart[2], averaging.surface)
+    multiple = None if averaging is None else averaging.multiple(apart)
     return Indirect(radiance, variance, scale * step, PILOT_SAMPLES, multiple=multiple)
 
 

@@ -6,10 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nir_render.light.enlarge import Enlargement, with_patch
-from nir_render.light.light import Edges, Indirect, Multiple
+from nir_render.light.light import Edges, Indirect
 from nir_render.scene.snapshot import Snapshot
 from nir_render.transport.indirect import groups
-from nir_render.transport.indirect.averaging import Averaging, narrow_versine
+from nir_render.transport.indirect.averaging import (
+    Averaging,
+    middle_directions,
+    narrow_versine,
+    pixel_angle_rad,
+    unit,
+)
 from nir_render.transport.indirect.enlargement import Labels, fit_enlargement
 from nir_render.transport.indirect.kernel.tables import DeviceScene
 from nir_render.transport.world.medium import medium
@@ -51,7 +57,7 @@ def pixels_in_glow(
     """
     rows, columns = labels.middle.shape
     grid = rays.corners[::scale, ::scale]
-    blocks = _middles(grid)
+    blocks = middle_directions(grid)
     # How near each block's nearest surface is to a source, over what counts as near there.
     nearest = np.full((rows // scale, columns // scale), np.inf)
     for source in snapshot.sources.values():
@@ -61,7 +67,7 @@ def pixels_in_glow(
         radius_rad = float(np.arcsin(min(radius_m / distance_m, 1.0)))
         cosine = blocks @ towards
         row, column = np.unravel_index(np.argmax(cosine), cosine.shape)
-        corner, right, below = _unit(grid[[row, row, row + 1], [column, column + 1, column]])
+        corner, right, below = unit(grid[[row, row, row + 1], [column, column + 1, column]])
         chord = max(float(np.linalg.norm(right - corner)), float(np.linalg.norm(below - corner)))
         block_rad = 2.0 * float(np.arcsin(min(0.5 * chord, 1.0)))
         reach_rad = radius_rad + (_GLOW_BLOCKS + 1.0) * block_rad
@@ -71,7 +77,7 @@ def pixels_in_glow(
         block = np.s_[near_row.min() : near_row.max() + 1, near_column.min() : near_column.max() + 1]
         at = tuple(slice(one.start * scale, one.stop * scale) for one in block)
         corners = rays.corners[at[0].start : at[0].stop + 1, at[1].start : at[1].stop + 1]
-        direction = _middles(corners)
+        direction = middle_directions(corners)
         nearness_per_m = labels.nearness_per_m[at]
         along_m = 1.0 / np.maximum(nearness_per_m, 1e-12)
         apart_m = np.linalg.norm(direction * along_m[..., None] - offset_m, axis=-1) - radius_m
@@ -91,15 +97,6 @@ def pixels_in_glow(
     return pixels, (len(glowing) - len(kept)) * scale**2
 
 
-def _middles(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unit vectors to the middles of pixels or blocks that have these corners."""
-    return _unit(corners[:-1, :-1] + corners[:-1, 1:] + corners[1:, :-1] + corners[1:, 1:])
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
 def halo_reach_px(snapshot: Snapshot, rays: groups.Rays, scale: int) -> float:
     """Return how far about flares pixels are rendered one by one, as fog's halos are sharper than blocks.
 
@@ -108,10 +105,7 @@ def halo_reach_px(snapshot: Snapshot, rays: groups.Rays, scale: int) -> float:
     fog = medium(snapshot)
     if fog is None or scale == 1:
         return 0.0
-    row, column = (count // 2 for count in rays.corners.shape[:2])
-    beside = rays.corners[row, column - 1 : column + 1]
-    first, second = beside / np.linalg.norm(beside, axis=1, keepdims=True)
-    half_block_rad = 0.5 * scale * float(np.linalg.norm(second - first))
+    half_block_rad = 0.5 * scale * pixel_angle_rad(rays.corners)
     within = 2.0 * np.pi * half_block_rad * fog.albedo * float(fog.phase.arc[-1])
     return _HALO_BLOCKS * scale if within > _SHARP_SHARE else 0.0
 
@@ -175,9 +169,7 @@ def flare_pilot(
     narrow = None if averaging is None else averaging.narrow
     radiance, variance, *apart = (array[:, :, None] for array in rendered("blocks", blocks, scale, narrow))
     edges = Edges(enlargement, *rendered("edges", enlargement.patch.astype(np.int64), 1, None))
-    multiple = None
-    if averaging is not None:
-        multiple = Multiple(apart[0], apart[1], apart[2], averaging.surface)
+    multiple = None if averaging is None else averaging.multiple(apart)
     return Indirect(radiance, variance, scale, samples, edges=edges, multiple=multiple)
 
 
