@@ -13,7 +13,7 @@ from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
-from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
+from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks, summit
 from perception.robust.search.frame import levels_around
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
@@ -27,6 +27,7 @@ MOST_FLARES = 1000
 
 _AT_ONCE = 8  # clusters between two looks at the clock
 _RING_PX = 4
+_SUMMIT_REACH = 4.0  # σ of the point spread: three of what it is filtered to, √2 times as wide
 _FEWEST_RING_PIXELS = 8
 
 
@@ -200,7 +201,17 @@ def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Bl
     """Divide a component, on such a background, at maxima that differ by more than their noise."""
     expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
-    return split_at_peaks(component, noise_e)
+    parts = split_at_peaks(component, noise_e)
+    if prepared.texture_e is None:
+        return parts
+    reach_px = math.ceil(_SUMMIT_REACH * math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0))
+    return [_summit(part, float(noise_e.max()), reach_px, prepared) for part in parts]
+
+
+def _summit(part: Blob, noise_e: float, reach_px: int, prepared: PreparedFrame) -> Blob:
+    """Cut what stands on the background's structure off it; what is clipped stays whole."""
+    clips = part.pixels & (prepared.pixels.data_dn[part.box.slices] >= prepared.clipped_dn)
+    return part if clips.any() else summit(part, noise_e, reach_px)
 
 
 def _detection(

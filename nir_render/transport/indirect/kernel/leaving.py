@@ -33,6 +33,8 @@ from nir_render.transport.world.emitters import SKY, SUN
 # Shares of directions that go into the halo of a light, from surfaces in fog and from fog itself. Each turn
 # that misses the halo weighs by one over what is left: near 1 it must be, as paths turn often.
 _FROM_SURFACE, _FROM_FOG = 0.5, 0.15
+_FROM_FOG_IN_SUN = 0.07
+_INTO_SUN, _AHEAD_PER_SR = 0.5, 3.0  # of a path that heads for the sun, as far as the phase function is so much
 # So many times more often than light do paths turn in fog: what comes of it varies more than what comes from
 # surfaces.
 _TURNS = 1.5
@@ -138,6 +140,8 @@ def _shares_into_halos(scene: DeviceScene, state: PathState) -> tuple[Float, Flo
     """Return the shares of directions from fog and from surfaces that go into halos: 0 for the sky alone."""
     share = towards_lights(state)
     lights, shares = scene.lights, (_FROM_FOG * share, _FROM_SURFACE * share)
+    if lights.sun >= 0:
+        shares = _share_into_sun(scene, state, shares[0]), shares[1]
     if not lights.sky_alone:
         return shares
     if state.tier is None:
@@ -145,6 +149,24 @@ def _shares_into_halos(scene: DeviceScene, state: PathState) -> tuple[Float, Flo
     serves = state.tier == dr.gather(mi.UInt32, lights.tier, mi.UInt32(lights.sky))
     from_fog, from_surface = (dr.select(serves, 0.0, share) for share in shares)
     return from_fog, from_surface
+
+
+def _share_into_sun(scene: DeviceScene, state: PathState, else_share: Float) -> Float:
+    """Return the share of directions from fog that go into halos, where the sun is among the lights.
+
+    Droplets turn light by little, and so comes most of what is near the sun after several turns; what the
+    phase function draws next brings much where it comes nearer to the sun, and that is seldom.
+    """
+    fog, lights = scene.fog, scene.lights
+    assert fog is not None  # only in fog
+    ahead = phase_function(
+        fog, versine(state.direction, dr.gather(mi.Vector3f, lights.normal, mi.UInt32(lights.sun)))
+    )
+    share = dr.maximum(_FROM_FOG_IN_SUN, _INTO_SUN * ahead / (ahead + _AHEAD_PER_SR))
+    if state.tier is None:
+        return mi.Float(share)
+    serves = state.tier == dr.gather(mi.UInt32, lights.tier, mi.UInt32(lights.sun))
+    return mi.Float(dr.select(serves, share, else_share))
 
 
 class _Halos:
@@ -184,19 +206,24 @@ class _Halos:
         sine, cosine = dr.sincos(draw_angle(self.fog, self.fog.halo, u))
         sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * v)
         axis, _ = self._axis(self.row)
-        return mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, cosine))
+        of_halo = mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, cosine))
+        if self.lights.sun < 0:
+            return mi.Vector3f(of_halo)
+        return mi.Vector3f(
+            dr.select(self._is_sun(self.row), draw_scattering(self.fog, axis, u, v), of_halo)
+        )
 
     def density(self, direction: Vector) -> Float:
         """Return the density per sr with which `direction` draws a unit direction."""
         if self.total is None:
-            return self._density(self._axis(self.row)[0], direction)
+            return self._density(self.row, self._axis(self.row)[0], direction)
 
         def more(k: UInt, _sum: Float) -> Mask:
             return k < self.count
 
         def add(k: UInt, density: Float) -> tuple[UInt, Float]:
             row, weight = self._weighed(k)
-            return k + 1, density + weight * self._density(self._axis(row)[0], direction)
+            return k + 1, density + weight * self._density(row, self._axis(row)[0], direction)
 
         width = dr.width(direction)
         start = (dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width))
@@ -213,7 +240,7 @@ class _Halos:
             kind = dr.gather(mi.UInt32, self.lights.kind, row, self.active)
             weight = dr.select(kind == SKY, 0.0, weight)
         ahead = phase_function(self.fog, versine(self.heading, axis)) + dr.minimum(
-            self._density(axis, self.heading), _BRIGHTEST_PER_SR
+            self._density(row, axis, self.heading), _BRIGHTEST_PER_SR
         )
         return row, dr.maximum(dr.select(self.turned, weight * ahead, weight), 1e-12)
 
@@ -221,13 +248,21 @@ class _Halos:
         """Return the direction of a light, and its distance; the sun counts as a metre away."""
         to = dr.gather(mi.Point3f, self.lights.center, row, self.active) - self.place
         if self.lights.sun >= 0:
-            sun = dr.gather(mi.UInt32, self.lights.kind, row, self.active) == SUN
-            to = dr.select(sun, dr.gather(mi.Vector3f, self.lights.normal, row, self.active), to)
+            to = dr.select(self._is_sun(row), dr.gather(mi.Vector3f, self.lights.normal, row, self.active), to)
         distance = dr.maximum(dr.norm(to), 1e-9)
         return mi.Vector3f(to) / distance, distance
 
-    def _density(self, axis: Vector, direction: Vector) -> Float:
-        """Return the density per sr around one light: that of the angle θ off it over 2π sin θ."""
+    def _density(self, row: UInt, axis: Vector, direction: Vector) -> Float:
+        """Return the density per sr around one light: that of the angle θ off it over 2π sin θ.
+
+        What the sun has around it comes from far: it shines as the phase function does.
+        """
         across = dr.norm(dr.cross(direction, axis))
         angle = dr.atan2(across, dr.dot(direction, axis))
-        return table_slope(self.fog, self.fog.halo, angle) / (2.0 * dr.pi * dr.maximum(across, 1e-7))
+        density = table_slope(self.fog, self.fog.halo, angle) / (2.0 * dr.pi * dr.maximum(across, 1e-7))
+        if self.lights.sun < 0:
+            return density
+        return dr.select(self._is_sun(row), phase_function(self.fog, versine(axis, direction)), density)
+
+    def _is_sun(self, row: UInt) -> Mask:
+        return dr.gather(mi.UInt32, self.lights.kind, row, self.active) == SUN
