@@ -173,6 +173,8 @@ def summit(blob: Blob, noise_e: float, reach_px: int) -> Blob:
     reach_px
         How far a point's image reaches beyond its half maximum.
     """
+    if not blob.peak_e > 0.0:  # brighter than what lies beside it alone, in a dark trough
+        return blob
     top = _part_with_peak(blob, 0.5 * blob.peak_e)
     near = _widened(top, reach_px)
     beyond = blob.pixels & ~near

@@ -1,7 +1,8 @@
 """How a path leaves a vertex, on a surface or in fog, on the device.
 
-Seen from a place, fog that scatters a light's light shines about as 1/θ, θ being the angle off the light. A
-path that only now and then goes there brings much at once; so some directions are drawn by that shine.
+Seen from a place, fog that scatters a light's light shines about as 1/θ, θ being the angle off the light, and
+as the phase function about the sun. A path that only now and then goes there brings much at once; so some
+directions are drawn by that shine.
 """
 
 from dataclasses import dataclass

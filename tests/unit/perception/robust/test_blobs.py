@@ -2,7 +2,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.robust.search.blobs import Blob, components, split_at_peaks
+from perception.robust.search.blobs import Blob, components, split_at_peaks, summit
 
 
 def hill(*tops: tuple[float, float, float], width: int = 30) -> NDArray[np.float32]:
@@ -58,3 +58,17 @@ def test_a_plateau_with_ripples_is_one() -> None:
     ).astype(np.float32)
     blob = Blob(PixelBox(0, 0, 20, 30), np.asarray(image > 500.0), image)
     assert split_at_peaks(blob, np.sqrt(image + 1)) == [blob]
+
+
+def test_a_flare_is_cut_off_the_hill_that_it_stands_on() -> None:
+    """A glow of 20 along a whole strip and a flare of 100 in it; the strip alone, and the flare alone, stay whole."""
+    strip = np.tile(20.0 * np.exp(-0.5 * ((np.arange(20.0) - 10.0) / 4.0) ** 2)[:, None], (1, 60)).astype(np.float32)
+    flare = hill((40.0, 10.0, 100.0), width=60)
+    (on_strip, strip_alone, alone) = (whole(image) for image in (strip + flare, strip, flare))
+    cut = summit(on_strip, 1.0, 5)
+    assert cut.pixels[10 - (cut.box.top - 100), 40 - (cut.box.left - 200)]
+    assert (cut.box.height, cut.box.width) == (5, 5)
+    # What is cut out is what exceeds the strip's ridge by 3 σ, in one piece.
+    assert cut.area_px == np.count_nonzero(((strip + flare) > 23.0))
+    assert summit(strip_alone, 1.0, 5) is strip_alone
+    assert summit(alone, 1.0, 5) is alone

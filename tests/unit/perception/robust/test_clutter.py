@@ -13,7 +13,7 @@ from perception.robust.search.limit import point_kernel
 from perception.robust.search.prepare import bad_pixels
 from perception.robust.search.structure import autocorrelation, structure_of
 from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, cell_centres, frame_of, textured
-from tests.unit.perception.simulation import expected_e, expose, random
+from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 EMPTY = (
     "60 stuck pixels",
@@ -56,6 +56,38 @@ def test_flares_on_texture_are_found_and_their_sigmas_know_of_it(correlation_px:
     result = textured(correlation_px, frames=1)
     assert (result["recall"], result["false_alarms"]) == (1.0, 0)
     assert result["pull_rms_u_v"] == pytest.approx([1.0, 1.0], abs=4.0 / math.sqrt(2 * 81))
+
+
+@pytest.mark.parametrize("glow_e", [100.0, 250.0])
+def test_flares_before_a_bright_horizon_are_found(glow_e: float) -> None:
+    """Sources 2.5 to 20 px above a horizon and below it, before a glow as fog in the sun has, 12 px high.
+
+    Without cutting them off that glow half and two thirds were lost. From 6.5 px on, where no step is near,
+    pulls are those of noise: root mean square 1, of 2 × 7 flares.
+    """
+    rows, columns = np.arange(960.0)[:, None], np.arange(1280.0)
+    glow = 30.0 + glow_e * np.exp(-(478.5 - rows) / 12.0)
+    side = 0.4 + 0.6 * np.exp(-(((columns - 300.0) / 350.0) ** 2))
+    ground_e = np.where(rows < 478.5, glow * side, 45.0 + 10.0 * np.exp(-(rows - 478.5) / 60.0))
+    camera, above_px = calibration(), (2.5, 3.5, 5.0, 6.5, 8.0, 10.0, 13.0, 16.0, 20.0, -6.5)
+    lost, pulls = 0, []
+    for frame in range(2):
+        places = [
+            (120.0 + 110.0 * k + random(7, frame, k).uniform(-20.0, 20.0), 478.5 - above)
+            for k, above in enumerate(above_px[5 * frame :] + above_px[: 5 * frame])
+        ]
+        image_e = expected_e(camera, [(u, v, 7.0) for u, v in places], 3e-4) + ground_e
+        found = perception.detect(expose(image_e, camera, random(8, frame), 3e-4), camera)
+        for u, v in places:
+            hits = [one for one in found if math.hypot(one.u_px - u, one.v_px - v) < 1.0]
+            lost += not hits
+            if hits and abs(478.5 - v) > 6.0:
+                (hit,) = hits
+                pulls += [(hit.u_px - u) / hit.u_sigma_px, (hit.v_px - v) / hit.v_sigma_px]
+                pulls.append((hit.range_m - 7.0) / hit.range_sigma_m)
+        assert len(found) <= len(places)
+    assert lost == 0
+    assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1.0, abs=4.0 / math.sqrt(2 * len(pulls)))
 
 
 @pytest.mark.parametrize("times", [3, 50])
