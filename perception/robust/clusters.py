@@ -310,13 +310,3 @@ def _window_box(members: Sequence[Candidate], prepared: PreparedFrame) -> PixelB
     least = max(bottom - top, right - left) + 2 * margin
     side = next((side for side in _SIDES_PX if side >= least), least)
     return PixelBox((top + bottom - side) // 2, (left + right - side) // 2, side, side)
-
-
-def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
-    """Widen a mask by some pixels in each direction, corners too."""
-    import cv2
-
-    if not mask.any():
-        return mask
-    kernel = np.ones((2 * by_px + 1, 2 * by_px + 1), dtype=np.uint8)
-    return np.asarray(cv2.dilate(mask.view(np.uint8), kernel), dtype=bool).reshape(mask.shape)

@@ -52,7 +52,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     Detections
         From top to bottom; `truncated` where time, or the number of blobs or of flares in one, ended the
         search, and with the `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above
-        the detection limit.
+        the detection limit, and above what lies beside a flare that stands on a hill of light.
         `saturated`: a pixel is clipped, which counts as censored. Where that does not determine the range
         `range_sigma_m` is NaN; of a clipped disc of more than 28 px radius the flux is a lower bound, too,
         and the range an upper one; of one not clipped, `merged`, no whole disc explains it. Flares that
@@ -80,7 +80,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         for component, middle_e in zip(found, middles_e, strict=True)
         for blob in _split(component, middle_e, prepared)
     ]
-    if len(blobs) != len(found):
+    if len(blobs) != len(found) or any(one is not each for one, each in zip(blobs, found, strict=True)):
         middles_e = _middles_e(blobs, prepared)
     blobs = _above_surroundings(blobs, middles_e, prepared)
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
@@ -205,13 +205,22 @@ def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Bl
     if prepared.texture_e is None:
         return parts
     reach_px = math.ceil(_SUMMIT_REACH * math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0))
-    return [_summit(part, float(noise_e.max()), reach_px, prepared) for part in parts]
+    return [_off_hill(part, component, reach_px, prepared) for part in parts]
 
 
-def _summit(part: Blob, noise_e: float, reach_px: int, prepared: PreparedFrame) -> Blob:
-    """Cut what stands on the background's structure off it; what is clipped stays whole."""
+def _off_hill(part: Blob, component: Blob, reach_px: int, prepared: PreparedFrame) -> Blob:
+    """Cut a part of a component off the hill that it stands on, where the background has structure."""
+    peak = np.argmax(np.where(part.pixels, part.filtered_e, np.float32(-np.inf)))
+    row, column = divmod(int(peak), part.box.width)
+    down, across = part.box.top - component.box.top + row, part.box.left - component.box.left + column
+    around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
+    # Its brightest pixel may be the flank of another, larger one.
+    if around.max() > part.peak_e or not prepared.is_structured(part.box):
+        return part
     clips = part.pixels & (prepared.pixels.data_dn[part.box.slices] >= prepared.clipped_dn)
-    return part if clips.any() else summit(part, noise_e, reach_px)
+    if clips.any() and len(prepared.bad_at):
+        clips &= ~prepared.bad[part.box.slices]
+    return summit(part, clips, reach_px)
 
 
 def _detection(

@@ -12,12 +12,12 @@ from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux
-from perception.robust.clusters import Candidate, Cluster, clusters, dilated, guess_by_outline
+from perception.robust.clusters import Candidate, Cluster, clusters, guess_by_outline
 from perception.robust.explain import MOST_LEFT, best
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size, of_free_width
 from perception.robust.problem import Problem
-from perception.robust.search.blobs import Blob, divide
+from perception.robust.search.blobs import Blob, dilated, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
 from perception.robust.verdict import (

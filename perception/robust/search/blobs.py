@@ -12,8 +12,6 @@ from perception.model.flare import PixelBox
 
 _MAX_PEAKS = 16
 _BESIDE_PX = 4
-_LEVEL_QUANTILE = 0.9
-_LEVEL_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,41 +155,39 @@ def split_at_peaks(blob: Blob, noise: NDArray[np.float32], dip: float = 0.05) ->
     return [_trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
 
 
-def summit(blob: Blob, noise_e: float, reach_px: int) -> Blob:
+def summit(blob: Blob, clips: NDArray[np.bool_], reach_px: int) -> Blob:
     """Cut what stands on a hill off the hill: a flare before a bright horizon, or on a patch of sun.
 
     The flare is what exceeds half of the maximum, and as far around that as its image reaches. Where twice as
-    much of the blob lies beyond, the level is raised above what lies right there. A blob of which more than
-    the flare exceeds that, too, is left as it is.
+    much of the blob lies beyond, the level is raised to the brightest of what lies right there. A blob whose
+    flare is clipped is left as it is.
 
     Parameters
     ----------
     blob
         What exceeds the detection limit.
-    noise_e
-        Standard deviation of the filtered image.
+    clips
+        Which pixels are clipped by light.
     reach_px
         How far a point's image reaches beyond its half maximum.
     """
-    if not blob.peak_e > 0.0:  # brighter than what lies beside it alone, in a dark trough
+    # Of a flare at least a quarter of what it reaches lies in its blob, as in a corner of the frame.
+    if not blob.peak_e > 0.0 or blob.area_px <= 2 * (reach_px + 1) ** 2:
         return blob
     top = _part_with_peak(blob, 0.5 * blob.peak_e)
-    near = _widened(top, reach_px)
+    near = dilated(top, reach_px)
     beyond = blob.pixels & ~near
-    if np.count_nonzero(beyond) <= 2 * np.count_nonzero(near):
+    if np.count_nonzero(beyond) <= 2 * np.count_nonzero(near & blob.pixels) or (clips & near).any():
         return blob
-    beside = beyond & _widened(near, _BESIDE_PX)
+    beside = beyond & dilated(near, _BESIDE_PX)
     if not beside.any():
         return blob
-    level_e = float(np.quantile(blob.filtered_e[beside], _LEVEL_QUANTILE)) + _LEVEL_SIGMAS * noise_e
-    if not level_e < blob.peak_e:
-        return blob
-    part = _part_with_peak(blob, level_e)
-    return blob if (part & ~near).any() else _trimmed(blob, part)
+    level_e = float(blob.filtered_e[beside].max())
+    return _trimmed(blob, _part_with_peak(blob, level_e)) if level_e < blob.peak_e else blob
 
 
 def _part_with_peak(blob: Blob, level_e: float) -> NDArray[np.bool_]:
-    """Mark what exceeds a level in one piece with the maximum, in the blob's box."""
+    """Mark what exceeds a level, which the maximum does, in one piece with it, in the blob's box."""
     places = np.flatnonzero(blob.pixels & (blob.filtered_e > level_e))
     labels, _ = _labelled(places, blob.box.width)
     values = blob.filtered_e.ravel()[places]
@@ -200,10 +196,12 @@ def _part_with_peak(blob: Blob, level_e: float) -> NDArray[np.bool_]:
     return mask.reshape(blob.pixels.shape)
 
 
-def _widened(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
     """Widen a mask by some pixels in each direction, corners too."""
     import cv2
 
+    if not mask.any():
+        return mask
     kernel = np.ones((2 * by_px + 1, 2 * by_px + 1), dtype=np.uint8)
     return np.asarray(cv2.dilate(mask.view(np.uint8), kernel), dtype=bool).reshape(mask.shape)
 

@@ -23,6 +23,7 @@ from perception.robust.search.cutout import grounds_at
 from perception.robust.search.frame import (
     Pixels,
     above,
+    between,
     exceeding,
     filtered,
     ground_at,
@@ -126,6 +127,14 @@ class PreparedFrame:
         if sigma_e == 0.0 or side_px > MOST_STRUCTURED_PX:
             return None, sigma_e
         return structure_of(self._autocorrelation, side_px, sigma_e), sigma_e
+
+    def is_structured(self, box: PixelBox) -> bool:
+        """Tell whether the background has structure anywhere in a box inside the frame."""
+        if self.texture_e is None:
+            return False
+        first, _, _ = between(box.top, self.shape[0], len(self.texture_e))
+        _, last, _ = between(box.top + box.height - 1, self.shape[0], len(self.texture_e))
+        return bool((self.texture_e[first : last + 1, box.left : box.left + box.width] > 0.0).any())
 
     @cached_property
     def _autocorrelation(self) -> tuple[float, ...]:

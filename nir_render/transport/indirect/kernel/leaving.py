@@ -35,7 +35,10 @@ from nir_render.transport.world.emitters import SKY, SUN
 # that misses the halo weighs by one over what is left: near 1 it must be, as paths turn often.
 _FROM_SURFACE, _FROM_FOG = 0.5, 0.15
 _FROM_FOG_IN_SUN = 0.07
-_INTO_SUN, _AHEAD_PER_SR = 0.5, 3.0  # of a path that heads for the sun, as far as the phase function is so much
+_INTO_SUN, _AHEAD_PER_SR = (
+    0.5,
+    3.0,
+)  # of a path that heads for the sun, as far as the phase function is so much
 # So many times more often than light do paths turn in fog: what comes of it varies more than what comes from
 # surfaces.
 _TURNS = 1.5
@@ -210,9 +213,7 @@ class _Halos:
         of_halo = mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, cosine))
         if self.lights.sun < 0:
             return mi.Vector3f(of_halo)
-        return mi.Vector3f(
-            dr.select(self._is_sun(self.row), draw_scattering(self.fog, axis, u, v), of_halo)
-        )
+        return mi.Vector3f(dr.select(self._is_sun(self.row), draw_scattering(self.fog, axis, u, v), of_halo))
 
     def density(self, direction: Vector) -> Float:
         """Return the density per sr with which `direction` draws a unit direction."""
@@ -249,7 +250,9 @@ class _Halos:
         """Return the direction of a light, and its distance; the sun counts as a metre away."""
         to = dr.gather(mi.Point3f, self.lights.center, row, self.active) - self.place
         if self.lights.sun >= 0:
-            to = dr.select(self._is_sun(row), dr.gather(mi.Vector3f, self.lights.normal, row, self.active), to)
+            to = dr.select(
+                self._is_sun(row), dr.gather(mi.Vector3f, self.lights.normal, row, self.active), to
+            )
         distance = dr.maximum(dr.norm(to), 1e-9)
         return mi.Vector3f(to) / distance, distance
 

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
@@ -61,14 +62,29 @@ def test_a_plateau_with_ripples_is_one() -> None:
 
 
 def test_a_flare_is_cut_off_the_hill_that_it_stands_on() -> None:
-    """A glow of 20 along a whole strip and a flare of 100 in it; the strip alone, and the flare alone, stay whole."""
-    strip = np.tile(20.0 * np.exp(-0.5 * ((np.arange(20.0) - 10.0) / 4.0) ** 2)[:, None], (1, 60)).astype(np.float32)
-    flare = hill((40.0, 10.0, 100.0), width=60)
-    (on_strip, strip_alone, alone) = (whole(image) for image in (strip + flare, strip, flare))
-    cut = summit(on_strip, 1.0, 5)
+    """A glow of 20 along a whole strip, dim at its end, and a flare of 100 in it; both alone stay whole."""
+    across = 20.0 * np.exp(-0.5 * ((np.arange(20.0) - 10.0) / 4.0) ** 2)
+    strip = np.asarray(across[:, None] * np.linspace(1.2, 0.8, 60), dtype=np.float32)
+    image = strip + hill((40.0, 10.0, 100.0), width=60)
+    clips = np.zeros((20, 60), dtype=bool)
+    cut = summit(whole(image), clips, 5)
+    assert (cut.box.height, cut.box.width) == (5, 6)
     assert cut.pixels[10 - (cut.box.top - 100), 40 - (cut.box.left - 200)]
-    assert (cut.box.height, cut.box.width) == (5, 5)
-    # What is cut out is what exceeds the strip's ridge by 3 σ, in one piece.
-    assert cut.area_px == np.count_nonzero(((strip + flare) > 23.0))
-    assert summit(strip_alone, 1.0, 5) is strip_alone
-    assert summit(alone, 1.0, 5) is alone
+    # It exceeds all that lies 5 to 9 px beside its half maximum, the brightest of it on the ridge to the left.
+    level_e = float(image[10, 33])
+    assert cut.area_px == np.count_nonzero(image[5:16, 34:47] > level_e)
+    for one in (strip, hill((40.0, 10.0, 100.0), width=60), strip + hill((5.0, 10.0, 4.0), width=60)):
+        blob = whole(one)
+        assert summit(blob, clips, 5) is blob
+    clips[10, 40] = True
+    blob = whole(image)
+    assert summit(blob, clips, 5) is blob
+    clips[10, 40], clips[10, 10] = False, True  # elsewhere on the hill
+    assert summit(blob, clips, 5) is not blob
+
+
+@pytest.mark.parametrize("level", [0.0, -1.0])
+def test_what_is_darker_than_the_background_is_no_hill(level: float) -> None:
+    image = np.full((20, 30), level, dtype=np.float32)
+    blob = Blob(PixelBox(0, 0, 20, 30), np.ones((20, 30), dtype=bool), image)
+    assert summit(blob, np.zeros((20, 30), dtype=bool), 5) is blob
