@@ -34,8 +34,8 @@ from nir_render.transport.world.emitters import SKY, SUN
 # Shares of directions that go into the halo of a light, from surfaces in fog and from fog itself. Each turn
 # that misses the halo weighs by one over what is left: near 1 it must be, as paths turn often.
 _FROM_SURFACE, _FROM_FOG = 0.5, 0.15
-# Where the sun shines: on all stretches so much, and up to so much of a path that heads for the sun, as far as
-# the phase function there exceeds so much.
+# Where the sun shines: on all stretches so much, and up to so much of a path that heads for the sun, as far
+# as the phase function there exceeds so much.
 _FROM_FOG_IN_SUN, _INTO_SUN, _AHEAD_PER_SR = 0.07, 0.5, 3.0
 # So many times more often than light do paths turn in fog: what comes of it varies more than what comes from
 # surfaces.
