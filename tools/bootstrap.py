@@ -173,6 +173,8 @@ def make_environment(root: Path) -> None:
     made_here = read_stamp(root).get("root", str(root)) == str(root)
     if made_here and succeeds([str(python), "-c", IS_GOOD.format("pip")]):
         return
+    if (root / ".venv").is_symlink():  # making it anew would empty what it points to
+        raise SetupError(f"{root / '.venv'} is a link to a folder that was not made here: delete the link")
     say(f"making .venv with Python {'.'.join(map(str, sys.version_info[:3]))}")
     # The base interpreter: this one may itself be the one in .venv, which is cleared.
     base = getattr(sys, "_base_executable", None) or sys.executable

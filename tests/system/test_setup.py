@@ -186,6 +186,19 @@ def test_a_checkout_that_was_moved_is_set_up_anew(bootstrap: ModuleType, checkou
     assert not bootstrap.has_packages(moved)
 
 
+@posix_only
+def test_an_environment_of_another_checkout_is_not_emptied(
+    bootstrap: ModuleType, checkout: Path, tmp_path: Path
+) -> None:
+    kept = tmp_path / "another" / ".venv" / "kept"
+    kept.parent.mkdir(parents=True)
+    kept.touch()
+    (checkout / ".venv").symlink_to(kept.parent)
+    with pytest.raises(bootstrap.SetupError, match=r"is a link .* delete the link"):
+        bootstrap.make_environment(checkout)
+    assert kept.exists()
+
+
 def test_an_interrupted_set_up_goes_on_with_llvm(
     bootstrap: ModuleType, checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
