@@ -80,7 +80,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         for component, middle_e in zip(found, middles_e, strict=True)
         for blob in _split(component, middle_e, prepared)
     ]
-    if len(blobs) != len(found) or any(one is not each for one, each in zip(blobs, found, strict=True)):
+    if blobs != found:  # divided, or cut
         middles_e = _middles_e(blobs, prepared)
     blobs = _above_surroundings(blobs, middles_e, prepared)
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
@@ -217,10 +217,7 @@ def _off_hill(part: Blob, component: Blob, reach_px: int, prepared: PreparedFram
     # Its brightest pixel may be the flank of another, larger one.
     if around.max() > part.peak_e or not prepared.is_structured(part.box):
         return part
-    clips = part.pixels & (prepared.pixels.data_dn[part.box.slices] >= prepared.clipped_dn)
-    if clips.any() and len(prepared.bad_at):
-        clips &= ~prepared.bad[part.box.slices]
-    return summit(part, clips, reach_px)
+    return summit(part, part.pixels & prepared.clipped_in(part.box), reach_px)
 
 
 def _detection(

@@ -183,11 +183,7 @@ def _measurement(
     if solution.ranged[index]:
         relative = min(flux_sigma_e / flux_e, 1.0)
         range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * relative**2)
-    frame = prepared.frame
-    clips = blob.pixels & (frame.data_dn[blob.box.slices] >= prepared.clipped_dn)
-    if clips.any() and len(prepared.bad_at):
-        clips &= ~prepared.bad[blob.box.slices]
-    saturated = bool(clips.any())
+    saturated = bool((blob.pixels & prepared.clipped_in(blob.box)).any())
     told_sigma = of_one  # that it may be two does not make a clipped one a bound
     if may_be_in_fog(prepared.calibration):
         # The range that this fit states is loosely tied to the flux, which tells it in fog.

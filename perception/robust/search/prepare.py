@@ -149,14 +149,18 @@ class PreparedFrame:
         rows, columns = self.shape
         return min(max(round(v_px), 0), rows - 1), min(max(round(u_px), 0), columns - 1)
 
+    def clipped_in(self, box: PixelBox) -> NDArray[np.bool_]:
+        """Mark the pixels of a box inside the frame that light has clipped: bad ones do not count."""
+        clipped = self.pixels.data_dn[box.slices] >= self.clipped_dn
+        if clipped.any() and len(self.bad_at):
+            clipped &= ~self.bad[box.slices]
+        return clipped
+
     def clipped_columns(self, box: PixelBox) -> NDArray[np.bool_]:
         """Tell in which columns of a box, which may leave the frame, a pixel is clipped and not bad."""
         part = box.inside(self.shape)
-        clipped = self.pixels.data_dn[part.slices] >= self.clipped_dn
-        if clipped.any() and len(self.bad_at):
-            clipped &= ~self.bad[part.slices]
         spilled = np.zeros(box.width, dtype=bool)
-        spilled[part.seen_from(box).slices[1]] = clipped.any(axis=0)
+        spilled[part.seen_from(box).slices[1]] = self.clipped_in(part).any(axis=0)
         return spilled
 
     def lit_in(self, box: PixelBox) -> NDArray[np.bool_]:
