@@ -187,12 +187,14 @@ def main() -> None:
     """Measure, and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--only", default="fog,yard,workshop,yard_in_fog,hall")
+    parser.add_argument("--only", default="fog,yard,greenhouse,glass_room,workshop,yard_in_fog,hall")
     parser.add_argument("--keep", type=Path)
     options = parser.parse_args()
     scenes: dict[str, Callable[[], Scene]] = {
         "fog": source_beside_sun,
         "yard": lambda: of_library("sunlit_yard", 32, 2),
+        "greenhouse": lambda: of_library("greenhouse", 16, 4),
+        "glass_room": lambda: of_library("glass_room", 16, 4),
         "workshop": lambda: of_library("workshop", 16, 4),
         "yard_in_fog": lambda: of_library("yard_in_fog", 64, 4),
         "hall": lambda: of_library("foggy_hall", 64, 8),

@@ -31,7 +31,9 @@ _ENTRIES = 2**22  # cells × emitters
 _EVEN_SHARE = 0.05
 _STEP, _STEPS = 4, 6  # of the groups' power
 _GROUP_SHARE = 0.06  # of the picks, spread evenly over groups
-_TIER_RATIO, _MOST_TIERS = 16.0, 3
+# Groups are of another tier from so many times weaker on, and tiers are so many at most. In clear air asking
+# each costs half as much again, which is less than it spares beside the sun, and more than beside lamps.
+_TIERS_IN_FOG, _TIERS_IN_CLEAR_AIR = (16.0, 3), (1024.0, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +96,8 @@ def guide(
         [_unshadowed_irradiance(emitters, facets, row, places_m, step_m, extinction_per_m) for row in rows]
     )
     weight = (weight * power[emitters.group][:, None]).T
-    foggy = extinction_per_m > 0.0
-    tier = _tiers(weight.mean(axis=0), emitters) if foggy else np.zeros(len(emitters.kind), dtype=np.int64)
+    steps = _TIERS_IN_FOG if extinction_per_m > 0.0 else _TIERS_IN_CLEAR_AIR
+    tier = _tiers(weight.mean(axis=0), emitters, *steps)
     numbers = range(int(tier.max(initial=0)) + 1)
     chance = np.concatenate([_chances(weight, emitters.group, tier == number) for number in numbers])
     cumulative = np.cumsum(chance, axis=1)
@@ -130,7 +132,7 @@ def _chances(weight: Array, group: NDArray[np.int64], chosen: NDArray[np.bool_])
     return chance
 
 
-def _tiers(brought: Array, emitters: Emitters) -> NDArray[np.int64]:
+def _tiers(brought: Array, emitters: Emitters, step: float, most: int) -> NDArray[np.int64]:
     """Return the tier of each emitter, by what its group brings to the scene on the mean over it.
 
     That is an irradiance for all kinds of light, and can be compared. The sky goes with the strongest: paths
@@ -138,7 +140,7 @@ def _tiers(brought: Array, emitters: Emitters) -> NDArray[np.int64]:
     """
     of_group = np.bincount(emitters.group, np.where(emitters.facet < 0, brought, 0.0))
     ratio = of_group.max(initial=0.0) / np.maximum(of_group, 1e-300)
-    level = np.minimum(np.floor(np.log(ratio) / np.log(_TIER_RATIO)), _MOST_TIERS - 1)
+    level = np.minimum(np.floor(np.log(ratio) / np.log(step)), most - 1)
     level[emitters.group[emitters.kind == SKY]] = 0
     return np.unique(level[emitters.group], return_inverse=True)[1].astype(np.int64)
 

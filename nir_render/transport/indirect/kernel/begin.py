@@ -11,7 +11,7 @@ sees straight is in all samples.
 from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
-from nir_render.transport.indirect.kernel import connect
+from nir_render.transport.indirect.kernel.aim import guide_cell
 from nir_render.transport.indirect.kernel.fog import absorbed_share, fog_interval, optical_depth
 from nir_render.transport.indirect.kernel.fog_scatter import brought_to_stretch, weighs_all
 from nir_render.transport.indirect.kernel.tables import DeviceScene
@@ -81,11 +81,9 @@ def deal_of(scene: DeviceScene, origin: Point, direction: Vector) -> Deal:
     A tier's share goes with what it brings to the fog on the ray's first stretch, and to the surface behind,
     by what the fog takes and leaves.
     """
-    tiers = scene.lights.tiers
-    if tiers == 1:
+    tiers, fog = scene.lights.tiers, scene.fog
+    if tiers == 1 or fog is None:  # in clear air each path serves all
         return Deal([])
-    fog = scene.fog
-    assert fog is not None  # only there are tiers
     si = scene.bodies.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=True)
     met = si.is_valid()
     begin, end = fog_interval(fog, origin, direction, dr.select(met, si.t, _FAR))
@@ -139,7 +137,7 @@ def _brought_to_fog(
 
 def _brought_to_place(scene: DeviceScene, place: Point) -> list[Float]:
     """Return each tier's share in what lights bring to places, by the guide's cells."""
-    cell = connect.guide_cell(scene.choice, place)
+    cell = guide_cell(scene.choice, place)
     return [
         dr.gather(mi.Float, scene.choice.tier_share, cell + scene.choice.cells * number)
         for number in range(scene.lights.tiers)

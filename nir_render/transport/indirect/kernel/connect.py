@@ -1,19 +1,34 @@
-"""From a place to a light on the device: choosing one, aiming at it, and what arrives on the way.
+"""Lights that a surface asks for on the device, and what arrives of a light on the way.
 
 A light's image in a flat smooth facet is a light of its own that stands behind the facet: a ray towards it
 that crosses the facet goes on, mirrored, to the light itself. Panes weaken what passes and do not bend it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from nir_render.transport.backend.variant import dr, mi
+from nir_render.transport.indirect.kernel import draws
 from nir_render.transport.indirect.kernel import nodes as of_nodes
+from nir_render.transport.indirect.kernel.aim import Aim, aim_at_light, choose_light, guide_cell
+from nir_render.transport.indirect.kernel.draws import power_heuristic
 from nir_render.transport.indirect.kernel.fog import transmittance
 from nir_render.transport.indirect.kernel.nodes import NodeTable
-from nir_render.transport.indirect.kernel.rectangle import RectangleInView, aim_at_rectangle
-from nir_render.transport.indirect.kernel.tables import Choice, DeviceScene, Lights, Surfaces, along_table
-from nir_render.transport.indirect.kernel.types import Float, Int, Mask, Point, Ray, Shares, UInt, Vector
-from nir_render.transport.world.emitters import RECTANGLE, SKY, SUN
+from nir_render.transport.indirect.kernel.tables import TURN, DeviceScene, Lights, Surfaces, along_table
+from nir_render.transport.indirect.kernel.types import (
+    AddLight,
+    Float,
+    Int,
+    Interaction,
+    Mask,
+    PathState,
+    Point,
+    Random,
+    Ray,
+    Shares,
+    UInt,
+    Vector,
+)
 from nir_render.transport.world.facets import MIRROR, PANE
 
 # Shadow rays to facets and lamps end this share of their way before it: what float32 rounds, with room.
@@ -21,97 +36,94 @@ SHORTER = 1e-4
 # So far behind a pane, in metres and relative to lengths at hand, a ray goes on that passes it: what float32
 # rounds, with room. What lies nearer behind it hides nothing.
 _PAST = 1e-5
-_ENDLESS = 1e15
 
 
 @dataclass(frozen=True, eq=False)
-class Aim:
-    """A ray towards a light: unit direction, length, density per sr of being drawn, and the radiance."""
+class SurfaceSample:
+    """A surface's own scattering: Mitsuba's sample and its weight, and the guide's cell of the place."""
 
-    direction: Vector
-    reach: Float
+    bsdf: Any
+    sample: Any
+    weight: Float
+    cell: UInt
+
+
+def ask_lights(
+    scene: DeviceScene,
+    state: PathState,
+    si: Interaction,
+    weight: Float,
+    surface: Mask,
+    max_depth: UInt,
+    number: Random,
+    add: AddLight,
+) -> SurfaceSample:
+    """Add what a surface scatters of one light into the path, and return its sample of a way onwards.
+
+    Both come from one call of Mitsuba's, which costs less than two. In clear air one light of each tier is
+    asked for: so what weak ones bring needs no share of what the strong are asked.
+    """
+    bsdf = si.bsdf()
+    cell = guide_cell(scene.choice, si.p, state.tier)
+    row, chance = choose_light(scene.choice, scene.lights, cell, number(draws.LIGHT))
+    aim = aim_at_light(scene.lights, row, si.p, number(draws.LIGHT_U), number(draws.LIGHT_V), surface)
+    value, density, sample, sampled_weight = bsdf.eval_pdf_sample(
+        mi.BSDFContext(), si, si.to_local(aim.direction), number(draws.LOBE),
+        mi.Point2f(number(draws.LOBE_U), number(draws.LOBE_V)), surface,
+    )  # fmt: skip
+    asked = _AskedLight(row, chance, aim, weight * value[0], density)
+    _add_asked_light(scene, state, si, asked, surface, max_depth, add)
+    if scene.lights.tiers > 1 and state.tier is None:
+        weak = cell + scene.choice.cells
+        row, chance = choose_light(scene.choice, scene.lights, weak, number(draws.WEAK))
+        u, v = number(draws.WEAK_U), number(draws.WEAK_V)
+        aim = aim_at_light(scene.lights, row, si.p, u, v, surface)
+        value, density = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(aim.direction), surface)
+        asked = _AskedLight(row, chance, aim, weight * value[0], density)
+        _add_asked_light(scene, state, si, asked, surface, max_depth, add)
+    return SurfaceSample(bsdf, sample, sampled_weight[0], cell)
+
+
+@dataclass(frozen=True, eq=False)
+class _AskedLight:
+    """A light that a surface asks for: its row, the chance of it, a ray to it, and what scatters it back.
+
+    `scattered` is the path's weight behind the surface, `density` that of the surface's own sampling.
+    """
+
+    row: UInt
+    chance: Float
+    aim: Aim
+    scattered: Float
     density: Float
-    radiance: Float
 
 
-def guide_cell(choice: Choice, place: Point, tier: UInt | None = None) -> UInt:
-    """Return the guide's cell of a place, of all tiers' cells that of one; outside the grid the nearest."""
-    at = mi.Point3u(along_table((place - choice.low) * choice.cells_per_m, choice.top))
-    cell = at.x + choice.stride_y * at.y + choice.stride_z * at.z
-    return cell if tier is None else cell + choice.cells * tier
-
-
-def choose_light(choice: Choice, lights: Lights, cell: UInt, u: Float) -> tuple[UInt, Float]:
-    """Return a light drawn by the guide, and the chance of it."""
-    first = cell * lights.count
-    row = dr.binary_search(
-        0, lights.rows - 1, lambda k: dr.gather(mi.Float, choice.cumulative, first + k) <= u
-    )
-    return row, dr.gather(mi.Float, choice.chance, first + row)
-
-
-def light_chance(choice: Choice, lights: Lights, cell: UInt, row: UInt, active: Mask) -> Float:
-    """Return the chance that the guide draws a light in a cell."""
-    return dr.gather(mi.Float, choice.chance, cell * lights.count + row, active)
-
-
-def versine_of(radius: Float, distance2: Float) -> Float:
-    """Return 1 − cos of half the angle that a sphere fills; the difference itself would lose its digits."""
-    sine2 = dr.minimum(radius * radius / distance2, 1.0)
-    return sine2 / (1.0 + dr.sqrt(1.0 - sine2))
-
-
-def aim_at_light(lights: Lights, row: UInt, place: Point, u: Float, v: Float, active: Mask) -> Aim:
-    """Return a ray from a place towards a point of a light, drawn evenly over the solid angle it fills."""
-    radiance = dr.gather(mi.Float, lights.radiance, row, active)
-    direction, reach, density = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(1)
-    kind = dr.gather(mi.UInt32, lights.kind, row, active)
-    if lights.has_spheres:
-        direction, reach, density = _aim_at_sphere(lights, row, place, u, v, active)
-    if lights.has_rectangles:
-        sampled = aim_at_rectangle(lights, row, place, u, v, active & (kind == RECTANGLE))
-        direction, reach, density = (
-            dr.select(kind == RECTANGLE, new, old)
-            for new, old in zip(sampled, (direction, reach, density), strict=True)
-        )
-    if lights.sun >= 0:
-        sampled = _aim_at_sun(lights, row, u, v, active & (kind == SUN))
-        direction, reach, density = (
-            dr.select(kind == SUN, new, old)
-            for new, old in zip(sampled, (direction, reach, density), strict=True)
-        )
-    if lights.sky_table is not None:
-        towards = lights.sky_table.aim(u, v)
-        direction = dr.select(kind == SKY, towards, direction)
-        reach = dr.select(kind == SKY, _ENDLESS, reach)
-        density = dr.select(kind == SKY, lights.sky_table.density(towards), density)
-    return Aim(direction, reach, density, radiance)
-
-
-def aim_density(lights: Lights, row: UInt, place: Point, direction: Vector, active: Mask) -> Float:
-    """Return the density per sr with which `aim_at_light` draws a direction that does meet a light."""
-    kind = dr.gather(mi.UInt32, lights.kind, row, active)
-    density = mi.Float(0)
-    if lights.has_spheres:
-        center = dr.gather(mi.Point3f, lights.center, row, active)
-        radius = dr.gather(mi.Float, lights.radius, row, active)
-        density = dr.rcp(2.0 * dr.pi * versine_of(radius, dr.squared_norm(center - place)))
-    if lights.has_rectangles:
-        flat = RectangleInView(lights, row, place, active & (kind == RECTANGLE))
-        density = dr.select(kind == RECTANGLE, flat.density(direction), density)
-    if lights.sun >= 0:
-        versine = dr.gather(mi.Float, lights.versine, row, active)
-        density = dr.select(kind == SUN, dr.rcp(2.0 * dr.pi * versine), density)
-    if lights.sky_table is not None:
-        density = dr.select(kind == SKY, lights.sky_table.density(direction), density)
-    return density
-
-
-def meets_sun(lights: Lights, direction: Vector) -> Mask:
-    """Tell whether a direction meets the sun's disc."""
-    row = mi.UInt32(lights.sun)
-    to_sun = dr.gather(mi.Vector3f, lights.normal, row)
-    return 0.5 * dr.squared_norm(direction - to_sun) < dr.gather(mi.Float, lights.versine, row)
+def _add_asked_light(
+    scene: DeviceScene,
+    state: PathState,
+    si: Interaction,
+    one: _AskedLight,
+    surface: Mask,
+    max_depth: UInt,
+    add: AddLight,
+) -> None:
+    """Add what arrives of a light that a surface asks for, as far as paths do not meet it by themselves."""
+    aim = one.aim
+    asked = aim.density * one.chance
+    brought = one.scattered * aim.radiance / asked * power_heuristic(asked, one.density)
+    if state.dealt is not None:
+        brought = brought * state.dealt
+    seen = surface & (brought > 0.0) & dr.isfinite(brought)
+    shadow = si.spawn_ray(aim.direction)
+    # Mitsuba lifts a ray's origin off the surface, up to 1e-4 of the coordinates; it aims at the same point.
+    to = aim.direction * aim.reach - (shadow.o - si.p)
+    reach = dr.norm(to)
+    lifted = replace(aim, direction=to / reach, reach=reach)
+    share, kept = arriving_share(scene, one.row, shadow.o, lifted, state.depth, max_depth, seen)
+    shares = of_nodes.off_surface(scene.nodes, si, si.bsdf(), aim.direction, mi.Bool(False), seen)
+    shares = of_nodes.times(of_nodes.times(state.shares, shares), kept)
+    once_more = None if state.turns is None else state.turns + TURN
+    add(brought * share, shares, one.row, seen & (share > 0.0), once_more)
 
 
 def pattern_factor(lights: Lights, light: UInt, leaving: Vector, active: Mask) -> Float:
@@ -241,34 +253,6 @@ def _crossing(surfaces: Surfaces, facet: UInt, origin: Point, direction: Vector,
     along_u = dr.dot(off, dr.gather(mi.Vector3f, surfaces.half_u, facet, active))
     along_v = dr.dot(off, dr.gather(mi.Vector3f, surfaces.half_v, facet, active))
     return _Crossing(distance, (dr.abs(along_u) <= 1.0) & (dr.abs(along_v) <= 1.0))
-
-
-def _aim_at_sphere(
-    lights: Lights, row: UInt, place: Point, u: Float, v: Float, active: Mask
-) -> tuple[Vector, Float, Float]:
-    to = dr.gather(mi.Point3f, lights.center, row, active) - place
-    radius = dr.gather(mi.Float, lights.radius, row, active)
-    distance2 = dr.squared_norm(to)
-    distance = dr.sqrt(distance2)
-    whole = versine_of(radius, distance2)
-    versine = whole * u
-    sine2 = versine * (2.0 - versine)
-    direction = _around(to / distance, dr.safe_sqrt(sine2), versine, v)
-    reach = distance * (1.0 - versine) - dr.safe_sqrt(radius * radius - distance2 * sine2)
-    return direction, reach, dr.rcp(2.0 * dr.pi * whole)
-
-
-def _aim_at_sun(lights: Lights, row: UInt, u: Float, v: Float, active: Mask) -> tuple[Vector, Float, Float]:
-    whole = dr.gather(mi.Float, lights.versine, row, active)
-    versine = whole * u
-    axis = dr.gather(mi.Vector3f, lights.normal, row, active)
-    direction = _around(axis, dr.safe_sqrt(versine * (2.0 - versine)), versine, v)
-    return direction, mi.Float(_ENDLESS), dr.rcp(2.0 * dr.pi * whole)
-
-
-def _around(axis: Vector, sine: Float, versine: Float, turn: Float) -> Vector:
-    sin_turn, cos_turn = dr.sincos(2.0 * dr.pi * turn)
-    return mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_turn, sine * sin_turn, 1.0 - versine))
 
 
 def arriving_share(

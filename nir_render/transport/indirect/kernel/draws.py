@@ -16,6 +16,7 @@ PIXEL_U, PIXEL_V, CAMERA_DIMENSIONS = 0, 1, 2
 TIER = 2**20  # beyond all vertices
 LIGHT, LIGHT_U, LIGHT_V, LOBE, LOBE_U, LOBE_V, SURVIVAL = range(7)
 FOG_LIGHT, FOG_PLACE, FOG_U, FOG_V, FLIGHT, HALO, HALO_LIGHT, HALO_U, HALO_V = range(7, 16)
+WEAK, WEAK_U, WEAK_V = range(7, 10)  # in clear air, where fog needs none
 FOG_CANDIDATES = 16  # two for each
 STEP = 24
 

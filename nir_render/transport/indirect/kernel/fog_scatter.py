@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws, nodes
+from nir_render.transport.indirect.kernel.aim import aim_at_light, choose_light, guide_cell
 from nir_render.transport.indirect.kernel.fog import (
     absorbed_share,
     arc_integral,
@@ -81,7 +82,7 @@ def scatter_on_stretch(
     row, chance = _light_for_stretch(scene, state, begin, end, active, number)
     distance, density = _place_on_stretch(scene, row, state, begin, end, number(draws.FOG_PLACE), active)
     place = state.origin + state.direction * distance
-    aim = connect.aim_at_light(scene.lights, row, place, number(draws.FOG_U), number(draws.FOG_V), active)
+    aim = aim_at_light(scene.lights, row, place, number(draws.FOG_U), number(draws.FOG_V), active)
     turn = versine(state.direction, aim.direction)
     before = optical_depth(fog, state.origin, state.direction, begin, distance)
     weight = extinction_at(fog, place) * fog.albedo * dr.exp(-before) / density
@@ -139,8 +140,8 @@ def _candidate(
     assert scene.fog is not None  # only called in fog
     share = (mi.Float(k) + along) / _CANDIDATES
     distance = draw_flight(scene.fog, state.origin, state.direction, begin, end, share)
-    cell = connect.guide_cell(scene.choice, state.origin + state.direction * distance, state.tier)
-    return connect.choose_light(scene.choice, scene.lights, cell, pick)
+    cell = guide_cell(scene.choice, state.origin + state.direction * distance, state.tier)
+    return choose_light(scene.choice, scene.lights, cell, pick)
 
 
 def brought_to_stretch(

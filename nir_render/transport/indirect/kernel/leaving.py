@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from nir_render.transport.backend.variant import dr, mi
-from nir_render.transport.indirect.kernel import connect, draws
+from nir_render.transport.indirect.kernel import draws
+from nir_render.transport.indirect.kernel.aim import choose_light, guide_cell
 from nir_render.transport.indirect.kernel.fog import (
     draw_angle,
     draw_scattering,
@@ -200,8 +201,8 @@ class _Halos:
             self.first, self.count = self.lights.of_tier(tier, active)
             self.row, _, self.total = draws.draw_by_weight(self.count, self._weighed, u)
         else:
-            cell = connect.guide_cell(scene.choice, place, tier)
-            self.row, _ = connect.choose_light(scene.choice, scene.lights, cell, u)
+            cell = guide_cell(scene.choice, place, tier)
+            self.row, _ = choose_light(scene.choice, scene.lights, cell, u)
 
     def direction(self, u: Float, v: Float) -> Vector:
         """Return a unit direction, drawn."""

@@ -10,11 +10,11 @@ own scattering, or by the fog's. Both ways to a light are weighted by the power 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 from nir_render.transport.backend.variant import dr, mi
 from nir_render.transport.indirect.kernel import connect, draws, nodes
+from nir_render.transport.indirect.kernel.aim import aim_density, light_chance, meets_sun
 from nir_render.transport.indirect.kernel.begin import Film, camera_direction, deal_of
 from nir_render.transport.indirect.kernel.draws import Draws, power_heuristic
 from nir_render.transport.indirect.kernel.fog import fog_interval, versine
@@ -139,7 +139,7 @@ def _step(
     passing, scattering = _pass_fog(scene, state, si, met, max_depth, number, add)
     light = _add_met_light(scene, state, si, met, passing, add)
     surface = met & (light < 0) & (state.depth + 1 < max_depth)
-    sampled = _ask_light(scene, state, si, passing, surface, max_depth, number, add)
+    sampled = connect.ask_lights(scene, state, si, passing, surface, max_depth, number, add)
     onward_path = _scatter(scene, state, si, sampled, surface, scattering, number)
     return _survive(state, onward_path, draw, number(draws.SURVIVAL), begin, camera, scene.narrow)
 
@@ -183,7 +183,7 @@ def _add_met_light(
     light = dr.gather(mi.Int32, scene.surfaces.light_of_shape, _shape(si), met)
     shines = met & (light >= 0)
     if scene.lights.sun >= 0:
-        leaves = state.active & ~si.is_valid() & connect.meets_sun(scene.lights, state.direction)
+        leaves = state.active & ~si.is_valid() & meets_sun(scene.lights, state.direction)
         light = dr.select(leaves, scene.lights.sun, light)
         shines = shines | leaves
     if scene.lights.sky >= 0:  # behind the sun's disc too
@@ -218,8 +218,11 @@ def _add_unasked_light(
     if lights.sky >= 0 and state.in_fog is not None:  # fog does not ask for it
         asked = asked & ((light != lights.sky) | ~state.in_fog)
     known = mi.UInt32(dr.maximum(row, 0))
-    density = connect.aim_density(lights, known, state.place, towards, asked)
-    chance = connect.light_chance(scene.choice, lights, state.cell, known, asked)
+    density = aim_density(lights, known, state.place, towards, asked)
+    cell = state.cell
+    if lights.tiers > 1 and state.tier is None:
+        cell = cell + scene.choice.cells * dr.gather(mi.UInt32, lights.tier, known, asked)
+    chance = light_chance(scene.choice, lights, cell, known, asked)
     if state.in_fog is not None:
         chance = dr.select(state.in_fog, 1.0, chance)
     share = dr.select(asked, power_heuristic(state.density, density * chance), 1.0)
@@ -232,56 +235,6 @@ def _add_unasked_light(
     radiance = radiance * connect.pattern_factor(lights, light, -state.direction, active)
     brings = weight * radiance * share
     add(brings, state.shares, light, active & (share > 0.0) & dr.isfinite(brings), state.turns)
-
-
-@dataclass(frozen=True, eq=False)
-class _SurfaceSample:
-    """A surface's own scattering: Mitsuba's sample and its weight, and the guide's cell of the place."""
-
-    bsdf: Any
-    sample: Any
-    weight: Float
-    cell: UInt
-
-
-def _ask_light(
-    scene: DeviceScene,
-    state: PathState,
-    si: Interaction,
-    weight: Float,
-    surface: Mask,
-    max_depth: UInt,
-    number: Random,
-    add: AddLight,
-) -> _SurfaceSample:
-    """Add what a surface scatters of one light into the path, and return its sample of a way onwards.
-
-    Both come from one call of Mitsuba's, which costs less than two.
-    """
-    bsdf = si.bsdf()
-    cell = connect.guide_cell(scene.choice, si.p, state.tier)
-    row, chance = connect.choose_light(scene.choice, scene.lights, cell, number(draws.LIGHT))
-    aim = connect.aim_at_light(scene.lights, row, si.p, number(draws.LIGHT_U), number(draws.LIGHT_V), surface)
-    value, density, sample, sampled_weight = bsdf.eval_pdf_sample(
-        mi.BSDFContext(), si, si.to_local(aim.direction), number(draws.LOBE),
-        mi.Point2f(number(draws.LOBE_U), number(draws.LOBE_V)), surface,
-    )  # fmt: skip
-    asked = aim.density * chance
-    brought = weight * value[0] * aim.radiance / asked * power_heuristic(asked, density)
-    if state.dealt is not None:
-        brought = brought * state.dealt
-    seen = surface & (brought > 0.0) & dr.isfinite(brought)
-    shadow = si.spawn_ray(aim.direction)
-    # Mitsuba lifts a ray's origin off the surface, up to 1e-4 of the coordinates; it aims at the same point.
-    to = aim.direction * aim.reach - (shadow.o - si.p)
-    reach = dr.norm(to)
-    lifted = replace(aim, direction=to / reach, reach=reach)
-    share, kept = connect.arriving_share(scene, row, shadow.o, lifted, state.depth, max_depth, seen)
-    shares = nodes.off_surface(scene.nodes, si, bsdf, aim.direction, mi.Bool(False), seen)
-    shares = nodes.times(nodes.times(state.shares, shares), kept)
-    once_more = None if state.turns is None else state.turns + TURN
-    add(brought * share, shares, row, seen & (share > 0.0), once_more)
-    return _SurfaceSample(bsdf, sample, sampled_weight[0], cell)
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +259,7 @@ def _scatter(
     scene: DeviceScene,
     state: PathState,
     si: Interaction,
-    sampled: _SurfaceSample,
+    sampled: connect.SurfaceSample,
     surface: Mask,
     scattering: FogScattering | None,
     number: Random,

@@ -10,7 +10,13 @@ from scipy import stats
 from nir_render import Scene, load_scene, render
 from nir_render.transport.backend.variant import backend
 from nir_render.transport.indirect.guide import guide
-from nir_render.transport.indirect.kernel import connect
+from nir_render.transport.indirect.kernel.aim import (
+    aim_at_light,
+    aim_density,
+    choose_light,
+    guide_cell,
+    light_chance,
+)
 from nir_render.transport.indirect.kernel.draws import lane_draws
 from nir_render.transport.indirect.kernel.tables import along_table, upload_guide, upload_lights
 from nir_render.transport.world import mitsuba_scene as world
@@ -98,14 +104,11 @@ def test_lights_are_chosen_as_often_as_their_chance_says(room: Scene, lights: An
     choice = upload_guide(chosen)
     u = np.random.default_rng(1).random(200_000).astype(np.float32)
     for place in ([0.5, 0.5, 0.0], [-2.9, 0.4, 0.0], [30.0, 0.0, 0.0]):
-        cell = connect.guide_cell(choice, mi.Point3f(*place))
-        row, chance = (np.array(value) for value in connect.choose_light(choice, lights, cell, mi.Float(u)))
+        cell = guide_cell(choice, mi.Point3f(*place))
+        row, chance = (np.array(value) for value in choose_light(choice, lights, cell, mi.Float(u)))
         counts = np.bincount(row, minlength=8)
         expected = np.array(
-            [
-                np.array(connect.light_chance(choice, lights, cell, mi.UInt32(k), mi.Bool(True)))[0]
-                for k in range(8)
-            ]
+            [np.array(light_chance(choice, lights, cell, mi.UInt32(k), mi.Bool(True)))[0] for k in range(8)]
         )
         np.testing.assert_array_equal(chance, expected[row].astype(np.float32))
         shares = expected.astype(float) / expected.astype(float).sum()
@@ -125,9 +128,9 @@ def test_a_lamp_is_aimed_at_evenly_over_its_solid_angle(lights: Any, place: list
     count = 400_000
     u, v = (mi.Float(random.random(count).astype(np.float32)) for _ in range(2))
     row = mi.UInt32(3)
-    aim = connect.aim_at_light(lights, row, mi.Point3f(*place), u, v, mi.Bool(True))
+    aim = aim_at_light(lights, row, mi.Point3f(*place), u, v, mi.Bool(True))
     direction, density = np.array(aim.direction).T.astype(float), np.array(aim.density).astype(float)
-    again = connect.aim_density(lights, row, mi.Point3f(*place), aim.direction, mi.Bool(True))
+    again = aim_density(lights, row, mi.Point3f(*place), aim.direction, mi.Bool(True))
     np.testing.assert_allclose(np.array(again), density, rtol=2e-4)
     ends = np.array(place) + direction * np.array(aim.reach)[:, None]
     assert np.abs(ends[:, 2] - 2.5).max() < 1e-4
@@ -165,9 +168,9 @@ def test_a_large_lamp_is_aimed_at_evenly_from_right_before_it(
     random = np.random.default_rng(11)
     u, v = (mi.Float(random.random(400_000).astype(np.float32)) for _ in range(2))
     place = mi.Point3f(1.0 + aside_m, -1.0 + 0.5 * aside_m, 2.5 - before_m)
-    weight_sr = 1.0 / np.array(
-        connect.aim_at_light(lights, mi.UInt32(3), place, u, v, mi.Bool(True)).density
-    ).astype(float)
+    weight_sr = 1.0 / np.array(aim_at_light(lights, mi.UInt32(3), place, u, v, mi.Bool(True)).density).astype(
+        float
+    )
     solid_angle_sr = sum(
         np.arctan(x * y / (before_m * np.sqrt(x * x + y * y + before_m**2)))
         for x in (1.0 - aside_m, 1.0 + aside_m)
@@ -192,11 +195,11 @@ def test_a_lamp_seen_from_its_own_plane_has_rays_too(room: Scene) -> None:
     below_m = 1e-7 * 600.0**below
     place = mi.Point3f(1.0 + 1.05 + 0.01 + 0.2 * beside, -1.0 + 2.1 * (along - 0.5), 2.5 - below_m)
     row, whole = mi.UInt32(3), mi.Bool(True)
-    aim = connect.aim_at_light(lights, row, place, mi.Float(u), mi.Float(v), whole)
+    aim = aim_at_light(lights, row, place, mi.Float(u), mi.Float(v), whole)
     for value in (*aim.direction, aim.reach, aim.density):
         assert np.isfinite(np.array(value)).all()
     assert (np.array(aim.density) > 0.0).all()
-    assert (np.array(connect.aim_density(lights, row, place, aim.direction, whole)) > 0.0).all()
+    assert (np.array(aim_density(lights, row, place, aim.direction, whole)) > 0.0).all()
 
 
 def test_what_is_no_number_has_the_first_place_in_a_table() -> None:
@@ -216,7 +219,7 @@ def test_a_sphere_is_aimed_at_evenly_over_its_cone(room: Scene, distance_m: floa
     place = shining.center_m[1] - [distance_m, 0.0, 0.0]
     random = np.random.default_rng(5)
     u, v = (mi.Float(random.random(100_000).astype(np.float32)) for _ in range(2))
-    aim = connect.aim_at_light(lights, mi.UInt32(1), mi.Point3f(*place.tolist()), u, v, mi.Bool(True))
+    aim = aim_at_light(lights, mi.UInt32(1), mi.Point3f(*place.tolist()), u, v, mi.Bool(True))
     half_angle = np.arcsin(0.01 / distance_m)
     versine = 2.0 * np.sin(0.5 * half_angle) ** 2
     np.testing.assert_allclose(np.array(aim.density), 1.0 / (2.0 * np.pi * versine), rtol=1e-5)
