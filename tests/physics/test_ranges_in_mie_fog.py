@@ -28,13 +28,14 @@ def test_ranges_in_heavy_advection_fog_hold_with_extinction_known_and_unknown(
     columns: int,
     samples: int,
 ) -> None:
-    """Robots 4 to 8 m or 20 m away in the dark, the paper's rig, exposed as it would itself, 12 frames of each.
+    """Robots 4 to 8 m or 20 m away in the dark, the paper's rig, exposed as it would itself, 100 frames of each.
 
     The halo is the path tracer's, and what robots know of it is small-angle theory. Expected: with extinction and droplets
-    known the median error is below 1 %, each mean within 4 standard errors and 0.6 % of 0 (render noise, and what the
-    theory leaves), and errors over σ have a mean square below 1.35² (about 1.1²); with one of four kinds of droplets, the median is below 2 %, and errors over σ are
+    known the median error is below 1 %, each mean within 0.4 % of 0 (render noise, and what the theory leaves),
+    and errors over σ are 1 rms within 15 % (at 20 m, where one render's noise is in all frames, within 25 %); with one of
+    four kinds of droplets, the median is below 2 %, and errors over σ are
     below 1.8 rms: these droplets are the farthest of the four from their mean, by 1.4 σ. With
-    extinction not known either, it is below 4 % up to 8 m, and errors over σ are below 1.3 rms.
+    extinction not known either, it is below 4 % up to 8 m, and errors over σ are 1 rms within 15 %.
     """
     scene = parse_scene(
         {
@@ -61,7 +62,7 @@ def test_ranges_in_heavy_advection_fog_hold_with_extinction_known_and_unknown(
         pose.rotation.T @ (world.sources[f"{name}.top"].pose.position_m - pose.position_m) for name in places
     ]
     found: dict[str, list[list[tuple[float, float]]]] = {name: [] for name in knows}
-    for seed in range(12):
+    for seed in range(100):
         frame = expose(light, scene, exposure_s=exposure_s, seed=seed)
         for name, camera in knows.items():
             hits = perception.detect(frame, camera)
@@ -76,12 +77,12 @@ def test_ranges_in_heavy_advection_fog_hold_with_extinction_known_and_unknown(
     pulls = {
         name: np.sqrt(np.mean((errors[name] / np.array(rows)[..., 1]) ** 2)) for name, rows in found.items()
     }
-    of_noise = errors["all"].std(axis=0, ddof=1) / np.sqrt(12.0)
-    assert np.all(np.abs(errors["all"].mean(axis=0)) < 4.0 * of_noise + 0.006)
+    near = places is PLACES
+    assert np.all(np.abs(errors["all"].mean(axis=0)) < 0.004)
     assert np.median(np.abs(errors["all"])) < 0.01
-    assert pulls["all"] < 1.35
+    assert abs(pulls["all"] - 1.0) < (0.15 if near else 0.25)
     assert np.median(np.abs(errors["extinction"])) < 0.02
     assert pulls["extinction"] < 1.8
-    if places is PLACES:
+    if near:
         assert np.median(np.abs(errors["nothing"])) < 0.04
-        assert pulls["nothing"] < 1.3
+        assert abs(pulls["nothing"] - 1.0) < 0.15

@@ -50,7 +50,7 @@ _PILOT_STEP = 4
 _PILOT_PIXELS = 1200
 _MOST_DEPTH = 64
 _FOG_DEPTH, _OPEN_FOG_DEPTH = (12, 3.0), (24, 5.0)  # and for each optical depth; open under sun or sky
-_VALUES_AT_ONCE = 2**25  # float32 numbers of one launch: 128 MiB
+_VALUES_AT_ONCE = 2**27  # float32 numbers of one launch: 512 MiB
 _MAPPED_FROM_BYTES = 2**30  # larger arrays lie in a file that the system may page out
 
 
@@ -204,6 +204,7 @@ def render_pixels(
     """
     groups = len(snapshot.groups)
     layers = groups * built.node_count * (1 if narrow is None else 2)
+    shape = groups, built.node_count, pixels.size
     arrays = [_array((groups * built.node_count, pixels.size)) for _ in range(2 if narrow is None else 5)]
     for count in np.unique(counts):
         places = np.flatnonzero(counts == count)
@@ -216,9 +217,11 @@ def render_pixels(
             whole = some[-1] - some[0] + 1 == some.size
             there = slice(some[0], some[-1] + 1) if whole else some
             found = sample_means(built, film, seed, groups, int(count), narrow)
+            if some.size == pixels.size:  # all at once: no copy
+                return [values.reshape(shape) for values in found]
             for array, values in zip(arrays, found, strict=True):
                 array[:, there] = values
-    return [array.reshape(groups, built.node_count, pixels.size) for array in arrays]
+    return [array.reshape(shape) for array in arrays]
 
 
 def light_seed(*key: object) -> int:

@@ -88,48 +88,51 @@ def guide(
     edge_m = float(np.cbrt(np.prod(extent_m) / cells))
     counts = np.maximum(np.floor(extent_m / edge_m), 1).astype(np.int64)
     step_m = extent_m / counts
-    axes = [low_m[k] + step_m[k] * (np.arange(counts[k]) + 0.5) for k in range(3)]
-    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
-    places_m = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-    rows = range(len(emitters.kind))
-    weight = np.stack(
-        [_unshadowed_irradiance(emitters, facets, row, places_m, step_m, extinction_per_m) for row in rows]
-    )
-    weight = (weight * power[emitters.group][:, None]).T
+    axes_m = [low_m[k] + step_m[k] * (np.arange(counts[k]) + 0.5) for k in range(3)]
+    weight = _unshadowed(emitters, facets, axes_m, step_m, extinction_per_m)
+    weight *= power[emitters.group][:, None]
     steps = _TIERS_IN_FOG if extinction_per_m > 0.0 else _TIERS_IN_CLEAR_AIR
-    tier = _tiers(weight.mean(axis=0), emitters, *steps)
+    tier = _tiers(weight.mean(axis=1), emitters, *steps)
     numbers = range(int(tier.max(initial=0)) + 1)
-    chance = np.concatenate([_chances(weight, emitters.group, tier == number) for number in numbers])
-    cumulative = np.cumsum(chance, axis=1)
-    cumulative = (cumulative / cumulative[:, -1:]).astype(np.float32)
-    last = len(tier) - 1 - np.argmax(chance[:, ::-1] > 0.0, axis=1)
-    cumulative[np.arange(len(tier)) >= last[:, None]] = 1.0
-    before = np.concatenate([np.zeros((len(cumulative), 1), dtype=np.float32), cumulative[:, :-1]], axis=1)
-    chance32 = np.asarray(cumulative - before, dtype=np.float32)
-    brought = np.stack([weight[:, tier == number].sum(axis=1) for number in numbers])
+    tables = [_chances(weight, emitters.group, tier == number) for number in numbers]
+    cumulative, chance = (np.concatenate(parts) for parts in zip(*tables, strict=True))
+    brought = np.stack([weight[tier == number].sum(axis=0) for number in numbers])
     share = brought / np.maximum(brought.sum(axis=0), 1e-300)
-    return Guide(
-        low_m, step_m, counts, np.asarray(cumulative, dtype=np.float32), chance32, tier, np.asarray(share)
-    )
+    return Guide(low_m, step_m, counts, cumulative, chance, tier, share)
 
 
-def _chances(weight: Array, group: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Array:
-    """Return the chances of the chosen emitters by their weights in each cell, shape (cells, emitters)."""
-    groups = np.unique(group[chosen])
-    total = weight[:, chosen].sum(axis=1, keepdims=True)
-    chance = np.zeros(weight.shape)
-    for one in groups:
-        own = chosen & (group == one)
-        own_weight = weight if own.all() else weight[:, own]
-        brought = own_weight.sum(axis=1, keepdims=True)
-        even = 1.0 / np.count_nonzero(own)
-        within = np.where(brought > 0.0, own_weight / np.where(brought > 0.0, brought, 1.0), even)
+def _chances(
+    weight: Array, group: NDArray[np.int64], chosen: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return cumulated chances of the chosen emitters, and chances, by their weights in each cell.
+
+    `weight` has shape (emitters, cells), what is returned (cells, emitters); the chance of others is 0.
+    """
+    places = np.flatnonzero(chosen)
+    places = places[np.argsort(group[places], kind="stable")]
+    first = np.flatnonzero(np.diff(group[places], prepend=-1))
+    count = np.diff(first, append=places.size)
+    own_weight = weight if np.array_equal(places, np.arange(len(group))) else weight[places]
+    if first.size == places.size:  # each group has one emitter
+        brought, within = own_weight, np.ones((1, 1))
+    else:
+        brought = np.add.reduceat(own_weight, first, axis=0)
+        of_group, even = np.repeat(brought, count, axis=0), np.repeat(1.0 / count, count)[:, None]
+        within = np.where(of_group > 0.0, own_weight / np.where(of_group > 0.0, of_group, 1.0), even)
         within = (1.0 - _EVEN_SHARE) * within + _EVEN_SHARE * even
-        if len(groups) > 1:
-            share = np.where(total > 0.0, brought / np.where(total > 0.0, total, 1.0), 1.0 / len(groups))
-            within = within * ((1.0 - _GROUP_SHARE) * share + _GROUP_SHARE / len(groups))
-        chance[:, own] = within
-    return chance
+    if first.size > 1:
+        total = brought.sum(axis=0)
+        share = np.where(total > 0.0, brought / np.where(total > 0.0, total, 1.0), 1.0 / first.size)
+        share = (1.0 - _GROUP_SHARE) * share + _GROUP_SHARE / first.size
+        within = within * (share if first.size == places.size else np.repeat(share, count, axis=0))
+    chance = np.zeros(weight.shape)
+    chance[places] = within
+    cumulative = np.cumsum(chance, axis=0)
+    last = len(chosen) - 1 - np.argmax(chance[::-1] > 0.0, axis=0)
+    cumulative = (cumulative / cumulative[-1]).astype(np.float32)
+    cumulative[np.arange(len(chosen))[:, None] >= last] = 1.0
+    chance32 = np.diff(cumulative, axis=0, prepend=np.float32(0.0))
+    return np.ascontiguousarray(cumulative.T), np.ascontiguousarray(chance32.T)
 
 
 def _tiers(brought: Array, emitters: Emitters, step: float, most: int) -> NDArray[np.int64]:
@@ -145,11 +148,40 @@ def _tiers(brought: Array, emitters: Emitters, step: float, most: int) -> NDArra
     return np.unique(level[emitters.group], return_inverse=True)[1].astype(np.int64)
 
 
+def _unshadowed(
+    emitters: Emitters, facets: Facets, axes_m: list[Array], step_m: Array, extinction_per_m: float
+) -> Array:
+    """Return what one unit of each emitter brings to cells if nothing hides it, shape (emitters, cells).
+
+    Spheres seen straight, of which there may be thousands, are reckoned together.
+    """
+    plain = (emitters.kind == SPHERE) & (emitters.facet < 0)
+    irradiance = np.empty((len(emitters.kind), *(axis.size for axis in axes_m[::-1])))
+    x2, y2, z2 = ((emitters.center_m[plain, k, None] - axes_m[k]) ** 2 for k in range(3))
+    distance2_m2 = (x2[:, None, None, :] + y2[:, None, :, None]) + z2[:, :, None, None]
+    irradiance[plain] = _of_sphere(distance2_m2, step_m, extinction_per_m)
+    z, y, x = np.meshgrid(*axes_m[::-1], indexing="ij")
+    places_m = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    irradiance = irradiance.reshape(len(emitters.kind), -1)
+    for row in np.flatnonzero(~plain):
+        irradiance[row] = _unshadowed_irradiance(
+            emitters, facets, int(row), places_m, step_m, extinction_per_m
+        )
+    return irradiance
+
+
+def _of_sphere(distance2_m2: Array, step_m: Array, extinction_per_m: float) -> Array:
+    """Return what a sphere brings to cells whose middles are so far."""
+    spread2_m2 = float(step_m @ step_m) / 12.0  # mean square distance within a cell from its middle
+    area_m2 = 4.0 * np.pi * (distance2_m2 + spread2_m2)
+    return np.exp(-extinction_per_m * np.sqrt(distance2_m2)) / area_m2 if extinction_per_m else 1.0 / area_m2
+
+
 def _unshadowed_irradiance(
     emitters: Emitters, facets: Facets, row: int, places_m: Array, step_m: Array, extinction_per_m: float
 ) -> Array:
     """Return what one unit of an emitter brings to places if nothing hides it, roughly, shape (places,)."""
-    spread2_m2 = float(step_m @ step_m) / 12.0  # mean square distance within a cell from its middle
+    spread2_m2 = float(step_m @ step_m) / 12.0
     facet = int(emitters.facet[row])
     kind = int(emitters.kind[row])
     if kind == SKY:
@@ -164,9 +196,7 @@ def _unshadowed_irradiance(
         to_m = emitters.center_m[row] - places_m
         distance2_m2 = (to_m**2).sum(axis=1)
         direction = to_m / np.sqrt(np.maximum(distance2_m2, 1e-12))[:, None]
-        irradiance = np.exp(-extinction_per_m * np.sqrt(distance2_m2)) / (
-            4.0 * np.pi * (distance2_m2 + spread2_m2)
-        )
+        irradiance = _of_sphere(distance2_m2, step_m, extinction_per_m)
         if kind == RECTANGLE:
             height_m = -(to_m @ emitters.normal[row])
             slack_m = 0.5 * float(np.abs(emitters.normal[row]) @ step_m)

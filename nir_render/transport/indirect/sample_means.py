@@ -39,9 +39,9 @@ def sample_means(
     """
     for _ in range(2):
         means = _sample_means(built, film, seed, groups, samples, narrow)
-        wrong = sum(int((~np.isfinite(array)).sum()) for array in means)
-        if not wrong:
+        if all(np.isfinite(array).all() for array in means):
             return means
+        wrong = sum(int((~np.isfinite(array)).sum()) for array in means)
         text = "indirect light came back not finite in %d of its values; the same samples are walked again"
         logging.getLogger(__name__).warning(text, wrong)
     raise InputError(
