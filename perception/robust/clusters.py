@@ -27,6 +27,7 @@ MOST_BLOBS = 8
 """Blobs in larger groups are measured one by one, each with the nearest that lie in its window."""
 
 _CROWD_NEIGHBOURS = 3
+_FAR_OFF_PX = 1.5  # of a blob's brightest pixel from the middle of its light
 _TOUCHING_PX = 4
 _KEPT_PX = 2
 
@@ -237,7 +238,8 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
     """Return sets of first guesses, the best of which is to be followed.
 
     Of a clipped flare, and of one that the frame's edge cuts, the part seen may be a small part of the flux;
-    but no source is larger than what is seen of it.
+    but no source is larger than what is seen of it. Where the middle of a lone blob's light is far from its
+    brightest pixel, a flare there may stand beside something else.
     """
     height, width = prepared.shape
     boxes = [member.blob.box for member in cluster.members]
@@ -260,6 +262,15 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
             starts.append((member.u_px, member.v_px, member.log_range(times * flux_e)))
         if starts not in sets:
             sets.append(starts)
+    if len(sets) == 1 and len(cluster.members) == 1:
+        (member,), smooth_px = cluster.members, math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
+        box, filtered_e = member.blob.box, member.blob.filtered_e
+        row, column = divmod(int(np.argmax(filtered_e)), box.width)
+        u_px, v_px = float(box.left + column), float(box.top + row)
+        if math.hypot(u_px - member.u_px, v_px - member.v_px) > max(_FAR_OFF_PX, member.image_radius_px):
+            # Filtered with its own width, a point's image has this share of its light in its brightest pixel.
+            flux_e = 4.0 * math.pi * smooth_px**2 * member.blob.peak_e
+            sets.append([(u_px, v_px, member.log_range(max(flux_e, floor_e)))])
     return sets
 
 

@@ -20,6 +20,7 @@ from perception.robust.overlap.deblend import (
     of_free_width,
 )
 from perception.robust.overlap.eclipse import eclipses
+from perception.robust.overlap.edge import is_beyond_doubt, with_edges
 from perception.robust.overlap.halo import with_halo
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
@@ -60,6 +61,12 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
             chosen[index] = None
     fit_beside_forward_light(chosen, camera)
+    lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
+    on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}
+    edged = with_edges(lone, on_structure, camera)
+    certain = {index: one for index, one in edged.items() if is_beyond_doubt(one, lone[index])}
+    for index in certain:
+        chosen[index] = None
     # Behind a rolling shutter a drive that switches while rows are read leaves a part of one flare, which two
     # flares would explain better.
     parted: dict[int, Solution] = {}
@@ -95,6 +102,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         chosen[index] = one
         uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
+    for index, one in _before_edges(edged, chosen, parted).items():
+        chosen[index], uneven_e[index] = one, one.left_over.structure_e
+        parted.pop(index, None)
     _retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
         chosen[index] = _better(more, chosen[index])
@@ -226,6 +236,18 @@ def _drop_beside_lines(
     for index, several in _parted(poor, halos, shape, camera, cut_short).items():
         if index not in parted or several.cost < parted[index].cost:
             parted[index] = several
+
+
+def _before_edges(
+    edged: Mapping[int, Solution], chosen: Sequence[Solution | None], parted: Mapping[int, Solution]
+) -> dict[int, Solution]:
+    """Return by index flares before edges where these explain all, and better than what did so far."""
+    likelier = {}
+    for index, one in edged.items():
+        held = parted.get(index, chosen[index])
+        if one.left_over.is_nothing and (held is None or one.cost < held.cost):
+            likelier[index] = one if held is None else weighed(one, held)
+    return likelier
 
 
 def _may_be_several(one: Solution | None) -> bool:

@@ -1,7 +1,7 @@
 """From clusters to measured flares: the fit, what to do where it is bad, and what is no source at all."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,12 +124,15 @@ def measure(
         measured += judged
         if not judged and len(cluster.members) > 1 and not apart:
             again += [cluster.members[k] for k in cluster.wanted]
+    others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
+    for cluster, solution in zip(others, _of_large_discs(others, prepared, camera), strict=True):
+        fits = solution is not None and _is_whole_discs(solution)
+        small = [] if fits or apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
+        again += [cluster.members[k] for k in small]
+        measured += _by_disc(cluster, solution if fits else None, small, prepared)
     if again:
         # What spoils a cluster spoils it for all: each by itself, the others left out.
         measured += measure(clusters(again, prepared, apart=True), prepared, apart=True)
-    others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
-    for cluster, solution in zip(others, _of_large_discs(others, prepared, camera), strict=True):
-        measured += _by_disc(cluster, solution, prepared)
     return measured
 
 
@@ -188,6 +191,7 @@ def _measurement(
     if may_be_in_fog(prepared.calibration):
         # The range that this fit states is loosely tied to the flux, which tells it in fog.
         told_sigma = math.hypot(0.5 * flux_sigma_e / flux_e, hidden / math.sqrt(3.0))
+    on_edge = solution.window.edges is not None
     bound_only = saturated and not told_sigma < CLIPPED_RANGE_SIGMA
     return MeasuredFlare(
         u_px=u_px,
@@ -208,7 +212,7 @@ def _measurement(
         is_doubtful=solution.is_doubtful or hidden > of_one,
         may_be_more=solution.may_be_more,
         on_texture=solution.window.structure_e > 0.0,
-        on_edges=solution.window.on_edges or left.peak_sigmas > RESIDUAL_SIGMAS,
+        on_edges=solution.window.on_edges or on_edge or left.peak_sigmas > RESIDUAL_SIGMAS,
     )
 
 
@@ -268,16 +272,23 @@ def _large_discs(cluster: Cluster, prepared: PreparedFrame) -> list[int]:
     return [k for k, one in members if not (one.is_too_large and is_no_large_disc(one, prepared))]
 
 
+def _is_whole_discs(solution: Solution) -> bool:
+    """Tell whether whole discs leave so little that they are taken for sources."""
+    return solution.left_over.share <= MOST_LEFT and bool(solution.ranged.all())
+
+
 def _by_disc(
-    cluster: Cluster, solution: Solution | None, prepared: PreparedFrame
+    cluster: Cluster, solution: Solution | None, without: Container[int], prepared: PreparedFrame
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a fit of whole large discs into measurements, or sum apertures where there is none that is one.
+
+    Some members, to be measured otherwise, are left out.
 
     A disc that is not all there, or not alone, leaves light over: about twice as much its flux may lack, or
     have too much, as the fit has taken a part of it up; by such a share of its radius it may be elsewhere.
     """
-    wanted = _large_discs(cluster, prepared)
-    if solution is None or solution.left_over.share > MOST_LEFT or not bool(solution.ranged.all()):
+    wanted = [k for k in _large_discs(cluster, prepared) if k not in without]
+    if solution is None:
         return [
             (cluster.members[k].blob, _from_aperture(cluster.members[k], cluster, prepared)) for k in wanted
         ]

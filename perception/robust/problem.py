@@ -38,6 +38,8 @@ class Window:
     known_e, unsure
         Light that is there beside flares and background, shape (height, width); None where there is none. And
         what is not known of it, which lies on top of any structure; None where nothing is.
+    edges
+        Straight edges on the background, with what is not known of them; None where there are none.
     """
 
     box: PixelBox
@@ -51,13 +53,16 @@ class Window:
     on_edges: bool = False
     known_e: Array | None = None
     unsure: Structure | None = None
+    edges: Structure | None = None
 
     @property
     def beside(self) -> Structure:
         """All that may lie beside flares and even background."""
-        if self.unsure is not None:
-            return joined(self.structure, self.unsure)
-        return even(self.image_e.size) if self.structure is None else self.structure
+        whole = self.structure
+        for more in (self.unsure, self.edges):
+            if more is not None:
+                whole = joined(whole, more)
+        return even(self.image_e.size) if whole is None else whole
 
     @property
     def usable(self) -> NDArray[np.bool_]:
