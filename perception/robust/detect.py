@@ -29,7 +29,7 @@ _AT_ONCE = 8  # clusters between two looks at the clock
 _RING_PX = 4
 _SUMMIT_REACH = 4.0  # σ of the point spread: three of what it is filtered to, √2 times as wide
 _FEWEST_RING_PIXELS = 8
-_LARGE_HILL = 8  # squares as wide as a point's image
+_LARGE_HILL = 8  # times the square that a point's image reaches
 
 
 def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = math.inf) -> Detections:
@@ -199,24 +199,29 @@ def _middles_e(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[float]:
 
 
 def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Blob]:
-    """Divide a component, on such a background, at maxima that differ by more than their noise."""
+    """Divide a component, on such a background, at maxima that differ by more than their noise.
+
+    Parts are cut off hills, where they are large or the background has structure.
+    """
     expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
-    parts = split_at_peaks(component, noise_e)
     reach_px = math.ceil(_SUMMIT_REACH * math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0))
-    return [_off_hill(part, component, reach_px, prepared) for part in parts]
+    return [
+        _off_hill(part, component, reach_px, prepared)
+        if part.area_px >= _LARGE_HILL * (reach_px + 1) ** 2 or prepared.is_structured(part.box)
+        else part
+        for part in split_at_peaks(component, noise_e)
+    ]
 
 
 def _off_hill(part: Blob, component: Blob, reach_px: int, prepared: PreparedFrame) -> Blob:
-    """Cut a part of a component off the hill that it stands on: a large one, or where there is structure."""
+    """Cut a part of a component off the hill that it stands on."""
     peak = np.argmax(np.where(part.pixels, part.filtered_e, np.float32(-np.inf)))
     row, column = divmod(int(peak), part.box.width)
     down, across = part.box.top - component.box.top + row, part.box.left - component.box.left + column
     around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
     # Its brightest pixel may be the flank of another, larger one.
     if around.max() > part.peak_e:
-        return part
-    if part.area_px < _LARGE_HILL * (reach_px + 1) ** 2 and not prepared.is_structured(part.box):
         return part
     return summit(part, part.pixels & prepared.clipped_in(part.box), reach_px)
 
