@@ -28,7 +28,8 @@ MOST_EDGES = 2
 _ANGLES, _STEP_PX = 18, 1.0
 _LEAST_KEPT = 0.02  # of an edge's power, beside what flares and an even background may take of it
 _ROUNDS, _CLIMBS = 3, 16
-_SEEMS_SIGMAS = 3.0
+_SEEMS_SIGMAS, _SEEMS_GAIN = 3.0, 12.0
+_LEAST_HEIGHT_E = 0.1
 _SETTLED = 0.01  # of χ²
 _MOST_STEPS = (1.0, 0.15, 0.3)  # px, rad, ln width
 _WIDEST = 4.0  # widths of a sharp one
@@ -142,8 +143,9 @@ def _seen_edge(one: Solution) -> Edge | None:
     """Return the edge that what is left over asks for most; None where there is none."""
     window, width_px = one.window, _sharp_px(one)
     height_e, offset_px, angle_rad = _likeliest_edge(
-        window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu, width_px
-    )
+        window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu, width_px,
+        0.0 if _leaves_something(one) else _SEEMS_GAIN,
+    )  # fmt: skip
     return None if height_e == 0.0 else Edge(height_e, offset_px, angle_rad, width_px)
 
 
@@ -236,19 +238,20 @@ def _structure(edges: list[Edge], one: Solution) -> Structure:
         along_u, along_v = math.cos(edge.angle_rad), math.sin(edge.angle_rad)
         beyond_px = (one.u_px - middle_u) * along_u + (one.v_px - middle_v) * along_v - edge.offset_px
         columns += [(profile - float(ndtr(beyond_px / edge.width_px).mean())).ravel(), *map(np.ravel, slopes)]
-        sigma += [abs(edge.height_e) * prior for prior in _PRIOR]
+        sigma += [max(abs(edge.height_e), _LEAST_HEIGHT_E) * prior for prior in _PRIOR]
     return Structure(np.array(columns), np.diag(1.0 / np.square(sigma)))
 
 
 @compiled
 def _likeliest_edge(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array,
-    floor_e2: float, prnu: float, width_px: float,
+    floor_e2: float, prnu: float, width_px: float, least_gain: float,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Return height, place and angle of the edge that brings most, beside flares that may all be off.
 
     What an error of the flares' light, place and width, and of the even background, looks like is taken away
-    from the residual and from each edge. The height is 0 where none brings anything.
+    from the residual and from each edge. The height is 0 where none
+    brings as much as `least_gain`, in 2 Δ ln L.
     """
     rows, columns = image_e.shape
     middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (rows - 1)
@@ -281,7 +284,7 @@ def _likeliest_edge(
     rise = np.empty(129)
     for step in range(129):
         rise[step] = 1.0 / (1.0 + math.exp(-1.702 * (step / 16.0 - 4.0)))
-    most, height_e, offset_px, angle_rad = 0.0, 0.0, 0.0, 0.0
+    most, height_e, offset_px, angle_rad = least_gain, 0.0, 0.0, 0.0
     reach_px = math.hypot(middle_x, middle_y)
     for turn in range(_ANGLES):
         angle = math.pi * turn / _ANGLES
