@@ -63,7 +63,11 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     fit_beside_forward_light(chosen, camera)
     lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
     on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}
-    edged = with_edges(lone, on_structure, camera)
+    found_edges = with_edges(lone, on_structure, camera)
+    beside_edges = [found_edges.get(index) for index in range(len(found))]
+    # What light fog throws forward goes by a flux that an edge no longer leads astray.
+    fit_beside_forward_light(beside_edges, camera)
+    edged = {index: one for index, one in enumerate(beside_edges) if one is not None}
     certain = {index: one for index, one in edged.items() if is_beyond_doubt(one, lone[index])}
     for index in certain:
         chosen[index] = None
@@ -77,7 +81,10 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     known = plain
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
-        may_be = [one is None or may_be_other_shape(one, camera) for one in plain]
+        may_be = [
+            index not in certain and (one is None or may_be_other_shape(one, camera))
+            for index, one in enumerate(plain)
+        ]
         divisible = [
             one if other or _may_be_several(one) else None for one, other in zip(plain, may_be, strict=True)
         ]
@@ -111,7 +118,8 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, pair in rivals.items():
         chosen[index] = _beside_rival(chosen[index], pair)
     if prepared.frame.line_time_s == 0.0:
-        for index, one_or_two in doubted(chosen, plain, camera).items():
+        at_rest = [certain.get(index, one) for index, one in enumerate(plain)]
+        for index, one_or_two in doubted(chosen, at_rest, camera).items():
             chosen[index] = one_or_two
     for index in cut_short:
         one = chosen[index]
@@ -244,9 +252,15 @@ def _before_edges(
     """Return by index flares before edges where these explain all, and better than what did so far."""
     likelier = {}
     for index, one in edged.items():
-        held = parted.get(index, chosen[index])
-        if one.left_over.is_nothing and (held is None or one.cost < held.cost):
-            likelier[index] = one if held is None else weighed(one, held)
+        rivals = [rival for rival in (parted.get(index), chosen[index]) if rival is not None]
+        held = min(rivals, key=lambda rival: rival.cost, default=None)
+        if not one.left_over.is_nothing:
+            continue
+        if held is None:
+            likelier[index] = one
+        # Costs of fits to other pixels, as without columns that charge spilled along, are no measure.
+        elif one.cost < held.cost and np.array_equal(one.window.state, held.window.state):
+            likelier[index] = weighed(one, held)
     return likelier
 
 

@@ -59,7 +59,7 @@ def camera_direction(film: Film, pixel: UInt, along: Float, down: Float) -> Vect
 
 @dataclass(frozen=True, eq=False)
 class Deal:
-    """The share of each tier in the samples of each lane's pixel; none where all lights are of one tier."""
+    """The share of each tier in the samples of each lane's pixel; none where paths serve all lights."""
 
     shares: list[Float]
 

@@ -58,7 +58,7 @@ def ask_lights(
     number: Random,
     add: AddLight,
 ) -> SurfaceSample:
-    """Add what a surface scatters of one light into the path, and return its sample of a way onwards.
+    """Add what a surface scatters of lights into the path, and return its sample of a way onwards.
 
     Both come from one call of Mitsuba's, which costs less than two. In clear air one light of each tier is
     asked for: so what weak ones bring needs no share of what the strong are asked.
@@ -74,6 +74,7 @@ def ask_lights(
     asked = _AskedLight(row, chance, aim, weight * value[0], density)
     _add_asked_light(scene, state, si, asked, surface, max_depth, add)
     if scene.lights.tiers > 1 and state.tier is None:
+        assert scene.lights.tiers == 2  # as many as are asked here
         weak = cell + scene.choice.cells
         row, chance = choose_light(scene.choice, scene.lights, weak, number(draws.WEAK))
         u, v = number(draws.WEAK_U), number(draws.WEAK_V)

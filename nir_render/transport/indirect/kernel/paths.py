@@ -5,8 +5,9 @@ A lane alone adds to its places in the result, in its samples' order: the same b
 
 Each step is a stretch of a path, from a vertex to the next: fog on the way scatters light of one light
 towards the vertex (a place drawn where the phase function and the inverse square put it, Kulla & Fajardo
-2012); at the surface one light is asked for (next-event estimation), and the path goes on by the surface's
-own scattering, or by the fog's. Both ways to a light are weighted by the power heuristic (Veach 1995).
+2012); at the surface one light, in clear air one of each tier, is asked for (next-event estimation), and
+the path goes on by the surface's own scattering, or by the fog's. Both ways to a light are weighted by the
+power heuristic (Veach 1995).
 """
 
 from collections.abc import Callable

@@ -44,6 +44,6 @@ class PathState:
     way: Int
     inside: Mask  # a transparent solid
     in_fog: Mask | None  # whether that vertex is fog's; None in clear air
-    tier: UInt | None  # of lights that the path serves; None where all are of one
+    tier: UInt | None  # of lights that the path serves; None where it serves all
     dealt: Float | None  # one over the share of samples that serve it
     active: Mask
