@@ -81,10 +81,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     known = plain
     if prepared.frame.line_time_s == 0.0:
         plain = [None if c.is_in_crowd else s for c, s in zip(found, chosen, strict=True)]
-        may_be = [
-            index not in certain and (one is None or may_be_other_shape(one, camera))
-            for index, one in enumerate(plain)
-        ]
+        may_be = [one is None or may_be_other_shape(one, camera) for one in plain]
         divisible = [
             one if other or _may_be_several(one) else None for one, other in zip(plain, may_be, strict=True)
         ]
@@ -118,8 +115,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, pair in rivals.items():
         chosen[index] = _beside_rival(chosen[index], pair)
     if prepared.frame.line_time_s == 0.0:
-        at_rest = [certain.get(index, one) for index, one in enumerate(plain)]
-        for index, one_or_two in doubted(chosen, at_rest, camera).items():
+        for index, one_or_two in doubted(chosen, plain, camera).items():
             chosen[index] = one_or_two
     for index in cut_short:
         one = chosen[index]
@@ -252,15 +248,9 @@ def _before_edges(
     """Return by index flares before edges where these explain all, and better than what did so far."""
     likelier = {}
     for index, one in edged.items():
-        rivals = [rival for rival in (parted.get(index), chosen[index]) if rival is not None]
-        held = min(rivals, key=lambda rival: rival.cost, default=None)
-        if not one.left_over.is_nothing:
-            continue
-        if held is None:
-            likelier[index] = one
-        # Costs of fits to other pixels, as without columns that charge spilled along, are no measure.
-        elif one.cost < held.cost and np.array_equal(one.window.state, held.window.state):
-            likelier[index] = weighed(one, held)
+        held = parted.get(index, chosen[index])
+        if one.left_over.is_nothing and (held is None or one.cost < held.cost):
+            likelier[index] = one if held is None else weighed(one, held)
     return likelier
 
 

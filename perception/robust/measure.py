@@ -1,7 +1,7 @@
 """From clusters to measured flares: the fit, what to do where it is bad, and what is no source at all."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -127,10 +127,9 @@ def measure(
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
     for cluster, solution in zip(others, _of_large_discs(others, prepared, camera), strict=True):
         fits = solution is not None and _is_whole_discs(solution)
-        if not (fits or apart or all(cluster.members[k].is_beyond_fit for k in cluster.wanted)):
-            again += [cluster.members[k] for k in cluster.wanted]
-            continue
-        measured += _by_disc(cluster, solution if fits else None, prepared)
+        small = [] if fits or apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
+        again += [cluster.members[k] for k in small]
+        measured += _by_disc(cluster, solution if fits else None, small, prepared)
     if again:
         # What spoils a cluster spoils it for all: each by itself, the others left out.
         measured += measure(clusters(again, prepared, apart=True), prepared, apart=True)
@@ -279,14 +278,16 @@ def _is_whole_discs(solution: Solution) -> bool:
 
 
 def _by_disc(
-    cluster: Cluster, solution: Solution | None, prepared: PreparedFrame
+    cluster: Cluster, solution: Solution | None, without: Container[int], prepared: PreparedFrame
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a fit of whole large discs into measurements, or sum apertures where there is none that is one.
+
+    Some members, to be measured otherwise, are left out.
 
     A disc that is not all there, or not alone, leaves light over: about twice as much its flux may lack, or
     have too much, as the fit has taken a part of it up; by such a share of its radius it may be elsewhere.
     """
-    wanted = _large_discs(cluster, prepared)
+    wanted = [k for k in _large_discs(cluster, prepared) if k not in without]
     if solution is None:
         return [
             (cluster.members[k].blob, _from_aperture(cluster.members[k], cluster, prepared)) for k in wanted

@@ -30,7 +30,6 @@ _LEAST_KEPT = 0.02  # of an edge's power, beside what flares and an even backgro
 _ROUNDS, _CLIMBS = 3, 16
 _SEEMS_SIGMAS, _SEEMS_GAIN = 3.0, 12.0
 _LEAST_HEIGHT_E = 0.1
-_MOST_PIXELS = 64**2  # of a window: the search takes 20 ms there
 _SETTLED = 0.01  # of χ²
 _MOST_STEPS = (1.0, 0.15, 0.3)  # px, rad, ln width
 _WIDEST = 4.0  # widths of a sharp one
@@ -78,8 +77,7 @@ def with_edges(
     going = {
         index: one
         for index, one in flares.items()
-        if one.window.image_e.size <= _MOST_PIXELS
-        and (_leaves_something(one) or (index in on_structure and one.left_over.peak_sigmas > _SEEMS_SIGMAS))
+        if _leaves_something(one) or (index in on_structure and one.left_over.peak_sigmas > _SEEMS_SIGMAS)
     }
     for _ in range(MOST_EDGES):
         tried: dict[int, list[Edge]] = {}
@@ -135,9 +133,7 @@ def _fitted(
             if again is None:
                 del known[index]
                 continue
-            # Structure has its prior about the width as it has come out.
-            off = [math.log(edge.width_px / _sharp_px(again)) / _PRIOR[3] for edge in known[index]]
-            current[index] = again = replace(again, deviance=again.deviance + sum(np.square(off).tolist()))
+            current[index] = again
             if index not in best or again.deviance < best[index][0].deviance:
                 best[index] = again, known[index]
     return best
