@@ -171,8 +171,16 @@ class Cluster:
         return any(member.is_clipped for member in self.members)
 
 
-def clusters(members: Sequence[Candidate], prepared: PreparedFrame, apart: bool = False) -> list[Cluster]:
-    """Group candidates that lie side by side, unless `apart`, and cut their windows out of the frame."""
+def clusters(
+    members: Sequence[Candidate],
+    prepared: PreparedFrame,
+    apart: bool = False,
+    measured: Sequence[Candidate] = (),
+) -> list[Cluster]:
+    """Group candidates that lie side by side, unless `apart`, and cut their windows out of the frame.
+
+    The pixels of what is `measured` already are left out of the windows.
+    """
     blobs = [member.blob for member in members]
     chosen: list[tuple[list[int], list[int]]] = []
     for group in [[k] for k in range(len(blobs))] if apart else near_groups(blobs, NEAR_PX):
@@ -191,8 +199,9 @@ def clusters(members: Sequence[Candidate], prepared: PreparedFrame, apart: bool 
             chosen.append(([group[k] for k in within], [within.index(at)]))
     owner = np.full(len(prepared.lit_at), -1)
     if blobs:
-        of_blobs = [blob.places(prepared.calibration.width_px) for blob in blobs]
-        of = np.repeat(np.arange(len(blobs)), [len(each) for each in of_blobs])
+        lit = [*blobs, *(candidate.blob for candidate in measured)]
+        of_blobs = [blob.places(prepared.calibration.width_px) for blob in lit]
+        of = np.repeat(np.arange(len(lit)), [len(each) for each in of_blobs])
         owner[np.searchsorted(prepared.lit_at, np.concatenate(of_blobs))] = of
     grounds_e = prepared.backgrounds_e(
         (members[group[0]].u_px, members[group[0]].v_px) for group, _ in chosen

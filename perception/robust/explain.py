@@ -20,7 +20,7 @@ from perception.robust.overlap.deblend import (
     of_free_width,
 )
 from perception.robust.overlap.eclipse import eclipses
-from perception.robust.overlap.edge import is_beyond_doubt, with_edges
+from perception.robust.overlap.edge import is_beyond_doubt, with_edges, with_flares_and_edges
 from perception.robust.overlap.halo import with_halo
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
@@ -106,6 +106,13 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         chosen[index] = one
         uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
+    several = {
+        index: one
+        for index, one in lone.items()
+        if _is_unexplained(one, edged.get(index))
+        and (index not in parted or parted[index].count > one.count + 2)
+    }
+    edged |= with_flares_and_edges(several, camera)
     for index, one in _before_edges(edged, chosen, parted).items():
         chosen[index], uneven_e[index] = one, one.left_over.structure_e
         parted.pop(index, None)
@@ -252,6 +259,11 @@ def _before_edges(
         if one.left_over.is_nothing and (held is None or one.cost < held.cost):
             likelier[index] = one if held is None else weighed(one, held)
     return likelier
+
+
+def _is_unexplained(*fits: Solution | None) -> bool:
+    """Tell whether each of some fits leaves something to explain."""
+    return not any(one is not None and one.left_over.is_nothing and not asks_for_more(one) for one in fits)
 
 
 def _may_be_several(one: Solution | None) -> bool:

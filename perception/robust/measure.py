@@ -116,12 +116,14 @@ def measure(
     free = dict(zip(odd, of_odd, strict=True))
     measured: list[tuple[Blob, MeasuredFlare]] = []
     again: list[Candidate] = []
+    done: list[Candidate] = []
     for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True)):
         other_size = (
             index in free and solution is not None and is_other_size(solution, free[index], camera.tie_spread)
         )
         judged = [] if solution is None or other_size else _judged(cluster, solution, prepared)
         measured += judged
+        done += [cluster.members[k] for k in cluster.wanted] if judged else []
         if not judged and len(cluster.members) > 1 and not apart:
             again += [cluster.members[k] for k in cluster.wanted]
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
@@ -132,7 +134,7 @@ def measure(
         measured += _by_disc(cluster, solution if fits else None, small, prepared)
     if again:
         # What spoils a cluster spoils it for all: each by itself, the others left out.
-        measured += measure(clusters(again, prepared, apart=True), prepared, apart=True)
+        measured += measure(clusters(again, prepared, apart=True, measured=done), prepared, apart=True)
     return measured
 
 

@@ -67,14 +67,14 @@ def deblend(
     asking, late = sorted(by_flux[:MOST_WINDOWS]), by_flux[MOST_WINDOWS:]
     null = dict(enumerate(found))
     while asking:
-        trials = [(index, starts) for index in asking for starts in _more(found[index])]
-        fits = solve([_of_more(found[index], starts) for index, starts in trials], camera)
+        trials = [(index, starts) for index in asking for starts in with_one_more(found[index])]
+        fits = solve([of_more(found[index], starts) for index, starts in trials], camera)
         best: dict[int, Solution] = {}
         for (index, _), fit in zip(trials, fits, strict=True):
             if fit is not None and (index not in best or fit.deviance < best[index].deviance):
                 best[index] = fit
         gaining = [index for index, fit in best.items() if gain(null[index], fit) >= LEAST_GAIN]
-        null |= _eased({index: found[index] for index in gaining if found[index].count == 1}, camera)
+        null |= eased({index: found[index] for index in gaining if found[index].count == 1}, camera)
         asking = []
         for index in gaining:
             fit, halo = best[index], beside.pop(index, None)
@@ -94,7 +94,7 @@ def _leaves_something(halo: Solution) -> bool:
     return not halo.left_over.is_nothing or asks_for_more(halo)
 
 
-def _eased(lone: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
+def eased(lone: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
     """Return by index lone flares of any width of the point spread, or any size, where that explains more."""
     eased = dict(lone)
     large = [index for index, one in lone.items() if float(one.image_radius_px[0]) > _LEAST_RADIUS_PX]
@@ -146,7 +146,7 @@ def gain(one: Solution, other: Solution) -> float:
     return float(np.sum((one.residual_e**2 - other.residual_e**2) / variance))
 
 
-def _of_more(current: Solution, starts: Sequence[Start]) -> Problem:
+def of_more(current: Solution, starts: Sequence[Start]) -> Problem:
     """Return the problem of fitting more flares; where they move, each begins with the mean motion."""
     motions = None
     if current.motion_px is not None:
@@ -155,7 +155,7 @@ def _of_more(current: Solution, starts: Sequence[Start]) -> Problem:
     return Problem(current.window, starts, current.background_e, motions)
 
 
-def _more(current: Solution) -> list[list[Start]]:
+def with_one_more(current: Solution) -> list[list[Start]]:
     """Return first guesses with one flare more."""
     box, flares = current.window.box, current.starts
     row, column = current.left_over.peak
