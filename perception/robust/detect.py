@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.model.bearing import bearing_body
 from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
@@ -13,7 +14,7 @@ from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
-from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks, summit
+from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks, standing, summit
 from perception.robust.search.frame import levels_around
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
@@ -206,24 +207,33 @@ def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Bl
     expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
     reach_px = math.ceil(_SUMMIT_REACH * math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0))
+    least_px = _LARGE_HILL * (reach_px + 1) ** 2
     return [
-        _off_hill(part, component, reach_px, prepared)
-        if part.area_px >= _LARGE_HILL * (reach_px + 1) ** 2 or prepared.is_structured(part.box)
-        else part
+        flare
         for part in split_at_peaks(component, noise_e)
+        for flare in (
+            _off_hill(part, component, noise_e, reach_px, prepared)
+            if part.area_px >= least_px or prepared.is_structured(part.box)
+            else [part]
+        )
     ]
 
 
-def _off_hill(part: Blob, component: Blob, reach_px: int, prepared: PreparedFrame) -> Blob:
-    """Cut a part of a component off the hill that it stands on."""
+def _off_hill(
+    part: Blob, component: Blob, noise_e: NDArray[np.float32], reach_px: int, prepared: PreparedFrame
+) -> list[Blob]:
+    """Cut a part of a component, and what else stands out of it, off the hill that it stands on."""
     peak = np.argmax(np.where(part.pixels, part.filtered_e, np.float32(-np.inf)))
     row, column = divmod(int(peak), part.box.width)
-    down, across = part.box.top - component.box.top + row, part.box.left - component.box.left + column
+    top, left = part.box.top - component.box.top, part.box.left - component.box.left
+    down, across = top + row, left + column
+    clips = part.pixels & prepared.clipped_in(part.box)
     around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
     # Its brightest pixel may be the flank of another, larger one.
-    if around.max() > part.peak_e:
-        return part
-    return summit(part, part.pixels & prepared.clipped_in(part.box), reach_px)
+    flare = part if around.max() > part.peak_e else summit(part, clips, reach_px)
+    if flare.area_px < _LARGE_HILL * (reach_px + 1) ** 2 or clips.any():
+        return [flare]
+    return standing(part, component, noise_e, reach_px, prepared.shape) or [flare]
 
 
 def _detection(

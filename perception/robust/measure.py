@@ -116,6 +116,7 @@ def measure(
     free = dict(zip(odd, of_odd, strict=True))
     measured: list[tuple[Blob, MeasuredFlare]] = []
     again: list[Candidate] = []
+    unseen: list[Candidate] = []
     done: list[Candidate] = []
     for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True)):
         other_size = (
@@ -123,9 +124,13 @@ def measure(
         )
         judged = [] if solution is None or other_size else _judged(cluster, solution, prepared)
         measured += judged
-        done += [cluster.members[k] for k in cluster.wanted] if judged else []
-        if not judged and len(cluster.members) > 1 and not apart:
-            again += [cluster.members[k] for k in cluster.wanted]
+        wanted = [cluster.members[k] for k in cluster.wanted]
+        if judged:
+            done += wanted
+        elif len(cluster.members) > 1:
+            again += [] if apart else wanted
+        elif apart and solution is not None and solution.left_over.is_nothing:
+            unseen += wanted
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
     for cluster, solution in zip(others, _of_large_discs(others, prepared, camera), strict=True):
         fits = solution is not None and _is_whole_discs(solution)
@@ -135,6 +140,10 @@ def measure(
     if again:
         # What spoils a cluster spoils it for all: each by itself, the others left out.
         measured += measure(clusters(again, prepared, apart=True, measured=done), prepared, apart=True)
+    if unseen:
+        # Of two side by side that spoil nothing each leaves out too much of the other.
+        together = [one for one in clusters(unseen, prepared, measured=done) if len(one.members) > 1]
+        measured += measure(together, prepared, apart=True)
     return measured
 
 

@@ -82,8 +82,10 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
     """
     window, place = solution.window, (float(solution.u_px[index]), float(solution.v_px[index]))
     inner_px = float(solution.image_radius_px[index]) + 2.0 * solution.psf_sigma_px + 1.0
+    # Straight edges beside it are explained.
+    edges_e = 0.0 if window.edges is None else solution.expected_e - solution.flares_e - solution.background_e
     share = _share_above(
-        window.image_e,
+        window.image_e - edges_e,
         solution.flares_e,
         solution.background_e,
         (window.box.top, window.box.left),

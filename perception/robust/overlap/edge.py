@@ -158,6 +158,7 @@ def _with_one_flare_more(found: Mapping[int, Solution], camera: Camera) -> dict[
         for index, one in found.items()
         if one.count < MOST_BEFORE_EDGES and asks_for_more(one)
         for starts in with_one_more(one)
+        if len(starts) == one.count + 1
     ]
     fits = solve([of_more(found[index], starts) for index, starts in trials], camera)
     best: dict[int, Solution] = {}

@@ -1,5 +1,6 @@
 """From a mask to blobs: connected components, and where one of them holds several flares."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,6 +13,9 @@ from perception.model.flare import PixelBox
 
 _MAX_PEAKS = 16
 _BESIDE_PX = 4
+_WAYS = 32  # across a place, at equal angles
+_STANDING_SIGMAS = 7.4  # 6 of a place less the mean of two others
+_STANDING_SHARE = 0.25  # of how much brighter it is than the darkest around it
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +188,77 @@ def summit(blob: Blob, clips: NDArray[np.bool_], reach_px: int) -> Blob:
         return blob
     level_e = float(blob.filtered_e[beside].max())
     return _trimmed(blob, _part_with_peak(blob, level_e)) if level_e < blob.peak_e else blob
+
+
+def standing(
+    part: Blob, component: Blob, noise: NDArray[np.float32], reach_px: int, shape: tuple[int, int]
+) -> list[Blob]:
+    """Cut out what stands out of a hill in every direction: flares on the bright rim of a wall, or before it.
+
+    A rim, a bar, a slope are as bright, somewhere, on both sides of each of their places, or brighter on one
+    side by as much as they are darker on the other. A flare is brighter than the mean of any two places
+    opposite each other beyond its reach. What such a mean says is the level that a flare is cut off at.
+
+    Parameters
+    ----------
+    part, component
+        What is looked at, of all that exceeds the detection limit in one piece with it.
+    noise
+        Standard deviation of the component's filtered image, shape (box.height, box.width).
+    reach_px
+        How far a point's image reaches beyond its half maximum.
+    shape
+        Of the frame: what is nearer to its edge than that is not looked at.
+    """
+    box, mask = component.box, np.zeros_like(component.pixels)
+    mask[part.box.seen_from(box).slices] = part.pixels
+    rows, columns = np.ogrid[: box.height, : box.width]
+    inner_rows = (rows + box.top >= reach_px) & (rows + box.top < shape[0] - reach_px)
+    inner = inner_rows & (columns + box.left >= reach_px) & (columns + box.left < shape[1] - reach_px)
+    cut = []
+    for row, column, level_e in _standing(mask & inner, component.filtered_e, noise, reach_px):
+        near = (abs(rows - row) <= reach_px) & (abs(columns - column) <= reach_px)
+        square = _trimmed(component, mask & near)
+        cut.append(_trimmed(square, _part_with_peak(square, level_e)))
+    return cut
+
+
+@compiled
+def _standing(
+    mask: NDArray[np.bool_], brightness: NDArray[np.float32], noise: NDArray[np.float32], reach_px: int
+) -> list[tuple[int, int, float]]:
+    """Return row and column of what stands out in every direction, and the level that it stands on."""
+    height, width = mask.shape
+    found = [(0, 0, 0.0) for _ in range(0)]
+    for row in range(height):
+        for column in range(width):
+            here, least = brightness[row, column], _STANDING_SIGMAS * noise[row, column]
+            if not mask[row, column] or not here > least:
+                continue
+            if brightness[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].max() > here:
+                continue
+            level, darkest = 0.0, here
+            for way in range(_WAYS):
+                down = reach_px * math.sin(math.pi * way / _WAYS)
+                across = reach_px * math.cos(math.pi * way / _WAYS)
+                one = _between(brightness, row + down, column + across)
+                other = _between(brightness, row - down, column - across)
+                level, darkest = max(level, 0.5 * (one + other)), min(darkest, one, other)
+            if here - level > max(least, _STANDING_SHARE * (here - darkest)):
+                found.append((row, column, level))
+    return found
+
+
+@compiled
+def _between(image: NDArray[np.float32], row: float, column: float) -> float:
+    """Return the value of an image between its pixels, by four of them; 0 beyond."""
+    first_row, first = math.floor(row), math.floor(column)
+    value = 0.0
+    for at_row in (first_row, first_row + 1):
+        for at in (first, first + 1):
+            if 0 <= at_row < image.shape[0] and 0 <= at < image.shape[1]:
+                value += (1.0 - abs(row - at_row)) * (1.0 - abs(column - at)) * image[at_row, at]
+    return value
 
 
 def _part_with_peak(blob: Blob, level_e: float) -> NDArray[np.bool_]:
