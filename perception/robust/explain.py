@@ -68,6 +68,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     # What light fog throws forward goes by a flux that an edge no longer leads astray.
     fit_beside_forward_light(beside_edges, camera)
     edged = {index: one for index, one in enumerate(beside_edges) if one is not None}
+    beside = list(chosen)
     certain = {index: one for index, one in edged.items() if is_beyond_doubt(one, lone[index])}
     for index in certain:
         chosen[index] = None
@@ -106,13 +107,14 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         chosen[index] = one
         uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
-    several = {
+    unexplained = {
         index: one
-        for index, one in lone.items()
-        if _is_unexplained(one, edged.get(index))
-        and (index not in parted or parted[index].count > one.count + 2)
+        for index, one in enumerate(beside)
+        if not found[index].is_in_crowd
+        and _is_unexplained(one, edged.get(index))
+        and (index not in parted or one is None or parted[index].count > one.count + 2)
     }
-    edged |= with_flares_and_edges(several, camera)
+    edged |= with_flares_and_edges(_brightest(unexplained, found, camera), camera)
     for index, one in _before_edges(edged, chosen, parted).items():
         chosen[index], uneven_e[index] = one, one.left_over.structure_e
         parted.pop(index, None)
@@ -259,6 +261,35 @@ def _before_edges(
         if one.left_over.is_nothing and (held is None or one.cost < held.cost):
             likelier[index] = one if held is None else weighed(one, held)
     return likelier
+
+
+def _brightest(
+    fits: Mapping[int, Solution | None], found: Sequence[Cluster], camera: Camera
+) -> dict[int, Solution]:
+    """Fit the brightest flare of each cluster alone: what else there is may be more flares, or edges.
+
+    Returns
+    -------
+    By index; the fit so far where that is of one flare, none where neither converges.
+    """
+    alone = {index: one for index, one in fits.items() if one is not None}
+    tried, problems = [], []
+    for index, one in fits.items():
+        members = found[index].members
+        if one is None and len(members) > 1:
+            brightest = max(members, key=lambda member: member.flux_e)
+            start = brightest.u_px, brightest.v_px, brightest.log_range(max(brightest.flux_e, 1.0))
+            problems.append(Problem(found[index].window, [start], found[index].background_e))
+        elif one is not None and one.count > 1:
+            start = one.starts[int(np.argmax(one.flux_e))]
+            problems.append(Problem(one.window, [start], one.background_e))
+        else:
+            continue
+        tried.append(index)
+    for index, one in zip(tried, solve(problems, camera), strict=True):
+        if one is not None:
+            alone[index] = one
+    return alone
 
 
 def _is_unexplained(*fits: Solution | None) -> bool:

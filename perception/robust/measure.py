@@ -168,7 +168,7 @@ def _judged(
         return []
     blobs: list[Blob | None] = [member.blob for member in cluster.members]
     wanted: Sequence[int] = cluster.wanted
-    if solution.count != len(blobs):
+    if solution.count != len(blobs) or solution.window.edges is not None:
         wanted = range(solution.count)
         blobs = divide([member.blob for member in cluster.members], solution.u_px, solution.v_px)
     return [
