@@ -8,6 +8,7 @@ import numpy as np
 
 from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, Camera
+from perception.robust.before_edges import brightest_alone, likelier_before_edges, with_flares_and_edges
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.motion import moving
@@ -20,7 +21,7 @@ from perception.robust.overlap.deblend import (
     of_free_width,
 )
 from perception.robust.overlap.eclipse import eclipses
-from perception.robust.overlap.edge import is_beyond_doubt, with_edges, with_flares_and_edges
+from perception.robust.overlap.edge import is_beyond_doubt, leaves_something, with_edges
 from perception.robust.overlap.halo import with_halo
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
@@ -107,15 +108,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         chosen[index] = one
         uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
-    unexplained = {
-        index: one
-        for index, one in enumerate(beside)
-        if not found[index].is_in_crowd
-        and _is_unexplained(one, edged.get(index))
-        and (index not in parted or one is None or parted[index].count > one.count + 2)
-    }
-    edged |= with_flares_and_edges(_brightest(unexplained, found, camera), camera)
-    for index, one in _before_edges(edged, chosen, parted).items():
+    if prepared.frame.line_time_s == 0.0:
+        edged |= _several_before_edges(found, beside, chosen, edged, parted, camera)
+    for index, one in likelier_before_edges(edged, chosen, parted).items():
         chosen[index], uneven_e[index] = one, one.left_over.structure_e
         parted.pop(index, None)
     _retry_on_uneven_ground(chosen, uneven_e, camera)
@@ -251,50 +246,26 @@ def _drop_beside_lines(
             parted[index] = several
 
 
-def _before_edges(
-    edged: Mapping[int, Solution], chosen: Sequence[Solution | None], parted: Mapping[int, Solution]
+def _several_before_edges(
+    found: Sequence[Cluster],
+    plain: Sequence[Solution | None],
+    chosen: Sequence[Solution | None],
+    edged: Mapping[int, Solution],
+    parted: Mapping[int, Solution],
+    camera: Camera,
 ) -> dict[int, Solution]:
-    """Return by index flares before edges where these explain all, and better than what did so far."""
-    likelier = {}
-    for index, one in edged.items():
-        held = parted.get(index, chosen[index])
-        if one.left_over.is_nothing and (held is None or one.cost < held.cost):
-            likelier[index] = one if held is None else weighed(one, held)
-    return likelier
-
-
-def _brightest(
-    fits: Mapping[int, Solution | None], found: Sequence[Cluster], camera: Camera
-) -> dict[int, Solution]:
-    """Fit the brightest flare of each cluster alone: what else there is may be more flares, or edges.
-
-    Returns
-    -------
-    By index; the fit so far where that is of one flare, none where neither converges.
-    """
-    alone = {index: one for index, one in fits.items() if one is not None}
-    tried, problems = [], []
-    for index, one in fits.items():
-        members = found[index].members
-        if one is None and len(members) > 1:
-            brightest = max(members, key=lambda member: member.flux_e)
-            start = brightest.u_px, brightest.v_px, brightest.log_range(max(brightest.flux_e, 1.0))
-            problems.append(Problem(found[index].window, [start], found[index].background_e))
-        elif one is not None and one.count > 1:
-            start = one.starts[int(np.argmax(one.flux_e))]
-            problems.append(Problem(one.window, [start], one.background_e))
-        else:
-            continue
-        tried.append(index)
-    for index, one in zip(tried, solve(problems, camera), strict=True):
-        if one is not None:
-            alone[index] = one
-    return alone
-
-
-def _is_unexplained(*fits: Solution | None) -> bool:
-    """Tell whether each of some fits leaves something to explain."""
-    return not any(one is not None and one.left_over.is_nothing and not asks_for_more(one) for one in fits)
+    """Explain by several flares before edges what nothing else explains, or only far more flares do."""
+    tried: dict[int, Solution | None] = {}
+    for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
+        more = parted.get(index)
+        by_few = None if more is None or (one is not None and more.count > one.count + 2) else more
+        so_far = (one, edged.get(index), chosen[index], by_few)
+        if not cluster.is_in_crowd and all(each is None or leaves_something(each) for each in so_far):
+            tried[index] = one
+    several = with_flares_and_edges(brightest_alone(tried, found, camera), camera)
+    of_all = [several.get(index) for index in range(len(found))]
+    fit_beside_forward_light(of_all, camera)
+    return {index: one for index, one in enumerate(of_all) if one is not None}
 
 
 def _may_be_several(one: Solution | None) -> bool:

@@ -16,6 +16,7 @@ from perception.robust.clusters import Candidate, Cluster, clusters, guess_by_ou
 from perception.robust.explain import MOST_LEFT, best
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size, of_free_width
+from perception.robust.overlap.eclipse import hidden_log_range
 from perception.robust.problem import Problem
 from perception.robust.search.blobs import Blob, dilated, divide
 from perception.robust.search.prepare import PreparedFrame
@@ -188,7 +189,7 @@ def _measurement(
     u_px, v_px = float(solution.u_px[index]), float(solution.v_px[index])
     flux_e = float(solution.flux_e[index])
     flux_sigma_e = float(solution.flux_sigma_e[index]) * widening
-    hidden = _hidden_log_range(solution, index)
+    hidden = hidden_log_range(solution, index)
     doubt = math.hypot(hidden / math.sqrt(3.0), solution.log_range_of_two)
     of_one = math.hypot(float(solution.log_range_sigma[index]) * widening, hidden / math.sqrt(3.0))
     of_background = float(solution.log_range_hidden[index])
@@ -225,29 +226,6 @@ def _measurement(
         on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges or on_edge or left.peak_sigmas > RESIDUAL_SIGMAS,
     )
-
-
-def _hidden_log_range(solution: Solution, index: int) -> float:
-    """Return how far a flare's ln range may be off because sources hide parts of each other.
-
-    What is fitted are whole discs, which shine through each other. Where they overlap so much of a source's
-    light may lack, or be another's. And one that seems farther than another, within two radii of which it
-    lies, may be as near as that, most of it hidden behind it. Eclipses are fitted as they are.
-    """
-    if solution.is_eclipse or solution.count == 1:
-        return 0.0
-    apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
-    others_px = solution.image_radius_px
-    if solution.motion_px is not None:
-        others_px = others_px - 0.5 * np.hypot(*solution.motion_px.T)
-    own_px = float(others_px[index])
-    farther = solution.log_range[index] - solution.log_range[apart_px < 2.0 * others_px]
-    # Of two discs of unlike size the chord of the smaller one: what a half plane at the mean edge cuts off.
-    into = (others_px + own_px - apart_px) / (2.0 * max(own_px, 1e-9))
-    into[index] = 0.0
-    depth = np.clip(into, 0.0, 1.0)
-    cut = (np.arccos(1.0 - 2.0 * depth) - (1.0 - 2.0 * depth) * 2.0 * np.sqrt(depth - depth**2)) / np.pi
-    return max(float(farther.max(initial=0.0)), 0.5 * float(cut.sum()))
 
 
 def _of_large_discs(

@@ -268,3 +268,26 @@ def finer(camera: Camera) -> float:
     No finer than what a pixel alone smooths asks for.
     """
     return min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))
+
+
+def hidden_log_range(solution: Solution, index: int) -> float:
+    """Return how far a flare's ln range may be off because sources hide parts of each other.
+
+    What is fitted are whole discs, which shine through each other. Where they overlap so much of a source's
+    light may lack, or be another's. And one that seems farther than another, within two radii of which it
+    lies, may be as near as that, most of it hidden behind it. Eclipses are fitted as they are.
+    """
+    if solution.is_eclipse or solution.count == 1:
+        return 0.0
+    apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
+    others_px = solution.image_radius_px
+    if solution.motion_px is not None:
+        others_px = others_px - 0.5 * np.hypot(*solution.motion_px.T)
+    own_px = float(others_px[index])
+    farther = solution.log_range[index] - solution.log_range[apart_px < 2.0 * others_px]
+    # Of two discs of unlike size the chord of the smaller one: what a half plane at the mean edge cuts off.
+    into = (others_px + own_px - apart_px) / (2.0 * max(own_px, 1e-9))
+    into[index] = 0.0
+    depth = np.clip(into, 0.0, 1.0)
+    cut = (np.arccos(1.0 - 2.0 * depth) - (1.0 - 2.0 * depth) * 2.0 * np.sqrt(depth - depth**2)) / np.pi
+    return max(float(farther.max(initial=0.0)), 0.5 * float(cut.sum()))

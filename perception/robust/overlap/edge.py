@@ -16,14 +16,7 @@ from perception.compiled import compiled
 from perception.model.layout import SEEN, Structure
 from perception.model.window import Camera
 from perception.robust.goodness import noise_e2
-from perception.robust.overlap.deblend import (
-    LEAST_GAIN,
-    asks_for_more,
-    eased,
-    gain,
-    of_more,
-    with_one_more,
-)
+from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, gain
 from perception.robust.problem import Window
 from perception.robust.solve import Solution, solve
 
@@ -31,9 +24,6 @@ Array = NDArray[np.float64]
 
 MOST_EDGES = 2
 """So many edges one window has at most: a bar has two."""
-
-MOST_BEFORE_EDGES = 4
-"""So many flares are looked for before the edges of one window at most."""
 
 _ANGLES, _STEP_PX = 18, 1.0
 _LEAST_KEPT = 0.02  # of an edge's power, beside what flares and an even background may take of it
@@ -87,86 +77,23 @@ def with_edges(
     going = {
         index: one
         for index, one in flares.items()
-        if _leaves_something(one) or (index in on_structure and one.left_over.peak_sigmas > _SEEMS_SIGMAS)
+        if leaves_something(one) or (index in on_structure and one.left_over.peak_sigmas > _SEEMS_SIGMAS)
     }
     for _ in range(MOST_EDGES):
         tried: dict[int, list[Edge]] = {}
         for index, one in going.items():
-            edge = _seen_edge(one)
+            edge = likeliest_edge_of(one)
             if edge is not None:
                 tried[index] = [*known[index], edge]
-        best = _fitted(tried, {index: going[index] for index in tried}, flares, camera)
+        best = fit_in_turns(tried, {index: going[index] for index in tried}, flares, camera)
         going = {}
         for index, (one, edges) in best.items():
             if gain(found.get(index, flares[index]), one) < LEAST_GAIN:
                 continue
             found[index], known[index] = one, edges
-            if _leaves_something(one):
+            if leaves_something(one):
                 going[index] = one
     return found
-
-
-def with_flares_and_edges(flares: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
-    """Explain windows by several flares before edges: what neither more flares nor edges alone explain.
-
-    One after another is added, a flare or an edge, whichever makes what is seen likelier.
-
-    Parameters
-    ----------
-    flares, camera
-        What explains windows so far, without edges, and the frame's camera.
-
-    Returns
-    -------
-    By index those in which nothing is left to explain, and that have an edge.
-    """
-    now: dict[int, tuple[Solution, list[Edge]]] = {index: (one, []) for index, one in flares.items()}
-    going, done = list(flares), {}
-    while going:
-        likelier = _with_one_flare_more({index: now[index][0] for index in going}, camera)
-        tried: dict[int, list[Edge]] = {}
-        for index in going:
-            one, edges = now[index]
-            if len(edges) < MOST_EDGES and (edge := _seen_edge(one)) is not None:
-                tried[index] = [*edges, edge]
-        fits = _fitted(tried, {index: now[index][0] for index in tried}, flares, camera)
-        moved: dict[int, list[Edge]] = {}
-        for index, more in likelier.items():
-            if index not in fits or more.deviance < fits[index][0].deviance:
-                fits[index] = more, now[index][1]
-                if now[index][1]:
-                    moved[index] = now[index][1]
-        for index, again in _fitted(moved, {index: fits[index][0] for index in moved}, flares, camera).items():
-            if again[0].deviance < fits[index][0].deviance:
-                fits[index] = again
-        going = []
-        for index, (one, edges) in fits.items():
-            if gain(now[index][0], one) < LEAST_GAIN:
-                continue
-            now[index] = one, edges
-            if _leaves_something(one):
-                going.append(index)
-            elif edges:
-                done[index] = one
-    return done
-
-
-def _with_one_flare_more(found: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
-    """Return by index what one flare more explains better, than one of another width or size, too."""
-    trials = [
-        (index, starts)
-        for index, one in found.items()
-        if one.count < MOST_BEFORE_EDGES and asks_for_more(one)
-        for starts in with_one_more(one)
-        if len(starts) == one.count + 1
-    ]
-    fits = solve([of_more(found[index], starts) for index, starts in trials], camera)
-    best: dict[int, Solution] = {}
-    for (index, _), fit in zip(trials, fits, strict=True):
-        if fit is not None and (index not in best or fit.deviance < best[index].deviance):
-            best[index] = fit
-    null = dict(found) | eased({index: found[index] for index in best if found[index].count == 1}, camera)
-    return {index: fit for index, fit in best.items() if gain(null[index], fit) >= LEAST_GAIN}
 
 
 def is_beyond_doubt(one: Solution, before: Solution) -> bool:
@@ -176,15 +103,15 @@ def is_beyond_doubt(one: Solution, before: Solution) -> bool:
     """
     variance = np.where(one.flares_e**2 < one.variance_e2(0.0), one.variance_e2(0.0), math.inf)
     gain_around = float(np.sum((before.residual_e**2 - one.residual_e**2) / variance))
-    return not _leaves_something(one) and gain_around >= LEAST_GAIN
+    return not leaves_something(one) and gain_around >= LEAST_GAIN
 
 
-def _leaves_something(one: Solution) -> bool:
+def leaves_something(one: Solution) -> bool:
     """Tell whether a fit leaves over what an edge may explain, on the flares or around them."""
     return not one.left_over.is_nothing or asks_for_more(one)
 
 
-def _fitted(
+def fit_in_turns(
     tried: Mapping[int, list[Edge]],
     solutions: Mapping[int, Solution],
     plain: Mapping[int, Solution],
@@ -212,12 +139,12 @@ def _fitted(
     return best
 
 
-def _seen_edge(one: Solution) -> Edge | None:
+def likeliest_edge_of(one: Solution) -> Edge | None:
     """Return the edge that what is left over asks for most; None where there is none."""
     window, width_px = one.window, _sharp_px(one)
     height_e, offset_px, angle_rad = _likeliest_edge(
         window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu, width_px,
-        0.0 if _leaves_something(one) else _SEEMS_GAIN,
+        0.0 if leaves_something(one) else _SEEMS_GAIN,
     )  # fmt: skip
     return None if height_e == 0.0 else Edge(height_e, offset_px, angle_rad, width_px)
 
