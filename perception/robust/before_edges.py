@@ -12,6 +12,7 @@ from perception.model.window import Camera
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.deblend import (
     LEAST_GAIN,
+    MOST_WINDOWS,
     asks_for_more,
     eased,
     gain,
@@ -38,10 +39,15 @@ def brightest_alone(
 ) -> dict[int, Solution]:
     """Fit the brightest flare of each cluster alone: what else there is may be more flares, or edges.
 
+    A fit of one flare stays as it is. Of more clusters than `MOST_WINDOWS` only the brightest are looked at.
+
     Returns
     -------
-    By index; the fit so far where that is of one flare, none where neither converges.
+    By index, but for those where nothing converges.
     """
+    if len(fits) > MOST_WINDOWS:
+        by_flux = sorted(fits, key=lambda index: -max(member.flux_e for member in found[index].members))
+        fits = {index: fits[index] for index in sorted(by_flux[:MOST_WINDOWS])}
     alone = {index: one for index, one in fits.items() if one is not None}
     tried, problems = [], []
     for index, one in fits.items():

@@ -14,8 +14,9 @@ from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.measure import MeasuredFlare, measure
-from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks, standing, summit
+from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
 from perception.robust.search.frame import levels_around
+from perception.robust.search.hills import prominent, summit
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
 from perception.types import Calibration, Detection, Detections, RawFrame
@@ -231,9 +232,9 @@ def _off_hill(
     around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
     # Its brightest pixel may be the flank of another, larger one.
     flare = part if around.max() > part.peak_e else summit(part, clips, reach_px)
-    if flare.area_px < _LARGE_HILL * (reach_px + 1) ** 2 or clips.any():
+    if flare is not part or part.area_px < _LARGE_HILL * (reach_px + 1) ** 2 or clips.any():
         return [flare]
-    return standing(part, component, noise_e, reach_px, prepared.shape) or [flare]
+    return prominent(part, component, noise_e, reach_px, prepared.shape) or [part]
 
 
 def _detection(

@@ -69,7 +69,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     # What light fog throws forward goes by a flux that an edge no longer leads astray.
     fit_beside_forward_light(beside_edges, camera)
     edged = {index: one for index, one in enumerate(beside_edges) if one is not None}
-    beside = list(chosen)
+    at_rest = list(chosen)
     certain = {index: one for index, one in edged.items() if is_beyond_doubt(one, lone[index])}
     for index in certain:
         chosen[index] = None
@@ -109,7 +109,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         uneven_e[index] = one.left_over.structure_e
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     if prepared.frame.line_time_s == 0.0:
-        edged |= _several_before_edges(found, beside, chosen, edged, parted, camera)
+        edged |= _several_before_edges(found, at_rest, chosen, edged, parted, prepared.shape, camera)
     for index, one in likelier_before_edges(edged, chosen, parted).items():
         chosen[index], uneven_e[index] = one, one.left_over.structure_e
         parted.pop(index, None)
@@ -252,6 +252,7 @@ def _several_before_edges(
     chosen: Sequence[Solution | None],
     edged: Mapping[int, Solution],
     parted: Mapping[int, Solution],
+    shape: tuple[int, int],
     camera: Camera,
 ) -> dict[int, Solution]:
     """Explain by several flares before edges what nothing else explains, or only far more flares do."""
@@ -265,7 +266,13 @@ def _several_before_edges(
     several = with_flares_and_edges(brightest_alone(tried, found, camera), camera)
     of_all = [several.get(index) for index in range(len(found))]
     fit_beside_forward_light(of_all, camera)
-    return {index: one for index, one in enumerate(of_all) if one is not None}
+    return {
+        index: one
+        for index, one in enumerate(of_all)
+        if one is not None
+        and _explains_all(one, shape)
+        and (index not in edged or one.cost < edged[index].cost)
+    }
 
 
 def _may_be_several(one: Solution | None) -> bool:

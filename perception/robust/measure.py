@@ -24,6 +24,7 @@ from perception.robust.solve import Solution, solve
 from perception.robust.verdict import (
     LEAST_RANGE_M,
     is_border,
+    is_hardly_seen,
     is_no_large_disc,
     is_other_size,
 )
@@ -86,7 +87,10 @@ class MeasuredFlare:
 
 
 def measure(
-    found: Sequence[Cluster], prepared: PreparedFrame, apart: bool = False
+    found: Sequence[Cluster],
+    prepared: PreparedFrame,
+    apart: bool = False,
+    before: Sequence[Candidate] = (),
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Measure clusters, and leave out what is no source.
 
@@ -104,6 +108,8 @@ def measure(
         The frame.
     apart
         That blobs side by side have been tried together before.
+    before
+        What was measured before.
 
     Returns
     -------
@@ -118,7 +124,7 @@ def measure(
     measured: list[tuple[Blob, MeasuredFlare]] = []
     again: list[Candidate] = []
     unseen: list[Candidate] = []
-    done: list[Candidate] = []
+    done = list(before)
     for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True)):
         other_size = (
             index in free and solution is not None and is_other_size(solution, free[index], camera.tie_spread)
@@ -130,8 +136,8 @@ def measure(
             done += wanted
         elif len(cluster.members) > 1:
             again += [] if apart else wanted
-        elif apart and solution is not None and solution.left_over.is_nothing:
-            unseen += wanted
+        elif apart and solution is not None and is_hardly_seen(solution, 0, prepared.shape):
+            unseen += wanted if solution.left_over.is_nothing else []
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
     for cluster, solution in zip(others, _of_large_discs(others, prepared, camera), strict=True):
         fits = solution is not None and _is_whole_discs(solution)
@@ -140,11 +146,11 @@ def measure(
         measured += _by_disc(cluster, solution if fits else None, small, prepared)
     if again:
         # What spoils a cluster spoils it for all: each by itself, the others left out.
-        measured += measure(clusters(again, prepared, apart=True, measured=done), prepared, apart=True)
+        measured += measure(clusters(again, prepared, apart=True, measured=done), prepared, True, done)
     if unseen:
         # Of two side by side that spoil nothing each leaves out too much of the other.
         together = [one for one in clusters(unseen, prepared, measured=done) if len(one.members) > 1]
-        measured += measure(together, prepared, apart=True)
+        measured += measure(together, prepared, True, done)
     return measured
 
 

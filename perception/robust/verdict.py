@@ -24,6 +24,7 @@ _MOST_ASPECT = 1.5
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _LEAST_PX, _LEAST_SHARE = 1.0, 0.15
 _FLANK_PX, _FLANK_SHARE = 3.0, 0.25
+_FLANK_PEAKS, _FLANK_PEAKS_ON_EDGES = 0.5, 1.0
 _LEAST_SEEN, _MOST_OFF = 2.0 / 3.0, 0.5
 
 
@@ -76,16 +77,15 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
     """Tell whether a flare stands on the flank of something larger that is not explained, as a lit patch.
 
     Light falls off around a flare, on all sides. Where a quarter of a ring around it, all flares taken away,
-    still exceeds the background by half of the flare's own peak, it is a part of what lies there. Of a lone
-    one that is its brightest pixel: an edge may hide its middle. `shape` is the frame's: what a window shows
-    beyond it does not count.
+    still exceeds the background by half of the flare's own peak, it is a part of what lies there; by all of
+    it, where straight edges explain what lies there: corners, of which they know nothing, look like fainter
+    flares. Of a lone one that is its brightest pixel: an edge may hide its middle. `shape` is the frame's:
+    what a window shows beyond it does not count.
     """
     window, place = solution.window, (float(solution.u_px[index]), float(solution.v_px[index]))
     inner_px = float(solution.image_radius_px[index]) + 2.0 * solution.psf_sigma_px + 1.0
-    # Straight edges beside it are explained.
-    edges_e = 0.0 if window.edges is None else solution.expected_e - solution.flares_e - solution.background_e
     share = _share_above(
-        window.image_e - edges_e,
+        window.image_e,
         solution.flares_e,
         solution.background_e,
         (window.box.top, window.box.left),
@@ -93,6 +93,7 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
         place,
         (inner_px, inner_px + _FLANK_PX),
         solution.count == 1,
+        _FLANK_PEAKS if window.edges is None else _FLANK_PEAKS_ON_EDGES,
     )
     return share > _FLANK_SHARE
 
@@ -100,9 +101,9 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
 @compiled
 def _share_above(
     image_e: Array, flares_e: Array, background_e: float, corner: tuple[int, int], shape: tuple[int, int],
-    place: tuple[float, float], ring_px: tuple[float, float], is_lone: bool,
+    place: tuple[float, float], ring_px: tuple[float, float], is_lone: bool, peaks: float,
 ) -> float:  # fmt: skip
-    """Return the share of a ring where what is no flare exceeds half of a flare's peak.
+    """Return the share of a ring where what is no flare exceeds so much of a flare's peak.
 
     Of a window whose first pixel has that row and column of the frame; `place` is (u, v) in the frame.
     """
@@ -114,12 +115,12 @@ def _share_above(
         peak_e = flares_e[top:bottom, left:right].max()
     else:
         peak_e = flares_e[min(max(round(v), top), bottom - 1), min(max(round(u), left), right - 1)]
-    half_peak, count, above = 0.5 * peak_e, 0, 0
+    most_e, count, above = peaks * peak_e, 0, 0
     for row in range(top, bottom):
         for column in range(left, right):
             if ring_px[0] <= math.hypot(column - u, row - v) <= ring_px[1]:
                 count += 1
-                above += image_e[row, column] - flares_e[row, column] - background_e > half_peak
+                above += image_e[row, column] - flares_e[row, column] - background_e > most_e
     return above / max(count, 1)
 
 

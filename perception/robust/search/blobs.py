@@ -1,6 +1,5 @@
 """From a mask to blobs: connected components, and where one of them holds several flares."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,11 +10,8 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.flare import PixelBox
 
-_MAX_PEAKS = 16
-_BESIDE_PX = 4
-_WAYS = 32  # across a place, at equal angles
-_STANDING_SIGMAS = 7.4  # 6 of a place less the mean of two others
-_STANDING_SHARE = 0.25  # of how much brighter it is than the darkest around it
+MOST_PEAKS = 16
+"""Of one blob so many maxima are told apart at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,123 +148,20 @@ def split_at_peaks(blob: Blob, noise: NDArray[np.float32], dip: float = 0.05) ->
     peaks = _peaks(blob.pixels, brightness, noise, dip)
     if len(peaks) == 1:
         return [blob]
-    peaks = peaks[np.argsort(-brightness[peaks[:, 0], peaks[:, 1]], kind="stable")][:_MAX_PEAKS]
+    peaks = peaks[np.argsort(-brightness[peaks[:, 0], peaks[:, 1]], kind="stable")][:MOST_PEAKS]
     rows, columns = np.indices(blob.pixels.shape)
     distance2 = (rows - peaks[:, :1, None]) ** 2 + (columns - peaks[:, 1:, None]) ** 2
     nearest = distance2.argmin(axis=0)
-    return [_trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
+    return [trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
 
 
-def summit(blob: Blob, clips: NDArray[np.bool_], reach_px: int) -> Blob:
-    """Cut what stands on a hill off the hill: a flare before a bright horizon, or on a patch of sun.
-
-    The flare is what exceeds half of the maximum, and as far around that as its image reaches. Where twice as
-    much of the blob lies beyond, the level is raised to the brightest of what lies right there. A blob whose
-    flare is clipped is left as it is.
-
-    Parameters
-    ----------
-    blob
-        What exceeds the detection limit.
-    clips
-        Which pixels are clipped by light.
-    reach_px
-        How far a point's image reaches beyond its half maximum.
-    """
-    # Of a flare at least a quarter of what it reaches lies in its blob, as in a corner of the frame.
-    if not blob.peak_e > 0.0 or blob.area_px <= 2 * (reach_px + 1) ** 2:
-        return blob
-    top = _part_with_peak(blob, 0.5 * blob.peak_e)
-    near = dilated(top, reach_px)
-    beyond = blob.pixels & ~near
-    if np.count_nonzero(beyond) <= 2 * np.count_nonzero(near & blob.pixels) or (clips & near).any():
-        return blob
-    beside = beyond & dilated(near, _BESIDE_PX)
-    if not beside.any():
-        return blob
-    level_e = float(blob.filtered_e[beside].max())
-    return _trimmed(blob, _part_with_peak(blob, level_e)) if level_e < blob.peak_e else blob
-
-
-def standing(
-    part: Blob, component: Blob, noise: NDArray[np.float32], reach_px: int, shape: tuple[int, int]
-) -> list[Blob]:
-    """Cut out what stands out of a hill in every direction: flares on the bright rim of a wall, or before it.
-
-    A rim, a bar, a slope are as bright, somewhere, on both sides of each of their places, or brighter on one
-    side by as much as they are darker on the other. A flare is brighter than the mean of any two places
-    opposite each other beyond its reach. What such a mean says is the level that a flare is cut off at.
-
-    Parameters
-    ----------
-    part, component
-        What is looked at, of all that exceeds the detection limit in one piece with it.
-    noise
-        Standard deviation of the component's filtered image, shape (box.height, box.width).
-    reach_px
-        How far a point's image reaches beyond its half maximum.
-    shape
-        Of the frame: what is nearer to its edge than that is not looked at.
-    """
-    box, mask = component.box, np.zeros_like(component.pixels)
-    mask[part.box.seen_from(box).slices] = part.pixels
-    rows, columns = np.ogrid[: box.height, : box.width]
-    inner_rows = (rows + box.top >= reach_px) & (rows + box.top < shape[0] - reach_px)
-    inner = inner_rows & (columns + box.left >= reach_px) & (columns + box.left < shape[1] - reach_px)
-    cut = []
-    for row, column, level_e in _standing(mask & inner, component.filtered_e, noise, reach_px):
-        near = (abs(rows - row) <= reach_px) & (abs(columns - column) <= reach_px)
-        square = _trimmed(component, mask & near)
-        cut.append(_trimmed(square, _part_with_peak(square, level_e)))
-    return cut
-
-
-@compiled
-def _standing(
-    mask: NDArray[np.bool_], brightness: NDArray[np.float32], noise: NDArray[np.float32], reach_px: int
-) -> list[tuple[int, int, float]]:
-    """Return row and column of what stands out in every direction, and the level that it stands on."""
-    height, width = mask.shape
-    found = [(0, 0, 0.0) for _ in range(0)]
-    for row in range(height):
-        for column in range(width):
-            here, least = brightness[row, column], _STANDING_SIGMAS * noise[row, column]
-            if not mask[row, column] or not here > least:
-                continue
-            if brightness[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].max() > here:
-                continue
-            level, darkest = 0.0, here
-            for way in range(_WAYS):
-                down = reach_px * math.sin(math.pi * way / _WAYS)
-                across = reach_px * math.cos(math.pi * way / _WAYS)
-                one = _between(brightness, row + down, column + across)
-                other = _between(brightness, row - down, column - across)
-                level, darkest = max(level, 0.5 * (one + other)), min(darkest, one, other)
-            if here - level > max(least, _STANDING_SHARE * (here - darkest)):
-                found.append((row, column, level))
-    return found
-
-
-@compiled
-def _between(image: NDArray[np.float32], row: float, column: float) -> float:
-    """Return the value of an image between its pixels, by four of them; 0 beyond."""
-    first_row, first = math.floor(row), math.floor(column)
-    value = 0.0
-    for at_row in (first_row, first_row + 1):
-        for at in (first, first + 1):
-            if 0 <= at_row < image.shape[0] and 0 <= at < image.shape[1]:
-                value += (1.0 - abs(row - at_row)) * (1.0 - abs(column - at)) * image[at_row, at]
-    return value
-
-
-def _part_with_peak(blob: Blob, level_e: float) -> NDArray[np.bool_]:
-    """Mark what exceeds a level, which the maximum does, in one piece with it, in the blob's box."""
-    places = np.flatnonzero(blob.pixels & (blob.filtered_e > level_e))
-    labels, _ = _labelled(places, blob.box.width)
-    values = blob.filtered_e.ravel()[places]
-    mask = np.zeros(blob.pixels.size, dtype=bool)
-    mask[places[labels == labels[np.argmax(values)]]] = True
-    return mask.reshape(blob.pixels.shape)
+def one_piece(mask: NDArray[np.bool_], row: int, column: int) -> NDArray[np.bool_]:
+    """Return what of a mask is in one piece with a place in it."""
+    places, width = np.flatnonzero(mask), mask.shape[1]
+    labels, _ = _labelled(places, width)
+    piece = np.zeros(mask.size, dtype=bool)
+    piece[places[labels == labels[np.searchsorted(places, row * width + column)]]] = True
+    return piece.reshape(mask.shape)
 
 
 def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
@@ -373,7 +266,7 @@ def divide(blobs: Sequence[Blob], u_px: NDArray[np.float64], v_px: NDArray[np.fl
     return divided
 
 
-def _trimmed(blob: Blob, pixels: NDArray[np.bool_]) -> Blob:
+def trimmed(blob: Blob, pixels: NDArray[np.bool_]) -> Blob:
     """Cut out the part of a blob that `pixels` marks, in a box of its own."""
     rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
     top, left = int(rows[0]), int(columns[0])

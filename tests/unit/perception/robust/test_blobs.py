@@ -3,7 +3,8 @@ import pytest
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.robust.search.blobs import Blob, components, split_at_peaks, summit
+from perception.robust.search.blobs import Blob, components, split_at_peaks
+from perception.robust.search.hills import prominent, summit
 
 
 def hill(*tops: tuple[float, float, float], width: int = 30) -> NDArray[np.float32]:
@@ -88,3 +89,45 @@ def test_what_is_darker_than_the_background_is_no_hill(level: float) -> None:
     image = np.full((20, 30), level, dtype=np.float32)
     blob = Blob(PixelBox(0, 0, 20, 30), np.ones((20, 30), dtype=bool), image)
     assert summit(blob, np.zeros((20, 30), dtype=bool), 5) is blob
+
+
+def test_flares_are_cut_off_a_rim_brighter_than_half_of_them() -> None:
+    """A ridge of 90, and on it flares of 60 and 50; `summit` leaves it whole.
+
+    Expected: each flare once, at its place, no pixel twice; nothing on the ridge alone, on a rectangle (whose
+    corners have bright neighbours), on a disc as wide as the reach, or where noise may make a maximum.
+    """
+    rows, columns = np.indices((60, 200), dtype=np.float64)
+    ridge = 90.0 * np.exp(-0.5 * ((rows - 30.0 - 0.2 * (columns - 100.0)) / 3.0) ** 2)
+    flares = [(60, 22, 60.0), (140, 38, 50.0)]
+    image = ridge + sum(h * np.exp(-0.25 * ((rows - v) ** 2 + (columns - u) ** 2)) for u, v, h in flares)
+    noise, shape = np.full(image.shape, 2.0, np.float32), (960, 1280)
+    blob = whole(image.astype(np.float32))
+    assert summit(blob, np.zeros(image.shape, dtype=bool), 4) is blob
+    cut = prominent(blob, blob, noise, 4, shape)
+    peaks = [divmod(int(np.argmax(one.filtered_e)), one.box.width) for one in cut]
+    at = [
+        (one.box.left - 200 + column, one.box.top - 100 + row)
+        for one, (row, column) in zip(cut, peaks, strict=True)
+    ]
+    assert at == [(u, v) for u, v, _ in flares]
+    assert all(one.area_px < 40 for one in cut)
+    assert len({place for one in cut for place in one.places(1280).tolist()}) == sum(b.area_px for b in cut)
+    rectangle = np.where((abs(rows - 30) < 12) & (abs(columns - 100) < 30), 100.0, 0.0)
+    disc = np.where(np.hypot(rows - 30, columns - 100) < 5.5, 100.0, 0.0)
+    for nothing in (ridge, rectangle, disc):
+        alone = whole(np.asarray(nothing, dtype=np.float32))
+        assert prominent(alone, alone, noise, 4, shape) == []
+    assert prominent(blob, blob, 10.0 * noise, 4, shape) == []
+
+
+def test_what_stands_near_the_frame_s_edge_is_left_on_its_rim() -> None:
+    """Beyond the edge of the frame a rim ends as a flare does."""
+    rows, columns = np.indices((60, 200), dtype=np.float64)
+    image = 90.0 * np.exp(-0.5 * ((rows - 30.0) / 3.0) ** 2)
+    image += 60.0 * np.exp(-0.25 * ((rows - 30.0) ** 2 + (columns - 3.0) ** 2))
+    blob = Blob(PixelBox(100, 0, 60, 200), image > 1.0, image.astype(np.float32))
+    noise = np.full(image.shape, 2.0, np.float32)
+    assert prominent(blob, blob, noise, 4, (960, 1280)) == []
+    inner = Blob(PixelBox(100, 5, 60, 200), blob.pixels, blob.filtered_e)
+    assert len(prominent(inner, inner, noise, 4, (960, 1280))) == 1
