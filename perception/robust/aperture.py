@@ -6,6 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.robust.clusters import Candidate
+from perception.robust.search.blobs import Blob
+from perception.robust.search.prepare import PreparedFrame
+
 
 @dataclass(frozen=True)
 class ApertureFlux:
@@ -77,3 +81,27 @@ def aperture_flux(
     # The background's own error enters once per pixel of the aperture, fully correlated.
     variance = max(flux, 0.0) + count * pixel_variance * (1.0 + count / max(ring_values.size, 1))
     return ApertureFlux(flux, math.sqrt(variance) if variance >= 0.0 else math.nan, background)
+
+
+def mask_in(top: int, left: int, shape: tuple[int, ...], blob: Blob) -> NDArray[np.bool_]:
+    """Mark the blob's pixels in a mask over a window that holds it."""
+    mask = np.zeros(shape, dtype=bool)
+    row, column = blob.box.top - top, blob.box.left - left
+    mask[row : row + blob.box.height, column : column + blob.box.width] = blob.pixels
+    return mask
+
+
+def centroid_sigmas(member: Candidate, flux_e: float, prepared: PreparedFrame) -> tuple[float, float]:
+    """Compute the centroid's standard deviations: √(Σ (x - x̄)² variance) / flux along each axis."""
+    if not flux_e > 0.0:
+        return math.nan, math.nan
+    blob = member.blob
+    light_e = prepared.excess_e[blob.box.slices][blob.pixels] + prepared.background_e(
+        member.u_px, member.v_px
+    )
+    variance = np.maximum(light_e, 0.0) + prepared.floor_e2
+    rows, columns = np.nonzero(blob.pixels)
+    return (
+        math.sqrt(float(np.sum((blob.box.left + columns - member.u_px) ** 2 * variance))) / flux_e,
+        math.sqrt(float(np.sum((blob.box.top + rows - member.v_px) ** 2 * variance))) / flux_e,
+    )

@@ -176,10 +176,12 @@ def clusters(
     prepared: PreparedFrame,
     apart: bool = False,
     measured: Sequence[Candidate] = (),
+    within_px: int = _TOUCHING_PX,
 ) -> list[Cluster]:
     """Group candidates that lie side by side, unless `apart`, and cut their windows out of the frame.
 
-    The pixels of what is `measured` already are left out of the windows.
+    The pixels of what is `measured` already are left out of the windows, and so is other light that does not
+    come `within_px` of a flare.
     """
     blobs = [member.blob for member in members]
     chosen: list[tuple[list[int], list[int]]] = []
@@ -207,7 +209,7 @@ def clusters(
         (members[group[0]].u_px, members[group[0]].v_px) for group, _ in chosen
     )
     return [
-        _cluster([members[k] for k in group], group, wanted, owner, ground_e, prepared)
+        _cluster([members[k] for k in group], group, wanted, owner, ground_e, within_px, prepared)
         for (group, wanted), ground_e in zip(chosen, grounds_e, strict=True)
     ]
 
@@ -218,6 +220,7 @@ def _cluster(
     wanted: Sequence[int],
     owner: NDArray[np.int64],
     background_e: float,
+    within_px: int,
     prepared: PreparedFrame,
 ) -> Cluster:
     frame, calibration = prepared.frame, prepared.calibration
@@ -227,7 +230,7 @@ def _cluster(
     image_e, state = cut(
         *prepared.pixels[:3], prepared.lit_at, owner, prepared.bad_at,
         box.corner_and_size, np.array(indices), prepared.clipped_dn,
-        _TOUCHING_PX, _KEPT_PX,
+        within_px, _KEPT_PX,
     )  # fmt: skip
     structure, sigma_e = prepared.structure_at(members[0].u_px, members[0].v_px, box.height)
     window = Window(

@@ -5,13 +5,12 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perception.model.fog import may_be_in_fog
 from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
-from perception.robust.aperture import aperture_flux
+from perception.robust.aperture import aperture_flux, centroid_sigmas, mask_in
 from perception.robust.clusters import Candidate, Cluster, clusters, guess_by_outline
 from perception.robust.explain import MOST_LEFT, best
 from perception.robust.forward_light import fit_beside_forward_light
@@ -26,6 +25,7 @@ from perception.robust.verdict import (
     is_border,
     is_hardly_seen,
     is_no_large_disc,
+    is_on_flank,
     is_other_size,
 )
 
@@ -35,6 +35,8 @@ CLIPPED_RANGE_SIGMA = 0.125
 MOST_LEFT_ON_EDGES = 0.1
 
 _ODD_SIGMAS = 3.0
+
+_IN_VIEW_PX = 1000  # farther than any window reaches
 
 _TIMES_LAID_OUT = 2  # large discs: a pixel elsewhere the lens stretches them otherwise
 
@@ -124,6 +126,7 @@ def measure(
     measured: list[tuple[Blob, MeasuredFlare]] = []
     again: list[Candidate] = []
     unseen: list[Candidate] = []
+    on_flank: list[Candidate] = []
     done = list(before)
     for index, (cluster, solution) in enumerate(zip(fitted, solutions, strict=True)):
         other_size = (
@@ -136,6 +139,8 @@ def measure(
             done += wanted
         elif len(cluster.members) > 1:
             again += [] if apart else wanted
+        elif not apart and solution is not None and _may_be_before_edge(solution, prepared.shape):
+            on_flank += wanted
         elif apart and solution is not None and is_hardly_seen(solution, 0, prepared.shape):
             unseen += wanted if solution.left_over.is_nothing else []
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
@@ -151,7 +156,19 @@ def measure(
         # Of two side by side that spoil nothing each leaves out too much of the other.
         together = [one for one in clusters(unseen, prepared, measured=done) if len(one.members) > 1]
         measured += measure(together, prepared, True, done)
+    if on_flank:
+        # Of what is bright beside it an edge may be the whole story: all of it in view.
+        in_view = clusters(on_flank, prepared, apart=True, measured=done, within_px=_IN_VIEW_PX)
+        measured += measure(in_view, prepared, True, done)
     return measured
+
+
+def _may_be_before_edge(solution: Solution, shape: tuple[int, int]) -> bool:
+    """Tell whether a flare is well explained, but beside something bright that its window leaves out."""
+    left_out = solution.window.edges is None and not solution.window.usable.all()
+    return (
+        left_out and solution.count == 1 and solution.left_over.is_nothing and is_on_flank(solution, 0, shape)
+    )
 
 
 def _is_odd(solution: Solution) -> bool:
@@ -329,7 +346,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
     blob, window = member.blob, cluster.window
     frame, calibration = prepared.frame, prepared.calibration
     reach_px = 0.5 * math.hypot(blob.box.height, blob.box.width) + 2.0
-    own = _mask_in(window.box.top, window.box.left, window.usable.shape, blob)
+    own = mask_in(window.box.top, window.box.left, window.usable.shape, blob)
     lit = prepared.lit_in(window.box) & ~own
     aperture = aperture_flux(
         window.image_e,
@@ -352,7 +369,7 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         aperture.background * gain,
     )
     has_place = not (member.is_clipped or member.is_too_large)
-    u_sigma_px, v_sigma_px = _centroid_sigmas(member, aperture.flux, prepared)
+    u_sigma_px, v_sigma_px = centroid_sigmas(member, aperture.flux, prepared)
     return MeasuredFlare(
         u_px=member.u_px,
         v_px=member.v_px,
@@ -366,28 +383,4 @@ def _from_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame)
         range_sigma_m=math.nan,
         saturated=member.is_clipped,
         misfit=member.is_too_large and not member.is_clipped,
-    )
-
-
-def _mask_in(top: int, left: int, shape: tuple[int, ...], blob: Blob) -> NDArray[np.bool_]:
-    """Mark the blob's pixels in a mask over a window that holds it."""
-    mask = np.zeros(shape, dtype=bool)
-    row, column = blob.box.top - top, blob.box.left - left
-    mask[row : row + blob.box.height, column : column + blob.box.width] = blob.pixels
-    return mask
-
-
-def _centroid_sigmas(member: Candidate, flux_e: float, prepared: PreparedFrame) -> tuple[float, float]:
-    """Compute the centroid's standard deviations: √(Σ (x - x̄)² variance) / flux along each axis."""
-    if not flux_e > 0.0:
-        return math.nan, math.nan
-    blob = member.blob
-    light_e = prepared.excess_e[blob.box.slices][blob.pixels] + prepared.background_e(
-        member.u_px, member.v_px
-    )
-    variance = np.maximum(light_e, 0.0) + prepared.floor_e2
-    rows, columns = np.nonzero(blob.pixels)
-    return (
-        math.sqrt(float(np.sum((blob.box.left + columns - member.u_px) ** 2 * variance))) / flux_e,
-        math.sqrt(float(np.sum((blob.box.top + rows - member.v_px) ** 2 * variance))) / flux_e,
     )
