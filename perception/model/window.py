@@ -202,10 +202,21 @@ def motion_cost(motion_px: Array, log_range: Array, covariance_px2: Array, camer
 
 def motion_price(length_px: Array, log_range: Array, camera: Camera) -> Array:
     """Return −2 ln (2π p) of motions so far, at such ranges, as for `motion_cost`; shape (flares,)."""
+    usual, otherwise = _motion_prior(length_px, log_range, camera)
+    return np.asarray(-2.0 * np.log(2.0 * math.pi * (usual + otherwise)))
+
+
+def is_usual_motion(length_px: Array, log_range: Array, camera: Camera) -> NDArray[np.bool_]:
+    """Tell which motions are those of robots at ordinary speeds, rather than of anything else."""
+    usual, otherwise = _motion_prior(length_px, log_range, camera)
+    return np.asarray(usual > otherwise)
+
+
+def _motion_prior(length_px: Array, log_range: Array, camera: Camera) -> tuple[Array, float]:
+    """Return the densities of motions at ordinary speeds, shape (flares,), and of any others."""
     calibration = camera.calibration
     turn_rad_per_s = np.hypot(TURN_RAD_PER_S, SPEED_M_PER_S * np.exp(-log_range))
     focal_px = math.sqrt(calibration.fx_px * calibration.fy_px)
     sigma2_px2 = (focal_px * camera.exposure_s * turn_rad_per_s) ** 2
     usual = np.exp(-0.5 * length_px**2 / sigma2_px2) / (math.pi * sigma2_px2)
-    prior = (1.0 - _OTHERWISE) * usual + _OTHERWISE / (0.5 * math.pi * MOST_MOTION_PX**2)
-    return np.asarray(-2.0 * np.log(2.0 * math.pi * prior))
+    return (1.0 - _OTHERWISE) * usual, _OTHERWISE / (0.5 * math.pi * MOST_MOTION_PX**2)

@@ -14,6 +14,7 @@ from perception.robust.aperture import aperture_flux, centroid_sigmas, mask_in
 from perception.robust.clusters import Candidate, Cluster, clusters, guess_by_outline
 from perception.robust.explain import MOST_LEFT, best
 from perception.robust.forward_light import fit_beside_forward_light
+from perception.robust.motion import is_long_clutter
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size, of_free_width
 from perception.robust.overlap.eclipse import hidden_log_range
 from perception.robust.problem import Problem
@@ -132,7 +133,7 @@ def measure(
         other_size = (
             index in free and solution is not None and is_other_size(solution, free[index], camera.tie_spread)
         )
-        judged = [] if solution is None or other_size else _judged(cluster, solution, prepared)
+        judged = [] if solution is None or other_size else _judged(cluster, solution, prepared, camera)
         measured += judged
         wanted = [cluster.members[k] for k in cluster.wanted]
         if judged:
@@ -177,7 +178,7 @@ def _is_odd(solution: Solution) -> bool:
 
 
 def _judged(
-    cluster: Cluster, solution: Solution, prepared: PreparedFrame
+    cluster: Cluster, solution: Solution, prepared: PreparedFrame, camera: Camera
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a solution into measurements, if it is one of sources."""
     left = solution.left_over
@@ -199,7 +200,9 @@ def _judged(
         (blob, _measurement(solution, k, blob, misfit, prepared))
         for k in wanted
         # What nothing lit belongs to only helps to explain what lies around.
-        if (blob := blobs[k]) is not None and not is_border(solution, k, prepared.shape)
+        if (blob := blobs[k]) is not None
+        and not is_border(solution, k, prepared.shape)
+        and not is_long_clutter(solution, k, camera)
     ]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.window import MOST_MOTION_PX, Camera, motion_price
+from perception.model.window import MOST_MOTION_PX, Camera, is_usual_motion, motion_price
 from perception.robust.goodness import drawn_out
 from perception.robust.overlap.deblend import asks_for_more
 from perception.robust.overlap.rivals import NO_RIVAL, weighed
@@ -56,6 +56,17 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
         for (index, at_rest), fit in zip(tried, fits, strict=True)
         if fit is not None and LEAST_PX <= fit.most_motion_px <= MOST_MOTION_PX
     }
+
+
+def is_long_clutter(solution: Solution, index: int, camera: Camera) -> bool:
+    """Tell whether a flare on texture or edges moves as no robot does: leaves, seams and slits are long, too.
+
+    On an even ground something else that is long is as rare as a robot that is so quick.
+    """
+    if solution.motion_px is None or not (solution.window.on_edges or solution.window.structure_e > 0.0):
+        return False
+    length_px, log_range = np.hypot(*solution.motion_px.T), solution.log_range
+    return not is_usual_motion(length_px, log_range, camera)[index]
 
 
 def _seen(solution: Solution, box: PixelBox, camera: Camera) -> Motion:

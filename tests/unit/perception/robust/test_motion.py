@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 import perception
 from perception.model.fisher import flare_limits
@@ -144,3 +145,23 @@ def test_two_that_cross_are_two_each_drawn_out_along_its_own_way() -> None:
         assert abs(hit.v_px - v_px) < 4.0 * hit.v_sigma_px
         assert abs(hit.range_m - range_m) < 4.0 * hit.range_sigma_m
         assert hit.range_sigma_m < 0.02 * range_m
+
+
+@pytest.mark.parametrize(("exposure_s", "told"), [(EXPOSURE_S, 20), (1e-4, 0)])
+def test_what_is_long_on_texture_is_told_only_if_robots_move_so(exposure_s: float, told: int) -> None:
+    """Twenty flares drawn out by 6 px on hills of 8 %, exposed for 10 ms, as robots move, and for 0.1 ms.
+
+    In 0.1 ms a robot would have to pass by at a hundred metres a second: on what has texture that is a leaf.
+    """
+    camera = replace(CAMERA, **lit_for(exposure_s))
+    rows, columns = np.indices((camera.height_px, camera.width_px))
+    hills = gaussian_filter(random(41).normal(size=rows.shape), 3.0, mode="wrap")
+    mean_e = 300.0 * (1.0 + 0.08 * hills / hills.std())
+    for k in range(20):
+        u_px, v_px = 60.3 + 130.0 * (k % 5), 60.2 + 120.0 * (k // 5)
+        turn_rad = random(42, k).uniform(0.0, math.pi)
+        way_px = 6.0 * math.cos(turn_rad), 6.0 * math.sin(turn_rad)
+        left, top, light_e = drawn_out_e(CAMERA, u_px, v_px, 3.0, way_px)
+        mean_e[top : top + len(light_e), left : left + len(light_e)] += light_e
+    hits = perception.detect(expose(mean_e, CAMERA, random(43), exposure_s), camera)
+    assert len(hits) == told
