@@ -154,7 +154,7 @@ def test_what_is_long_on_texture_is_told_only_if_robots_move_so(exposure_s: floa
     In 0.1 ms a robot would have to pass by at a hundred metres a second: on what has texture that is a leaf.
     """
     camera = replace(CAMERA, **lit_for(exposure_s))
-    rows, columns = np.indices((camera.height_px, camera.width_px))
+    rows, _columns = np.indices((camera.height_px, camera.width_px))
     hills = gaussian_filter(random(41).normal(size=rows.shape), 3.0, mode="wrap")
     mean_e = 300.0 * (1.0 + 0.08 * hills / hills.std())
     for k in range(20):
