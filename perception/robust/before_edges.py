@@ -14,9 +14,8 @@ from perception.robust.overlap.deblend import (
     LEAST_GAIN,
     MOST_WINDOWS,
     asks_for_more,
-    eased,
     gain,
-    of_more,
+    gaining,
     with_one_more,
 )
 from perception.robust.overlap.edge import (
@@ -121,13 +120,7 @@ def _with_one_flare_more(found: Mapping[int, Solution], camera: Camera) -> dict[
         for starts in with_one_more(one)
         if len(starts) == one.count + 1
     ]
-    fits = solve([of_more(found[index], starts) for index, starts in trials], camera)
-    best: dict[int, Solution] = {}
-    for (index, _), fit in zip(trials, fits, strict=True):
-        if fit is not None and (index not in best or fit.deviance < best[index].deviance):
-            best[index] = fit
-    null = dict(found) | eased({index: found[index] for index in best if found[index].count == 1}, camera)
-    return {index: fit for index, fit in best.items() if gain(null[index], fit) >= LEAST_GAIN}
+    return gaining(trials, found, dict(found), camera)
 
 
 def likelier_before_edges(

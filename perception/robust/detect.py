@@ -226,8 +226,7 @@ def _off_hill(
     """Cut a part of a component, and what else stands out of it, off the hill that it stands on."""
     peak = np.argmax(np.where(part.pixels, part.filtered_e, np.float32(-np.inf)))
     row, column = divmod(int(peak), part.box.width)
-    top, left = part.box.top - component.box.top, part.box.left - component.box.left
-    down, across = top + row, left + column
+    down, across = part.box.top - component.box.top + row, part.box.left - component.box.left + column
     clips = part.pixels & prepared.clipped_in(part.box)
     around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
     # Its brightest pixel may be the flank of another, larger one.

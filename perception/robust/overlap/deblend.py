@@ -68,25 +68,37 @@ def deblend(
     null = dict(enumerate(found))
     while asking:
         trials = [(index, starts) for index in asking for starts in with_one_more(found[index])]
-        fits = solve([of_more(found[index], starts) for index, starts in trials], camera)
-        best: dict[int, Solution] = {}
-        for (index, _), fit in zip(trials, fits, strict=True):
-            if fit is not None and (index not in best or fit.deviance < best[index].deviance):
-                best[index] = fit
-        gaining = [index for index, fit in best.items() if gain(null[index], fit) >= LEAST_GAIN]
-        null |= eased({index: found[index] for index in gaining if found[index].count == 1}, camera)
         asking = []
-        for index in gaining:
-            fit, halo = best[index], beside.pop(index, None)
-            if gain(null[index], fit) >= LEAST_GAIN:
-                if halo is not None and halo.cost < fit.cost:
-                    fit = halo
-                found[index] = null[index] = fit
-                if asks_for_more(fit):
-                    (asking if fit.count < MOST_FLARES else late).append(index)
+        for index, fit in gaining(trials, dict(enumerate(found)), null, camera).items():
+            halo = beside.pop(index, None)
+            if halo is not None and halo.cost < fit.cost:
+                fit = halo
+            found[index] = null[index] = fit
+            if asks_for_more(fit):
+                (asking if fit.count < MOST_FLARES else late).append(index)
     for index in late:
         found[index] = replace(found[index], may_be_more=True)
     return found
+
+
+def gaining(
+    trials: Sequence[tuple[int, Sequence[Start]]],
+    found: Mapping[int, Solution],
+    null: dict[int, Solution],
+    camera: Camera,
+) -> dict[int, Solution]:
+    """Fit first guesses with more flares, and return by index the likeliest that gains `LEAST_GAIN`.
+
+    Over what is in `null`: a lone flare is replaced there by one of another width or size that is likelier.
+    """
+    fits = solve([_of_more(found[index], starts) for index, starts in trials], camera)
+    best: dict[int, Solution] = {}
+    for (index, _), fit in zip(trials, fits, strict=True):
+        if fit is not None and (index not in best or fit.deviance < best[index].deviance):
+            best[index] = fit
+    likelier = {index: fit for index, fit in best.items() if gain(null[index], fit) >= LEAST_GAIN}
+    null |= _eased({index: found[index] for index in likelier if found[index].count == 1}, camera)
+    return {index: fit for index, fit in likelier.items() if gain(null[index], fit) >= LEAST_GAIN}
 
 
 def _leaves_something(halo: Solution) -> bool:
@@ -94,7 +106,7 @@ def _leaves_something(halo: Solution) -> bool:
     return not halo.left_over.is_nothing or asks_for_more(halo)
 
 
-def eased(lone: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
+def _eased(lone: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
     """Return by index lone flares of any width of the point spread, or any size, where that explains more."""
     eased = dict(lone)
     large = [index for index, one in lone.items() if float(one.image_radius_px[0]) > _LEAST_RADIUS_PX]
@@ -146,7 +158,7 @@ def gain(one: Solution, other: Solution) -> float:
     return float(np.sum((one.residual_e**2 - other.residual_e**2) / variance))
 
 
-def of_more(current: Solution, starts: Sequence[Start]) -> Problem:
+def _of_more(current: Solution, starts: Sequence[Start]) -> Problem:
     """Return the problem of fitting more flares; where they move, each begins with the mean motion."""
     motions = None
     if current.motion_px is not None:

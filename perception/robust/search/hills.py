@@ -72,10 +72,10 @@ def prominent(
     """
     box, mask = component.box, np.zeros_like(component.pixels)
     mask[part.box.seen_from(box).slices] = part.pixels
-    rows, columns = np.ogrid[: box.height, : box.width]
-    inner_rows = (rows + box.top >= reach_px) & (rows + box.top < shape[0] - reach_px)
-    inner = inner_rows & (columns + box.left >= reach_px) & (columns + box.left < shape[1] - reach_px)
-    found = _prominent(mask & inner, component.filtered_e, noise, reach_px)
+    inner = PixelBox(reach_px, reach_px, shape[0] - 2 * reach_px, shape[1] - 2 * reach_px)
+    inside, looked_at = inner.overlap(part.box).seen_from(box).slices, np.zeros_like(mask)
+    looked_at[inside] = mask[inside]
+    found = _prominent(looked_at, component.filtered_e, noise, reach_px)
     found.sort(key=lambda each: -float(component.filtered_e[each[0], each[1]]))
     cut: list[Blob] = []
     taken = np.zeros_like(mask)
