@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from perception.model.bearing import direction_camera
+from perception.model.discs.nodes import disc_nodes
 from perception.model.layout import Sources
 from perception.model.lens import stretch
-from perception.model.nodes import disc_nodes
 from perception.model.pixels import spread_nodes
 from perception.types import Calibration
 
@@ -169,7 +169,7 @@ def flare_image(
     direction = direction_camera(np.stack([u, v], axis=1), calibration)
     nodes = disc_nodes(u, v, direction, radius, calibration)
     image = np.zeros((5, window.height, window.width))
-    source = Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.along, nodes.weight, np.zeros(1), np.zeros(1))
+    source = Sources.of(nodes, np.zeros(1), np.zeros(1))
     place = (float(u_px) - window.left, float(v_px) - window.top)
     spread_nodes(source, 0, place, 1.0, (0.0, 0.0), calibration.psf_sigma_px, image)
     return FlareImage(*image)

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.discs.nodes import DiscNodes
+
 Array = NDArray[np.float64]
 
 UNUSABLE, SEEN, CLIPPED = 0, 1, 2
@@ -116,9 +118,10 @@ class Sources(NamedTuple):
     ----------
     first_node
         Index of the first node of each, and the number of all, shape (sources + 1,).
-    node_u_px, node_v_px, weight
-        Where nodes are, relative to the source's place, and their share of its light, shape (nodes,).
-        Infinite where there is no image: that light falls on no pixel.
+    node_u_px, node_v_px, half_px, tilt, bend, weight
+        Where nodes are, relative to the source's place, how long and how shaded they are where they are
+        strips (`discs.nodes.DiscNodes`), and their share of its light, shape (nodes,). Infinite where there
+        is no image: that light falls on no pixel.
     node_along
         By what part of its motion during the exposure each lies off, -½ to ½, same shape; 0 where none moves.
     log_range_at
@@ -130,10 +133,21 @@ class Sources(NamedTuple):
     first_node: NDArray[np.int64]
     node_u_px: Array
     node_v_px: Array
+    half_px: Array
+    tilt: Array
+    bend: Array
     node_along: Array
     weight: Array
     log_range_at: Array
     log_flux_at_1_m: Array
+
+    @classmethod
+    def of(cls, nodes: DiscNodes, log_range_at: Array, log_flux_at_1_m: Array) -> "Sources":
+        """Return sources with such images."""
+        return cls(
+            nodes.first, nodes.u_px, nodes.v_px, nodes.half_px, nodes.tilt, nodes.bend, nodes.along,
+            nodes.weight, log_range_at, log_flux_at_1_m,
+        )  # fmt: skip
 
     def part(self, first: int, end: int) -> "Sources":
         """Return some of the sources."""
@@ -142,6 +156,9 @@ class Sources(NamedTuple):
             self.first_node[first : end + 1] - nodes.start,
             self.node_u_px[nodes],
             self.node_v_px[nodes],
+            self.half_px[nodes],
+            self.tilt[nodes],
+            self.bend[nodes],
             self.node_along[nodes],
             self.weight[nodes],
             self.log_range_at[first:end],
@@ -151,7 +168,7 @@ class Sources(NamedTuple):
     @property
     def reach_px(self) -> Array:
         """Radius of each source's image before the point spread, as laid out."""
-        reach_px = np.hypot(self.node_u_px, self.node_v_px)
+        reach_px = np.hypot(abs(self.node_u_px) + self.half_px, self.node_v_px)
         return np.maximum.reduceat(np.where(np.isfinite(reach_px), reach_px, 0.0), self.first_node[:-1])
 
 

@@ -68,6 +68,65 @@ def shares(at_px: float, count: int, sigma_px: float, into: Array) -> tuple[int,
 
 
 @compiled
+def strip_shares(
+    at_px: float, half_px: float, shading: tuple[float, float], off_px: float, count: int, sigma_px: float,
+    into: Array,
+) -> tuple[int, int]:  # fmt: skip
+    """Spread a strip along a row of pixels, as `shares` does a point.
+
+    Its light is 1 + a t + b (t² - 1/3) with `shading` (a, b), t from -1 at its left end to 1 at its right.
+    Rows 0 to 2 of `into`, shape (4, count), become as there, row 3 the derivative by ln size as the strip and
+    `off_px`, how far its middle lies from the point that it grows about, grow in proportion.
+    """
+    reach_px = REACH_SIGMAS * sigma_px + half_px
+    if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):
+        return 0, 0
+    first = max(0, math.ceil(at_px - reach_px - 0.5))
+    end = min(count, math.floor(at_px + reach_px + 0.5) + 1)
+    h, s, variance, is_shaded = half_px, sigma_px, sigma_px**2, shading[0] != 0.0 or shading[1] != 0.0
+    even, tilt, bend = 0.5 * (1.0 - shading[1] / 3.0) / h, 0.5 * shading[0] / h**2, 0.5 * shading[1] / h**3
+    below, density, moment, growing = 0.0, 0.0, 0.0, 0.0
+    for edge in range(first, end + 1):
+        # From the strip's middle; u runs along it from -h to h.
+        x = edge - 0.5 - at_px
+        place = (min(max((x + h) / s, -REACH_SIGMAS), REACH_SIGMAS) + (REACH_SIGMAS + 2.0 * STEP)) / STEP
+        step = int(place)
+        cubic, t = NORMAL[step], place - step
+        below_a = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
+        slope_a = s * (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7])))
+        place = (min(max((x - h) / s, -REACH_SIGMAS), REACH_SIGMAS) + (REACH_SIGMAS + 2.0 * STEP)) / STEP
+        step = int(place)
+        cubic, t = NORMAL[step], place - step
+        below_b = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
+        slope_b = s * (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7])))
+        # ∫ N(x - u) du and ∫ u N du, by parts; ∫ Φ du; σ² times the slope of the first.
+        zeroth = below_a - below_b
+        first_moment = x * zeroth + slope_a - slope_b
+        next_below = even * (h * (below_a + below_b) + first_moment)
+        next_density, next_growing = even * zeroth, even * first_moment
+        next_moment = even * (slope_a - slope_b)
+        if is_shaded:
+            # ∫ uⁿ⁺¹ N du = x ∫ uⁿ N du + σ² times the slope of that; ∫ uⁿ Φ du by parts.
+            slope_1 = variance * zeroth - h * (slope_a + slope_b)
+            second_moment = x * first_moment + slope_1
+            slope_2 = 2.0 * variance * first_moment + h * h * (slope_a - slope_b)
+            third_moment = x * second_moment + slope_2
+            next_below += tilt * 0.5 * (second_moment - h * h * zeroth)
+            next_below += bend * (h**3 * (below_a + below_b) + third_moment) / 3.0
+            next_density += tilt * first_moment + bend * second_moment
+            next_growing += tilt * second_moment + bend * third_moment
+            next_moment += tilt * slope_1 + bend * slope_2
+        next_growing += off_px * next_density
+        if edge > first:
+            into[0, edge - 1] = next_below - below
+            into[1, edge - 1] = density - next_density
+            into[2, edge - 1] = next_moment - moment
+            into[3, edge - 1] = growing - next_growing
+        below, density, moment, growing = next_below, next_density, next_moment, next_growing
+    return first, end
+
+
+@compiled
 def log_upper_tail(z: float) -> float:
     """Return ln Q(z) of the normal distribution: to 10⁻⁸ beyond z = 36, where Q itself is too small."""
     if z < 0.0:

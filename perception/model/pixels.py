@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
-from perception.model.normal import log_upper_tail, of_clipped, shares
+from perception.model.normal import log_upper_tail, of_clipped, shares, strip_shares
 
 Array = NDArray[np.float64]
 
 SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 MOST_STEPS, LEAST_PIVOT = 50, 1e-10
+LEAST_STRIP = 3e-3  # half the length of what is no point, over the width of the point spread
 LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
 
 
@@ -45,16 +46,25 @@ def spread_nodes(
         derivatives by column, row, ln size and ln width of the point spread, and by both parts of its motion.
     """
     planes, rows, columns = image.shape
-    across, down = np.empty((3, columns)), np.empty((3, rows))
+    across, down = np.empty((4, columns)), np.empty((3, rows))
     for node in range(sources.first_node[source], sources.first_node[source + 1]):
         out_u, out_v = growth * sources.node_u_px[node], growth * sources.node_v_px[node]
         if not (math.isfinite(out_u) and math.isfinite(out_v)):
             continue
         along = sources.node_along[node]
-        left, right = shares(place[0] + (out_u + along * motion[0]), columns, sigma_px, across)
+        at_px, half_px = place[0] + (out_u + along * motion[0]), growth * sources.half_px[node]
+        if half_px > LEAST_STRIP * sigma_px:
+            left, right = strip_shares(
+                at_px, half_px, (sources.tilt[node], sources.bend[node]), out_u, columns, sigma_px, across
+            )
+        else:
+            left, right = shares(at_px, columns, sigma_px, across)
+            for column in range(left, right):
+                across[3, column] = out_u * across[1, column]
         top, bottom = shares(place[1] + (out_v + along * motion[1]), rows, sigma_px, down)
         weight = sources.weight[node]
-        in_u, by_u, wider_u = across[0, left:right], across[1, left:right], across[2, left:right]
+        in_u, by_u = across[0, left:right], across[1, left:right]
+        wider_u, larger_u = across[2, left:right], across[3, left:right]
         for row in range(top, bottom):
             in_v, by_v, wider_v = weight * down[0, row], weight * down[1, row], weight * down[2, row]
             line = image[:, row, left:right]
@@ -63,7 +73,7 @@ def spread_nodes(
                 line[0, column] += in_v * in_u[column]
                 line[1, column] += by_u_here
                 line[2, column] += by_v_here
-                line[3, column] += out_u * by_u_here + out_v * by_v_here
+                line[3, column] += in_v * larger_u[column] + out_v * by_v_here
                 line[4, column] += in_v * wider_u[column] + wider_v * in_u[column]
                 if planes == 7:
                     line[5, column] += along * by_u_here

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
+from perception.model.discs.nodes import disc_nodes
+from perception.model.discs.rows import disc_rows
 from perception.model.flare import is_before
 from perception.model.layout import Known, Sources
-from perception.model.nodes import disc_nodes
 from perception.model.ranging import LEAST_LEFT, angular_radius_rad, exposure_towards, flux_e_of
 from perception.types import Calibration
 
@@ -137,6 +138,7 @@ def lay_out(
     hidden_e: Array | None = None,
     moved_px: Array | None = None,
     finer: Array | None = None,
+    in_points: bool = False,
 ) -> tuple[Sources, NDArray[np.bool_]]:
     """Lay sources out as quadrature nodes, all of them at once.
 
@@ -152,7 +154,9 @@ def lay_out(
     moved_px
         How far each moves at most during the exposure, shape (sources,). By default nothing does.
     finer
-        As for `nodes.disc_nodes`.
+        As for `disc_nodes`.
+    in_points
+        That nodes are to be points, of which some may be left out, and not strips.
 
     Returns
     -------
@@ -170,11 +174,10 @@ def lay_out(
         u_px, v_px = np.where(imaged, u_px, calibration.cx_px), np.where(imaged, v_px, calibration.cy_px)
         direction = np.where(imaged[:, None], direction, (0.0, 0.0, 1.0))
         radius_rad = np.where(imaged, radius_rad, 0.0)
-    nodes = disc_nodes(u_px, v_px, direction, radius_rad, calibration, moved_px, finer)
+    laid_out = disc_nodes if in_points else disc_rows
+    nodes = laid_out(u_px, v_px, direction, radius_rad, calibration, moved_px, finer)
     log_flux_at_1_m = np.log(np.where(at_1_m_e > 0.0, at_1_m_e, 1.0))
-    at = np.ascontiguousarray(log_range)
-    sources = Sources(nodes.first, nodes.u_px, nodes.v_px, nodes.along, nodes.weight, at, log_flux_at_1_m)
-    return sources, imaged
+    return Sources.of(nodes, np.ascontiguousarray(log_range), log_flux_at_1_m), imaged
 
 
 def motion_cost(motion_px: Array, log_range: Array, covariance_px2: Array, camera: Camera) -> float:

@@ -35,7 +35,7 @@ MAX_IMAGE_RADIUS_PX = 28.0
 """Sources that look larger are fitted as they are, or not at all: looking for what may hide them is dear."""
 
 MOST_FITTED_RADIUS_PX = 130.0
-"""So far are images laid out exactly (`model.nodes`)."""
+"""So far are images laid out exactly (`model.discs`)."""
 
 # Few sizes of windows, as what texture looks like is reckoned once for each.
 _SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX)

@@ -167,7 +167,9 @@ class _Cut(Climb):
         sigma_px = known.psf_sigma_px
         if layout.has_width:
             sigma_px *= math.exp(known.width_spread * float(values[layout.width]))
-        laid, imaged = lay_out(self._camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=self._finer)
+        laid, imaged = lay_out(
+            self._camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=self._finer, in_points=True
+        )
         fit.log_flux_at_1_m[0], fit.image_radius_px[0] = laid.log_flux_at_1_m[0], laid.reach_px[0]
         flux = math.exp(float(laid.log_flux_at_1_m[0]) - 2.0 * float(own[0, 2]))
         flux = flux if imaged[0] else math.nan  # nowhere to go on to

@@ -214,7 +214,7 @@ def is_as_bright(
     least_e: float, most_e: float, place: tuple[float, float], at_1_m_px: float, camera: Camera
 ) -> bool:
     """Tell whether pixels of so much light may be of sources, which are as bright at any range."""
-    laid, _ = lay_out(camera, np.array([place[0]]), np.array([place[1]]), np.zeros(1))
+    laid, _ = lay_out(camera, np.array([place[0]]), np.array([place[1]]), np.zeros(1), in_points=True)
     source_e = math.exp(float(laid.log_flux_at_1_m[0])) / (math.pi * at_1_m_px**2)
     spread = 1.0 + 4.0 * camera.flux_spread
     return _DIMMEST / spread * source_e < most_e and least_e < _BRIGHTEST * spread * source_e
@@ -243,7 +243,9 @@ class _Eclipse(Climb):
         hidden_px = hidden_px_at_1_m(own, camera)
         hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
         fineness = np.where(np.arange(layout.sources) == far, self._finer, 1.0)
-        laid, imaged = lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=fineness)
+        laid, imaged = lay_out(
+            camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=fineness, in_points=True
+        )
         fit.log_flux_at_1_m, fit.image_radius_px = laid.log_flux_at_1_m, laid.reach_px
         flux = np.exp(laid.log_flux_at_1_m - 2.0 * own[:, 2])
         flux[~imaged] = math.nan  # nowhere to go on to

@@ -121,7 +121,7 @@ def _behind(
                     line[column] += light * across[0, column]
         weight[node] *= stands_out
     seen = Sources(
-        sources.first_node, sources.node_u_px, sources.node_v_px, sources.node_along, weight,
-        sources.log_range_at, sources.log_flux_at_1_m,
+        sources.first_node, sources.node_u_px, sources.node_v_px, sources.half_px, sources.tilt, sources.bend,
+        sources.node_along, weight, sources.log_range_at, sources.log_flux_at_1_m,
     )  # fmt: skip
     return seen, changes

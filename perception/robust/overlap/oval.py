@@ -92,8 +92,7 @@ def _image(values: Array, several: Solution, camera: Camera) -> tuple[Array, Arr
     largest = int(np.argmax(several.image_radius_px))
     laid, _ = lay_out(
         camera, several.u_px[largest : largest + 1], several.v_px[largest : largest + 1],
-        several.log_range[largest : largest + 1],
-    )  # fmt: skip
+        several.log_range[largest : largest + 1], in_points=True)  # fmt: skip
     u_px, v_px, log_flux, log_size, a, b, _ = values.tolist()
     size, out_u, out_v = float(np.exp(log_size)), laid.node_u_px, laid.node_v_px
     moved = laid._replace(

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perception.model import nodes
+from perception.model.discs import nodes
 from perception.model.flare import PixelBox, flare_image, image_radius_px
 from perception.model.ranging import angular_radius_rad
 from tests.unit.perception.simulation import calibration, expected_e

@@ -1,4 +1,4 @@
-"""Quadrature over the image of a source: a uniform sphere, seen through a lens.
+"""The image of a source in points: quadrature over a uniform sphere, seen through a lens.
 
 A sphere of radius r at distance d fills the cap of directions within asin(r / d) of its centre, at uniform
 radiance. Each direction ω of the cap gives light in proportion to cos θ · response(θ) · dΩ, θ the field
@@ -6,6 +6,7 @@ angle, and falls on the image where the lens projects it.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -28,14 +29,18 @@ _LINE_BASE, _LINE_SLOPE = 2.0, 1.1
 
 @dataclass(frozen=True, eq=False)
 class DiscNodes:
-    """Quadrature nodes of the images of some sources, one source's after another's.
+    """Quadrature nodes of some sources' images, one's after another's: points, or strips along u.
 
     Attributes
     ----------
     first
         Index of the first node of each source, and the number of all, shape (sources + 1,).
     u_px, v_px
-        Where they are, relative to the source's place, shape (nodes,); infinite beyond the lens's fold.
+        Where their middles are, relative to the source's place, shape (nodes,); infinite beyond the lens's
+        fold.
+    half_px, tilt, bend
+        Half the length of a strip, and how light changes along it: as 1 + tilt t + bend (t² - 1/3), t from -1
+        to 1. All 0 for points; same shape.
     along
         By what part of its motion each lies off, -½ to ½, same shape.
     weight
@@ -45,8 +50,28 @@ class DiscNodes:
     first: NDArray[np.int64]
     u_px: Array
     v_px: Array
+    half_px: Array
+    tilt: Array
+    bend: Array
     along: Array
     weight: Array
+
+    def of(self, source: int) -> "DiscNodes":
+        """Return those of one source."""
+        these = slice(int(self.first[source]), int(self.first[source + 1]))
+        first = np.array([0, these.stop - these.start])
+        return DiscNodes(first, *(of_all[these] for of_all in self._of_nodes))
+
+    @classmethod
+    def joined(cls, parts: Sequence["DiscNodes"]) -> "DiscNodes":
+        """Return those of the sources of several, one after another's."""
+        counts = np.concatenate([np.diff(part.first) for part in parts])
+        of_nodes = zip(*(part._of_nodes for part in parts), strict=True)
+        return cls(np.cumsum([0, *counts.tolist()]), *(np.concatenate(each) for each in of_nodes))
+
+    @property
+    def _of_nodes(self) -> tuple[Array, ...]:
+        return self.u_px, self.v_px, self.half_px, self.tilt, self.bend, self.along, self.weight
 
 
 def disc_nodes(
@@ -72,11 +97,8 @@ def disc_nodes(
     finer
         By how much nearer together nodes are to lie than a whole image needs, shape (sources,); by default 1.
     """
-    # The pixel smooths like a box of variance 1/12 px², on top of the PSF.
-    smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
-    radius_px = stretch(direction, calibration) * np.tan(angular_radius_rad)
-    fineness = 2.0 * radius_px / smooth_px if finer is None else 2.0 * radius_px / (smooth_px / finer)
-    rules = [_cap_rule(each) for each in np.ceil(fineness).astype(int).tolist()]
+    smooth_px, fineness = fineness_of(direction, angular_radius_rad, calibration, finer)
+    rules = [_cap_rule(each) for each in np.ceil(2.0 * fineness).astype(int).tolist()]
     first = np.cumsum([0, *(rule.shape[1] for rule in rules)])
     omega, weight = _over_caps(
         first,
@@ -90,20 +112,40 @@ def disc_nodes(
     at_px = project(omega, calibration)
     at_px[np.isnan(at_px)] = np.inf
     of = np.repeat(np.arange(len(rules)), np.diff(first))
-    still = DiscNodes(first, at_px[:, 0] - u_px[of], at_px[:, 1] - v_px[of], np.zeros(len(weight)), weight)
-    return still if moved_px is None else _along_lines(still, moved_px / smooth_px)
+    none = np.zeros(len(weight))
+    still = DiscNodes(first, at_px[:, 0] - u_px[of], at_px[:, 1] - v_px[of], none, none, none, none, weight)
+    return still if moved_px is None else along_lines(still, moved_px / smooth_px)
 
 
-def _along_lines(still: DiscNodes, length: Array) -> DiscNodes:
+def fineness_of(
+    direction: Array, angular_radius_rad: Array, calibration: Calibration, finer: Array | None
+) -> tuple[float, Array]:
+    """Return the width that smooths images, in pixels, and for each the ratio of its radius to that.
+
+    Pixels smooth like a box of variance 1/12 px², on top of the point spread.
+    """
+    smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
+    radius_px = stretch(direction, calibration) * np.tan(angular_radius_rad)
+    return smooth_px, radius_px / smooth_px if finer is None else radius_px / (smooth_px / finer)
+
+
+def along_lines(still: DiscNodes, length: Array) -> DiscNodes:
     """Return each source's nodes again for each node of its line, of a length relative to the smoothing."""
     rules = [_line_rule(math.ceil(_LINE_BASE + _LINE_SLOPE * one)) for one in length.tolist()]
     parts = [slice(first, end) for first, end in zip(still.first[:-1], still.first[1:], strict=True)]
     both = list(zip(parts, rules, strict=True))
     times = [len(along) for along, _ in rules]
+    u_px, v_px, half_px, tilt, bend = (
+        np.concatenate([np.tile(of_nodes[part], len(along)) for part, (along, _) in both])
+        for of_nodes in (still.u_px, still.v_px, still.half_px, still.tilt, still.bend)
+    )
     return DiscNodes(
         np.cumsum([0, *(times * np.diff(still.first))]),
-        np.concatenate([np.tile(still.u_px[part], len(along)) for part, (along, _) in both]),
-        np.concatenate([np.tile(still.v_px[part], len(along)) for part, (along, _) in both]),
+        u_px,
+        v_px,
+        half_px,
+        tilt,
+        bend,
         np.concatenate([np.repeat(along, part.stop - part.start) for part, (along, _) in both]),
         np.concatenate([np.outer(weight, still.weight[part]).ravel() for part, (_, weight) in both]),
     )

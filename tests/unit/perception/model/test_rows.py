@@ -1,0 +1,124 @@
+"""Images in rows of strips, as fits use them, against points and a sum by hand."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from perception.model.bearing import direction_camera
+from perception.model.discs.nodes import DiscNodes, disc_nodes
+from perception.model.discs.rows import disc_rows
+from perception.model.layout import Sources
+from perception.model.normal import strip_shares
+from perception.model.pixels import spread_nodes
+from perception.model.ranging import angular_radius_rad
+from perception.types import Calibration
+from tests.unit.perception.simulation import calibration
+
+Array = NDArray[np.float64]
+
+FALLING: Array = np.linspace(0.0, 1.2, 121)
+LENSES: dict[str, dict[str, Any]] = {
+    "rectilinear": {},
+    "sharp": {"psf_sigma_px": 0.4},
+    "fisheye": {"lens_model": "fisheye", "distortion": (-0.02, 0.003, 0.0, 0.0)},
+    "brown_conrady": {"lens_model": "brown_conrady", "distortion": (-0.2, 0.05, 0.001, -0.001)},
+    "vignetted": {"response_angle_rad": FALLING, "response_relative": np.cos(FALLING) ** 2},
+}
+
+
+def _laid(
+    lay: Any, u_px: float, v_px: float, radius_rad: float, camera: Calibration, finer: float, moved_px: float
+) -> DiscNodes:
+    place = np.array([[u_px, v_px]])
+    nodes = lay(
+        place[:, 0], place[:, 1], direction_camera(place, camera), np.array([radius_rad]), camera,
+        np.array([moved_px]) if moved_px else None, np.array([finer]),
+    )  # fmt: skip
+    assert isinstance(nodes, DiscNodes)
+    return nodes
+
+
+def _image(
+    nodes: DiscNodes, u_px: float, v_px: float, half_px: int, sigma_px: float, motion: tuple[float, float]
+) -> Array:
+    source = Sources.of(nodes, np.zeros(1), np.zeros(1))
+    image = np.zeros((7 if any(motion) else 5, 2 * half_px + 1, 2 * half_px + 1))
+    spread_nodes(source, 0, (half_px + u_px % 1.0, half_px + v_px % 1.0), 1.02, motion, sigma_px, image)
+    return image
+
+
+@pytest.mark.parametrize("lens", list(LENSES))
+@pytest.mark.parametrize("range_m", [200.0, 24.0, 5.0, 1.2, 0.4, 0.16])
+@pytest.mark.parametrize(("u_px", "v_px"), [(639.8, 479.3), (1000.3, 700.7)])
+def test_rows_say_the_same_as_points(lens: str, range_m: float, u_px: float, v_px: float) -> None:
+    """Sources of 0.02 to 60 px radius: shares to 1e-4 of the greatest, slopes as well as points know them."""
+    camera = calibration(**LENSES[lens])
+    radius_rad = float(angular_radius_rad(range_m, 0.01))
+    half_px = math.ceil(1500.0 * radius_rad + 6.0 * camera.psf_sigma_px) + 3
+    points, rows = (
+        _image(
+            _laid(lay, u_px, v_px, radius_rad, camera, finer, 0.0), u_px, v_px, half_px, camera.psf_sigma_px, (0.0, 0.0)
+        )
+        for lay, finer in ((disc_nodes, 2.0), (disc_rows, 1.0))
+    )  # fmt: skip
+    for plane, most in enumerate((1e-4, 5e-4, 5e-4, 5e-4, 3e-3)):
+        greatest = float(np.abs(points[plane]).max())
+        # What a point's size changes is next to nothing.
+        least = 1e-3 * float(np.abs(points[4]).max()) if plane == 3 else 0.0
+        assert float(np.abs(rows[plane] - points[plane]).max()) < most * max(greatest, least), plane
+
+
+def test_so_do_rows_of_what_moves() -> None:
+    """4.8 px in radius, moved by 5 px: to 1e-4 of the greatest, the slopes by its motion too."""
+    camera, radius_rad = calibration(), float(angular_radius_rad(1.0, 0.01))
+    points, rows = (
+        _image(
+            _laid(lay, 700.4, 300.2, radius_rad, camera, finer, 6.0), 700.4, 300.2, 20, 0.7, (3.0, 4.0)
+        )
+        for lay, finer in ((disc_nodes, 2.0), (disc_rows, 1.0))
+    )  # fmt: skip
+    for plane in range(7):
+        greatest = float(np.abs(points[plane]).max())
+        assert float(np.abs(rows[plane] - points[plane]).max()) < 2e-4 * greatest, plane
+
+
+def test_rows_are_few() -> None:
+    """Of 4.8 px: a strip for each half pixel of its height, where points take 220."""
+    camera, radius_rad = calibration(), float(angular_radius_rad(1.0, 0.01))
+    assert len(_laid(disc_rows, 640.0, 480.0, radius_rad, camera, 1.0, 0.0).weight) <= 19
+
+
+def test_what_a_lens_folds_away_is_of_points() -> None:
+    """A sphere across the fold: the part that has no image counts as light, and falls nowhere."""
+    camera = calibration(lens_model="brown_conrady", distortion=(-0.3, 0.0, 0.0, 0.0))
+    u_px = camera.cx_px + camera.fx_px * 0.66  # 39.8° from the axis, where 46.5° is the fold
+    rows = _laid(disc_rows, u_px, 479.5, 0.15, camera, 1.0, 0.0)
+    assert not rows.half_px.any()
+    assert 0.01 < rows.weight[np.isinf(rows.u_px)].sum() < 0.5
+    assert rows.weight.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("shading", [(0.0, 0.0), (0.4, -0.3)])
+def test_a_strip_against_a_sum_of_points(shading: tuple[float, float]) -> None:
+    """Φ and φ of 4 001 points along it, from the standard library's erf: to 1e-6 of the greatest."""
+    half_px, sigma_px, at_px, off_px, count = 2.3, 0.7, 9.37, -1.7, 20
+    into: Array = np.zeros((4, count))
+    first, end = strip_shares(at_px, half_px, shading, off_px, count, sigma_px, into)
+    assert (first, end) == (3, 17)
+    t = (np.arange(4001) + 0.5) / 2000.5 - 1.0
+    light = 1.0 + shading[0] * t + shading[1] * (t**2 - 1.0 / 3.0)
+    light /= light.sum()
+    z = (np.arange(count + 1)[:, None] - 0.5 - at_px - half_px * t) / sigma_px
+    below = 0.5 + 0.5 * np.vectorize(math.erf)(z * math.sqrt(0.5))
+    density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
+    sums: list[Array] = [
+        np.diff(below @ light),
+        -np.diff(density @ light) / sigma_px,
+        -np.diff((z * density) @ light),
+        -np.diff((density * (off_px + half_px * t)) @ light) / sigma_px,
+    ]
+    for row, expected in zip(into, sums, strict=True):
+        np.testing.assert_allclose(row, expected, atol=1e-6 * float(np.abs(expected).max()))
