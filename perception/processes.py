@@ -1,7 +1,8 @@
 """The frames of a set side by side in processes of their own.
 
 Threads of one interpreter hand it to and fro between the many short steps of a fit, and gain little by that;
-processes do not. Frames reach them by memory that they share, detections come back by pipes.
+processes do not. Frames reach them by memory that they share, the next ones while they are at work, and
+detections come back by pipes.
 """
 
 import contextlib
@@ -10,7 +11,8 @@ import os
 import signal
 import threading
 import weakref
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing import connection, get_context
 from multiprocessing.shared_memory import SharedMemory
@@ -24,6 +26,7 @@ from perception.types import Calibration, Detections, RawFrame
 from perception.warm_up import warm_up_frames
 
 _ENDS_WITHIN_S = 2.0
+_MOST_HELD = 64  # pieces of memory that a process keeps open
 
 
 class DetectorProcesses:
@@ -71,7 +74,8 @@ class DetectorProcesses:
         self._calibrations = dict(calibrations)
         self._one_at_a_time = threading.RLock()
         self._workers: list[_Worker] = []
-        weakref.finalize(self, _end, self._workers)  # where nobody closes it
+        self._memory = _Memory()
+        weakref.finalize(self, _end, self._workers, self._memory)  # where nobody closes it
         try:
             for _ in range(count):
                 self._workers.append(_Worker(self._calibrations, estimator, limit_s))
@@ -112,7 +116,7 @@ class DetectorProcesses:
     def close(self) -> None:
         """End the processes, and give their memory back."""
         with self._one_at_a_time:
-            _end(self._workers)
+            _end(self._workers, self._memory)
 
     def __enter__(self) -> "DetectorProcesses":
         return self
@@ -123,51 +127,52 @@ class DetectorProcesses:
         self.close()
 
     def _answers(self, frames: Sequence[RawFrame]) -> list[Detections | Exception]:
-        """Give each process a frame, and the next one when it answers."""
+        """Give each process a frame, and the next one when it answers; that is in memory by then."""
         answers: dict[int, Detections | Exception] = {}
         waiting = iter(enumerate(frames))
-        busy: dict[Any, tuple[_Worker, int]] = {}
+        placed: deque[tuple[int, _Handed]] = deque()
+        busy: dict[Any, tuple[_Worker, int, _Handed]] = {}
         idle = list(self._workers)
-        while True:
-            for worker in idle:
-                handed = next(waiting, None)
-                if handed is not None:
-                    worker.hand_over(handed[1])
-                    busy[worker.pipe] = (worker, handed[0])
-            if not busy:
-                return [answers[index] for index in range(len(frames))]
-            idle = []
-            for ready in connection.wait(list(busy)):
-                worker, index = busy.pop(ready)
+        while len(answers) < len(frames):
+            while idle and (placed or self._place_next(waiting, placed)):
+                worker, (index, handed) = idle.pop(), placed.popleft()
+                worker.hand_over(handed)
+                busy[worker.pipe] = (worker, index, handed)
+            # One at a time, as long as nobody waits.
+            goes_on = len(placed) < len(self._workers) and self._place_next(waiting, placed)
+            for ready in connection.wait(list(busy), timeout=0.0 if goes_on else None):
+                worker, index, handed = busy.pop(ready)
                 answers[index] = worker.answer("has ended, and the others with it: make others")
+                self._memory.give_back(handed)
                 idle.append(worker)
+        return [answers[index] for index in range(len(frames))]
+
+    def _place_next(
+        self, waiting: "Iterator[tuple[int, RawFrame]]", placed: "deque[tuple[int, _Handed]]"
+    ) -> bool:
+        """Put the next frame where processes find it; tell whether there was one."""
+        for index, frame in waiting:
+            placed.append((index, self._memory.place(frame)))
+            return True
+        return False
 
 
 class _Worker:
-    """A process, the pipe to it, and the memory in which it finds its frame."""
+    """A process, and the pipe to it."""
 
     def __init__(self, calibrations: Mapping[str, Calibration], estimator: str, limit_s: float) -> None:
         context = get_context("spawn")
         self.pipe, its = context.Pipe()
-        self._memory: SharedMemory | None = None
         self.process = context.Process(
             target=_serve, args=(its, calibrations, estimator, limit_s), daemon=True
         )
         self.process.start()
         its.close()
 
-    def hand_over(self, frame: RawFrame) -> None:
-        """Give it a frame. What is no array of numbers goes as it is."""
-        pixels, place = frame.data_dn, None
-        if isinstance(pixels, np.ndarray) and pixels.dtype.kind in "iuf" and pixels.size:
-            if self._memory is None or self._memory.size < pixels.nbytes:
-                self._forget()
-                self._memory = SharedMemory(create=True, size=pixels.nbytes)
-            np.copyto(np.ndarray(pixels.shape, pixels.dtype, self._memory.buf), pixels)
-            place = _Place(self._memory.name, pixels.shape, pixels.dtype.str)
-            frame = replace(frame, data_dn=np.empty((0, 0), dtype=np.uint16))
+    def hand_over(self, handed: "_Handed") -> None:
+        """Give it a frame."""
         with contextlib.suppress(OSError):  # one that has ended is told where its answer is waited for
-            self.pipe.send((frame, place))
+            self.pipe.send(handed)
 
     def answer(self, otherwise: str) -> Any:
         """Wait for its answer; raise RuntimeError where it ends without one."""
@@ -187,19 +192,6 @@ class _Worker:
             self.process.kill()
             self.process.join()
         self.pipe.close()
-        self._forget()
-
-    def _forget(self) -> None:
-        if self._memory is not None:
-            self._memory.close()
-            with contextlib.suppress(FileNotFoundError):
-                self._memory.unlink()
-            self._memory = None
-
-
-def _end(workers: "list[_Worker]") -> None:
-    while workers:
-        workers.pop().end()
 
 
 @dataclass(frozen=True)
@@ -211,6 +203,58 @@ class _Place:
     dtype: str
 
 
+_Handed = tuple[RawFrame, _Place | None]
+"""A frame, without its pixels where these lie in memory."""
+
+
+class _Memory:
+    """Memory that processes share, a piece for each frame that is in it."""
+
+    def __init__(self) -> None:
+        self._all: dict[str, SharedMemory] = {}
+        self._free: list[str] = []
+
+    def place(self, frame: RawFrame) -> _Handed:
+        """Put a frame's pixels into memory. What is no array of numbers stays as it is."""
+        pixels = frame.data_dn
+        if not (isinstance(pixels, np.ndarray) and pixels.dtype.kind in "iuf" and pixels.size):
+            return frame, None
+        name = next((each for each in self._free if self._all[each].size >= pixels.nbytes), None)
+        if name is None:
+            while self._free:  # too small, all of them
+                _forget(self._all.pop(self._free.pop()))
+            memory = SharedMemory(create=True, size=pixels.nbytes)
+            name, self._all[memory.name] = memory.name, memory
+        else:
+            self._free.remove(name)
+        np.copyto(np.ndarray(pixels.shape, pixels.dtype, self._all[name].buf), pixels)
+        without = replace(frame, data_dn=np.empty((0, 0), dtype=np.uint16))
+        return without, _Place(name, pixels.shape, pixels.dtype.str)
+
+    def give_back(self, handed: _Handed) -> None:
+        """Take a frame's memory for another."""
+        if handed[1] is not None:
+            self._free.append(handed[1].memory)
+
+    def close(self) -> None:
+        """Give all of it back."""
+        self._free.clear()
+        while self._all:
+            _forget(self._all.popitem()[1])
+
+
+def _forget(memory: SharedMemory) -> None:
+    memory.close()
+    with contextlib.suppress(FileNotFoundError):
+        memory.unlink()
+
+
+def _end(workers: list[_Worker], memory: _Memory) -> None:
+    while workers:
+        workers.pop().end()
+    memory.close()
+
+
 def _serve(
     pipe: connection.Connection, calibrations: Mapping[str, Calibration], estimator: str, limit_s: float
 ) -> None:
@@ -219,15 +263,18 @@ def _serve(
     warm_up_frames()
     with contextlib.suppress(EOFError, OSError):  # nobody is there any more
         pipe.send("ready")
-        held: SharedMemory | None = None
+        held: dict[str, SharedMemory] = {}
         while (handed := pipe.recv()) is not None:
             answer: Detections | Exception
             try:
                 frame, place = handed
                 if place is not None:
-                    if held is None or held.name != place.memory:
-                        held = SharedMemory(place.memory)
-                    frame = replace(frame, data_dn=np.ndarray(place.shape, place.dtype, held.buf))
+                    if place.memory not in held:
+                        if len(held) >= _MOST_HELD:
+                            held.clear()
+                        held[place.memory] = SharedMemory(place.memory)
+                    pixels = np.ndarray(place.shape, place.dtype, held[place.memory].buf)
+                    frame = replace(frame, data_dn=pixels)
                 answer = detect(frame, calibrations[frame.camera], estimator, limit_s=limit_s)
             except ValueError as error:
                 answer = error

@@ -73,18 +73,27 @@ class Layout:
 
     def prior(self, structure: "Structure", motion_px: float) -> Array:
         """Return the prior precision of the unknowns, shape (unknowns, unknowns); `motion_px` of `Known`."""
-        precision = np.zeros((self.size, self.size))
-        if self.has_slack:
-            slack = np.arange(3, self.width, self.per_source)
-            precision[slack, slack] = 1.0
-        if self.moves:
-            for motion in (self.motion, self.motion + 1):
-                moved = np.arange(motion, self.width, self.per_source)
-                precision[moved, moved] = 1.0 / motion_px**2
-        if self.has_width:
-            precision[self.width, self.width] = 1.0
+        if not self.structure:
+            return _prior(self, motion_px)
+        precision = _prior(self, motion_px).copy()
         precision[self.background + 1 :, self.background + 1 :] = structure.precision
         return precision
+
+
+@lru_cache(maxsize=256)
+def _prior(layout: Layout, motion_px: float) -> Array:
+    """Return the prior precision of unknowns, but for that of a structure's amplitudes."""
+    precision = np.zeros((layout.size, layout.size))
+    if layout.has_slack:
+        slack = np.arange(3, layout.width, layout.per_source)
+        precision[slack, slack] = 1.0
+    if layout.moves:
+        for motion in (layout.motion, layout.motion + 1):
+            moved = np.arange(motion, layout.width, layout.per_source)
+            precision[moved, moved] = 1.0 / motion_px**2
+    if layout.has_width:
+        precision[layout.width, layout.width] = 1.0
+    return precision
 
 
 _layout = lru_cache(maxsize=256)(Layout)  # every window asks for one, and most for the same

@@ -13,71 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.model.discs.spread import spread_nodes
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
-from perception.model.normal import log_upper_tail, of_clipped, shares, strip_shares
+from perception.model.normal import log_upper_tail, of_clipped
 
 Array = NDArray[np.float64]
 
 SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 MOST_STEPS, LEAST_PIVOT = 50, 1e-10
-LEAST_STRIP = 3e-3  # half the length of what is no point, over the width of the point spread
 LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
-
-
-@compiled
-def spread_nodes(
-    sources: Sources, source: int, place: tuple[float, float], growth: float, motion: tuple[float, float],
-    sigma_px: float, image: Array,
-) -> None:  # fmt: skip
-    """Integrate one source's image over the pixels of a window.
-
-    Parameters
-    ----------
-    sources, source, place
-        Which one, and its column and row in the window.
-    growth, motion
-        Factor on the size for which it is laid out, and how far it moves along columns and rows during the
-        exposure, evenly, half of it before `place`.
-    sigma_px
-        Width of the point spread.
-    image
-        Zeros of shape (5 or 7, rows, columns): the share of its flux in each pixel is added, and that share's
-        derivatives by column, row, ln size and ln width of the point spread, and by both parts of its motion.
-    """
-    planes, rows, columns = image.shape
-    across, down = np.empty((4, columns)), np.empty((3, rows))
-    for node in range(sources.first_node[source], sources.first_node[source + 1]):
-        out_u, out_v = growth * sources.node_u_px[node], growth * sources.node_v_px[node]
-        if not (math.isfinite(out_u) and math.isfinite(out_v)):
-            continue
-        along = sources.node_along[node]
-        at_px, half_px = place[0] + (out_u + along * motion[0]), growth * sources.half_px[node]
-        if half_px > LEAST_STRIP * sigma_px:
-            left, right = strip_shares(
-                at_px, half_px, (sources.tilt[node], sources.bend[node]), out_u, columns, sigma_px, across
-            )
-        else:
-            left, right = shares(at_px, columns, sigma_px, across)
-            for column in range(left, right):
-                across[3, column] = out_u * across[1, column]
-        top, bottom = shares(place[1] + (out_v + along * motion[1]), rows, sigma_px, down)
-        weight = sources.weight[node]
-        in_u, by_u = across[0, left:right], across[1, left:right]
-        wider_u, larger_u = across[2, left:right], across[3, left:right]
-        for row in range(top, bottom):
-            in_v, by_v, wider_v = weight * down[0, row], weight * down[1, row], weight * down[2, row]
-            line = image[:, row, left:right]
-            for column in range(right - left):
-                by_u_here, by_v_here = in_v * by_u[column], by_v * in_u[column]
-                line[0, column] += in_v * in_u[column]
-                line[1, column] += by_u_here
-                line[2, column] += by_v_here
-                line[3, column] += in_v * larger_u[column] + out_v * by_v_here
-                line[4, column] += in_v * wider_u[column] + wider_v * in_u[column]
-                if planes == 7:
-                    line[5, column] += along * by_u_here
-                    line[6, column] += along * by_v_here
 
 
 @compiled
@@ -141,6 +86,21 @@ def expectation(
 
 
 @compiled
+def dot(one: Array, other: Array) -> float:
+    """Return Σ xᵢ yᵢ: four sums side by side, which the processor adds at once, always in the same order."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = len(one) - len(one) % 4
+    for at in range(0, whole, 4):
+        a += one[at] * other[at]
+        b += one[at + 1] * other[at + 1]
+        c += one[at + 2] * other[at + 2]
+        d += one[at + 3] * other[at + 3]
+    for at in range(whole, len(one)):
+        a += one[at] * other[at]
+    return (a + b) + (c + d)
+
+
+@compiled
 def add_information(jacobian: Array, weight: Array, into: Array) -> None:
     """Add J W Jᵀ."""
     size, pixels = jacobian.shape
@@ -149,17 +109,7 @@ def add_information(jacobian: Array, weight: Array, into: Array) -> None:
         for pixel in range(pixels):
             weighted[pixel] = jacobian[one, pixel] * weight[pixel]
         for other in range(one + 1):
-            # Four sums side by side: the processor adds them at once, in an order that is always the same.
-            a, b, c, d = 0.0, 0.0, 0.0, 0.0
-            whole = pixels - pixels % 4
-            for pixel in range(0, whole, 4):
-                a += weighted[pixel] * jacobian[other, pixel]
-                b += weighted[pixel + 1] * jacobian[other, pixel + 1]
-                c += weighted[pixel + 2] * jacobian[other, pixel + 2]
-                d += weighted[pixel + 3] * jacobian[other, pixel + 3]
-            for pixel in range(whole, pixels):
-                a += weighted[pixel] * jacobian[other, pixel]
-            total = (a + b) + (c + d)
+            total = dot(weighted, jacobian[other])
             into[one, other] += total
             if other != one:
                 into[other, one] += total
@@ -190,9 +140,7 @@ def slopes(
     information[:] = precision
     add_information(jacobian, weight, information)
     for one in range(len(values)):
-        total = 0.0
-        for pixel in range(len(expected)):
-            total += jacobian[one, pixel] * pull[pixel]
+        total = dot(jacobian[one], pull)
         for other in range(len(values)):
             total -= precision[one, other] * values[other]
         gradient[one] = total
@@ -201,21 +149,30 @@ def slopes(
 @compiled
 def objective(
     view: View, values: Array, expected: Array, variance: Array, precision: Array, clip_e: float
-) -> tuple[float, float]:
-    """Return −2 ln L of an expectation with given variances, priors included, without Σ ln variance; that."""
+) -> float:
+    """Return −2 ln L of an expectation with given variances, priors included, without Σ ln variance."""
     image, state = view.image_e.ravel(), view.state.ravel()
-    total, logs = 0.0, 0.0
+    total = 0.0
     for pixel in range(len(expected)):
         if state[pixel] == SEEN:
             total += (image[pixel] - expected[pixel]) ** 2 / variance[pixel]
-            logs += math.log(variance[pixel])
         elif state[pixel] == CLIPPED:
             z = (clip_e - expected[pixel]) / math.sqrt(variance[pixel])
             total -= 2.0 * log_upper_tail(min(max(z, -38.0), 1e4))
     for one in range(len(values)):
         for other in range(len(values)):
             total += values[one] * precision[one, other] * values[other]
-    return total, logs
+    return total
+
+
+@compiled
+def log_variances(view: View, variance: Array) -> float:
+    """Return Σ ln variance of the pixels that are seen."""
+    state, total = view.state.ravel(), 0.0
+    for pixel in range(len(variance)):
+        if state[pixel] == SEEN:
+            total += math.log(variance[pixel])
+    return total
 
 
 @compiled
@@ -232,8 +189,8 @@ def unlikeliness(
         return math.inf
     expected, variance, jacobian = np.empty(pixels), np.empty(pixels), np.empty((len(values), pixels))
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
-    total, logs = objective(view, values, expected, variance, precision, known.clip_e)
-    return total + logs
+    total = objective(view, values, expected, variance, precision, known.clip_e)
+    return total + log_variances(view, variance)
 
 
 @compiled
@@ -351,7 +308,7 @@ def maximise(
     new_expected, variance, new_variance = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     gradient, trial, clip_e = np.empty(size), np.empty(size), known.clip_e
     fisher, inverse, damped = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
-    damping, is_new, log_det = FIRST_DAMPING, True, 0.0
+    damping, is_new, log_det, before = FIRST_DAMPING, True, 0.0, 0.0
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
     for _ in range(MOST_STEPS):
         if is_new:
@@ -367,6 +324,7 @@ def maximise(
                 settled &= abs(free_step) <= SETTLED_SIGMAS * math.sqrt(inverse[one, one])
             if settled:
                 break
+            before = objective(view, values, expected, variance, precision, clip_e)
         for one in range(size):
             damped[one] = fisher[one]
             damped[one, one] *= 1.0 + damping
@@ -382,8 +340,7 @@ def maximise(
         is_new = False
         if is_inside(trial, view, count, step):
             expectation(trial, view, sources, structure, known, new_expected, new_jacobian, new_variance)
-            before, _ = objective(view, values, expected, variance, precision, clip_e)
-            after, _ = objective(view, trial, new_expected, variance, precision, clip_e)
+            after = objective(view, trial, new_expected, variance, precision, clip_e)
             is_new = after <= before + 1e-9 * abs(before) + 1e-9
         if is_new:
             values[:], expected[:] = trial, new_expected
@@ -402,5 +359,5 @@ def maximise(
         if math.isnan(log_det):
             return math.inf, math.inf
     covariance[:] = inverse
-    chi2, logs = objective(view, values, expected, variance, precision, clip_e)
-    return chi2 + logs, log_det
+    chi2 = objective(view, values, expected, variance, precision, clip_e)
+    return chi2 + log_variances(view, variance), log_det

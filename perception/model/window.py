@@ -21,7 +21,13 @@ from perception.model.discs.nodes import disc_nodes
 from perception.model.discs.rows import disc_rows
 from perception.model.flare import is_before
 from perception.model.layout import Known, Sources
-from perception.model.ranging import LEAST_LEFT, angular_radius_rad, exposure_towards, flux_e_of
+from perception.model.ranging import (
+    LEAST_LEFT,
+    angular_radius_rad,
+    covered_px_at_1_m,
+    exposure_towards,
+    flux_e_of,
+)
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
@@ -86,6 +92,14 @@ class Camera:
         """Radius of the sources, 0 where it is not known."""
         radius_m = self.calibration.source_radius_m
         return radius_m if math.isfinite(radius_m) else 0.0
+
+    def hidden_px_at_1_m(self, places_px: Array) -> Array | None:
+        """Return of how many pixels' background a source would take away from one metre, at each place.
+
+        Shape (n, 2) → (n,); None where sources hide nothing.
+        """
+        hiding = self.calibration.hidden_background
+        return hiding * covered_px_at_1_m(places_px, self.calibration) if hiding else None
 
     def known(self, clip_e: float) -> Known:
         """Return what compiled loops are told of the camera, and at how many electrons a pixel clips."""

@@ -21,7 +21,12 @@ from perception.robust.overlap.deblend import (
     of_free_width,
 )
 from perception.robust.overlap.eclipse import eclipses
-from perception.robust.overlap.edge import is_beyond_doubt, leaves_something, with_edges
+from perception.robust.overlap.edge import (
+    is_beyond_doubt,
+    leaves_something,
+    surely_leaves_something,
+    with_edges,
+)
 from perception.robust.overlap.halo import with_halo
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
@@ -260,8 +265,10 @@ def _several_before_edges(
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         more = parted.get(index)
         by_few = None if more is None or (one is not None and more.count > one.count + 2) else more
-        so_far = (one, edged.get(index), chosen[index], by_few)
-        if not cluster.is_in_crowd and all(each is None or leaves_something(each) for each in so_far):
+        so_far = (edged.get(index), chosen[index], by_few)
+        if cluster.is_in_crowd or not (one is None or surely_leaves_something(one)):
+            continue
+        if all(each is None or leaves_something(each) for each in so_far):
             tried[index] = one
     several = with_flares_and_edges(brightest_alone(tried, found, camera), camera)
     of_all = [several.get(index) for index in range(len(found))]

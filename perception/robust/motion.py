@@ -42,9 +42,9 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
         if solution is None or solution.count > MOST_TOGETHER:
             continue
         if solution.count == 1:
-            motions = [_seen(solution, solution.window.box, camera)]
+            motions = [_seen(solution, *solution.drawn_out, camera)]
         elif asks_for_more(solution):
-            motions = [_seen(solution, _around(solution, flare), camera) for flare in range(solution.count)]
+            motions = [_seen(solution, *_drawn_out(solution, k), camera) for k in range(solution.count)]
         else:
             continue
         if any(motion != AT_REST for motion in motions):
@@ -69,21 +69,13 @@ def is_long_clutter(solution: Solution, index: int, camera: Camera) -> bool:
     return not is_usual_motion(length_px, log_range, camera)[index]
 
 
-def _seen(solution: Solution, box: PixelBox, camera: Camera) -> Motion:
-    """Return the motion that the residual in a part of a window asks for, if it does.
+def _seen(
+    solution: Solution, chi2: float, along_u: float, along_v: float, most_gain: float, camera: Camera
+) -> Motion:
+    """Return the motion that a residual asks for (`drawn_out`), if it does.
 
     One of a lone flare that costs more than it may gain, by so much that it would not be weighed in, is none.
     """
-    window = solution.window
-    part = box.seen_from(window.box).slices
-    chi2, along_u, along_v, most_gain = drawn_out(
-        np.ascontiguousarray(window.image_e[part]),
-        np.ascontiguousarray(window.state[part]),
-        np.ascontiguousarray(solution.expected_e[part]),
-        np.ascontiguousarray(solution.flares_e[part]),
-        window.floor_e2,
-        window.prnu,
-    )
     length_px = math.hypot(along_u, along_v)
     if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
         return AT_REST
@@ -94,6 +86,20 @@ def _seen(solution: Solution, box: PixelBox, camera: Camera) -> Motion:
             return AT_REST
     shorter = min(1.0, 0.5 * MOST_MOTION_PX / length_px)
     return shorter * along_u, shorter * along_v
+
+
+def _drawn_out(solution: Solution, flare: int) -> tuple[float, float, float, float]:
+    """Return what the residual around one of several flares says of its motion, as `Solution.drawn_out`."""
+    window = solution.window
+    part = _around(solution, flare).seen_from(window.box).slices
+    return drawn_out(
+        np.ascontiguousarray(window.image_e[part]),
+        np.ascontiguousarray(window.state[part]),
+        np.ascontiguousarray(solution.expected_e[part]),
+        np.ascontiguousarray(solution.flares_e[part]),
+        window.floor_e2,
+        window.prnu,
+    )
 
 
 def _around(solution: Solution, flare: int) -> PixelBox:

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.layout import UNUSABLE, Structure, even
+from perception.model.layout import UNUSABLE, Structure, View, even
 from perception.robust.search.structure import joined
 
 Array = NDArray[np.float64]
@@ -55,7 +56,13 @@ class Window:
     unsure: Structure | None = None
     edges: Structure | None = None
 
-    @property
+    @cached_property
+    def view(self) -> View:
+        """The window as compiled loops see it."""
+        known_e = np.zeros(self.image_e.shape) if self.known_e is None else self.known_e
+        return View(self.box.top, self.box.left, self.image_e, self.state, self.floor_e2, known_e)
+
+    @cached_property
     def beside(self) -> Structure:
         """All that may lie beside flares and even background."""
         whole = self.structure

@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.layout import Sources, View
+from perception.model.layout import Sources
 from perception.model.pixels import maximise, unlikeliness
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import MOTION_PX, Camera, lay_out
 from perception.model.window import motion_cost as cost_of_motion
-from perception.robust.goodness import LeftOver, left_over, residual_e
+from perception.robust.goodness import LeftOver, drawn_out, left_over, residual_e
 from perception.robust.problem import Motion, Problem, Start, Window
 
 Array = NDArray[np.float64]
@@ -156,6 +156,14 @@ class Solution:
             window.floor_e2, window.prnu, self.psf_sigma_px,
         )  # fmt: skip
 
+    @cached_property
+    def drawn_out(self) -> tuple[float, float, float, float]:
+        """By how much longer than wide what is seen in its window is than the fit (`goodness.drawn_out`)."""
+        window = self.window
+        return drawn_out(
+            window.image_e, window.state, self.expected_e, self.flares_e, window.floor_e2, window.prnu
+        )
+
     @property
     def excess_e(self) -> float:
         """Root of the mean square of what the fit leaves over in its window, noise taken off."""
@@ -247,25 +255,18 @@ class Fit:
         )
 
     @property
-    def view(self) -> View:
-        """The window as compiled loops see it."""
-        box, window = self.window.box, self.window
-        known_e = np.zeros(window.image_e.shape) if window.known_e is None else window.known_e
-        return View(box.top, box.left, window.image_e, window.state, window.floor_e2, known_e)
-
-    @property
     def prior(self) -> Array:
         """Precision of the unknowns a priori."""
         return self.layout.prior(self.structure, self.known.motion_px)
 
     def unlikeliness(self, sources: Sources) -> float:
         """Return −2 ln L of the present values but for a constant, with images as laid out for them."""
-        return unlikeliness(self.view, sources, self.structure, self.known, self.prior, self.values)
+        return unlikeliness(self.window.view, sources, self.structure, self.known, self.prior, self.values)
 
     def climb(self, sources: Sources, reach_px: Array) -> None:
         """Go on to the greatest likelihood, with images as laid out, of so large radii."""
         self.deviance, self.log_information = maximise(
-            self.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
+            self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
             self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
         self.converged = math.isfinite(self.deviance)
@@ -309,17 +310,11 @@ def _laid_out(
     """Lay out the sources of fits; beside what `lay_out` returns, how many pixels each would hide at 1 m."""
     own = np.concatenate([fit.own for fit in fits])
     background_e = np.concatenate([fit.background_e for fit in fits])
-    hidden_px = hidden_px_at_1_m(own, camera)
+    hidden_px = camera.hidden_px_at_1_m(own[:, :2])
     hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
     by_size = log_range_by_size(own, fits[0])
     fineness = np.full(len(own), finer)
     return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px, fineness), hidden_px
-
-
-def hidden_px_at_1_m(own: Array, camera: Camera) -> Array | None:
-    """Return of how many pixels' background each source would take away from one metre; None if of none."""
-    hiding = camera.calibration.hidden_background
-    return hiding * covered_px_at_1_m(own[:, :2], camera.calibration) if hiding else None
 
 
 def log_range_by_size(own: Array, fit: Fit) -> Array:

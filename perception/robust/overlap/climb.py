@@ -17,6 +17,7 @@ from perception.model.pixels import (
     MOST_DAMPING,
     inverted,
     is_inside,
+    log_variances,
     objective,
     slopes,
 )
@@ -40,7 +41,7 @@ class Climb(ABC):
     """
 
     def __init__(self, fit: Fit, camera: Camera, values: Array, most_step: Array, prior: Array) -> None:
-        self._fit, self._camera, self._view = fit, camera, fit.view
+        self._fit, self._camera, self._view = fit, camera, fit.window.view
         self._values, self._most_step, self._prior = values, most_step, prior
         self._expected, self._jacobian = self._expectation(values)
         self.objective = self._objective(values, self._expected)
@@ -134,5 +135,5 @@ class Climb(ABC):
     def _objective(self, values: Array, expected: Array, variance: Array | None = None) -> float:
         """Return −2 ln L but for a constant of the window; with given variances without their logarithms."""
         own = self._variance(expected) if variance is None else variance
-        total, logs = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
-        return float(total + logs) if variance is None else float(total)
+        total = objective(self._view, values, expected, own, self._prior, self._fit.known.clip_e)
+        return float(total + log_variances(self._view, own)) if variance is None else float(total)

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.discs.spread import spread_nodes
 from perception.model.flare import image_radius_px
 from perception.model.layout import Sources
-from perception.model.pixels import spread_nodes
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.climb import Climb
@@ -24,7 +24,7 @@ from perception.robust.overlap.hidden import RAMP_PX
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
-from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
+from perception.robust.solve import Fit, Solution, log_range_by_size, solutions_of
 
 Array = NDArray[np.float64]
 
@@ -162,7 +162,7 @@ class _Cut(Climb):
         own = layout.of_sources(values[: layout.size])
         background_e = float(values[layout.background])
         by_size = log_range_by_size(own, fit)
-        hidden_px = hidden_px_at_1_m(own, self._camera)
+        hidden_px = self._camera.hidden_px_at_1_m(own[:, :2])
         hidden_e = None if hidden_px is None else hidden_px * max(background_e, 0.0)
         sigma_px = known.psf_sigma_px
         if layout.has_width:

@@ -34,7 +34,7 @@ from perception.robust.overlap.pairs import (
     pair_of,
 )
 from perception.robust.problem import Problem, Start
-from perception.robust.solve import Fit, Solution, hidden_px_at_1_m, log_range_by_size, solutions_of
+from perception.robust.solve import Fit, Solution, log_range_by_size, solutions_of
 
 Array = NDArray[np.float64]
 
@@ -240,7 +240,7 @@ class _Eclipse(Climb):
         own = layout.of_sources(values)
         by_size = log_range_by_size(own, fit)
         near, far = sorted(self._pair, key=lambda k: float(by_size[k]))
-        hidden_px = hidden_px_at_1_m(own, camera)
+        hidden_px = camera.hidden_px_at_1_m(own[:, :2])
         hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
         fineness = np.where(np.arange(layout.sources) == far, self._finer, 1.0)
         laid, imaged = lay_out(

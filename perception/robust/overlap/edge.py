@@ -16,7 +16,7 @@ from perception.compiled import compiled
 from perception.model.layout import SEEN, Structure
 from perception.model.window import Camera
 from perception.robust.goodness import noise_e2
-from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more, gain
+from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, gain
 from perception.robust.problem import Window
 from perception.robust.solve import Solution, solve
 
@@ -111,6 +111,11 @@ def leaves_something(one: Solution) -> bool:
     return not one.left_over.is_nothing or asks_for_more(one)
 
 
+def surely_leaves_something(one: Solution) -> bool:
+    """Tell whether a fit leaves over what noise does not, rather than only what noise may hide."""
+    return not one.left_over.is_nothing or one.left_over.peak_sigmas > RESIDUAL_SIGMAS
+
+
 def fit_in_turns(
     tried: Mapping[int, list[Edge]],
     solutions: Mapping[int, Solution],
@@ -144,7 +149,7 @@ def likeliest_edge_of(one: Solution) -> Edge | None:
     window, width_px = one.window, _sharp_px(one)
     height_e, offset_px, angle_rad = _likeliest_edge(
         window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu, width_px,
-        0.0 if leaves_something(one) else _SEEMS_GAIN,
+        0.0 if surely_leaves_something(one) else _SEEMS_GAIN,
     )  # fmt: skip
     return None if height_e == 0.0 else Edge(height_e, offset_px, angle_rad, width_px)
 

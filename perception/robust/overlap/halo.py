@@ -17,9 +17,11 @@ from perception.robust.solve import Solution, solve
 
 Array = NDArray[np.float64]
 
-SEEMS_SIGMAS = 1.5
 LEAST_GAIN = 10.0
 """2 Δ ln L that a halo must bring: noise gives χ² of two or three degrees of freedom, 10 hardly ever."""
+
+_SEEMS_SIGMAS, _SEEMS_AT_ALL = 2.4, 1.5
+"""So much of a halo shows where one is tried; of one that brings `LEAST_GAIN` 3.2 σ, less of other widths."""
 
 _HALO_SHARE, _SHAPE_SHARE = 1.0, 0.1
 """What a wall throws back of the light of a source before it, and how far that differs in shape, a priori."""
@@ -74,10 +76,10 @@ def _seems_to_have_one(solution: Solution) -> bool:
         return False
     window, (u_px, v_px, _) = solution.window, solution.starts[0]
     seems = halo_sigmas(
-        window.image_e, window.state, solution.expected_e, window.floor_e2, window.prnu,
-        (u_px - window.box.left, v_px - window.box.top), np.array(widths_px),
+        window.image_e, window.state, solution.expected_e, solution.flares_e, window.floor_e2, window.prnu,
+        (u_px - window.box.left, v_px - window.box.top), np.array(widths_px), _SEEMS_AT_ALL,
     )  # fmt: skip
-    return bool(seems > SEEMS_SIGMAS)
+    return bool(seems > _SEEMS_SIGMAS)
 
 
 def _radius_px(solution: Solution) -> float:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.window import Camera
-from perception.robust.goodness import drawn_out
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
@@ -38,11 +37,7 @@ def knows_layouts(camera: Camera) -> bool:
 
 def longer_chi2(one: Solution) -> float:
     """Return by how much an image is longer than wide than its fit, χ² of two degrees of freedom."""
-    window = one.window
-    chi2, _, _, _ = drawn_out(
-        window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu
-    )
-    return chi2
+    return one.drawn_out[0]
 
 
 def is_near(several: Solution, least_px: float) -> bool:

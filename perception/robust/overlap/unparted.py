@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.model.window import Camera
 from perception.robust.overlap.deblend import gain, halves
@@ -19,8 +20,14 @@ from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import NEIGHBOURS_PER_PX2, Solution, solve
 
-LONGER_CHI2 = 9.0
-"""Of two degrees of freedom, from which two are tried: noise does it once in 90."""
+Array = NDArray[np.float64]
+
+LONGER_CHI2, LONGER_ALONE_CHI2 = 9.0, 13.0
+"""Of two degrees of freedom, from which two are tried: among others, and where no others are around.
+
+Noise does it once in 90, and in 700. Alone, two cost 24 to 30 more a priori than such a χ² says that they
+bring, and count only if that leaves them a hundredth, 9.2.
+"""
 
 _AROUND_PX = 50.0
 _STEP_PX = 0.25
@@ -43,10 +50,13 @@ def doubted(
     """
     tried: list[int] = []
     problems = []
+    places_px = np.array([(one.u_px[0], one.v_px[0]) for one in chosen if one is not None])
     for index, (one, lone) in enumerate(zip(chosen, at_rest, strict=True)):
         if one is None or lone is None or one.count != 1 or lone.count != 1 or one.is_eclipse:
             continue
-        if not lone.left_over.is_good or longer_chi2(lone) > LONGER_CHI2:
+        longer = longer_chi2(lone)
+        is_long = longer > LONGER_CHI2 and longer > LONGER_ALONE_CHI2 - _likelier_around(one, places_px)
+        if is_long or not lone.left_over.is_good:
             for starts in (halves(lone, 0), halves(lone, 0, _NEAR_WIDTHS) or _beside(lone)):
                 if starts is not None:
                     tried.append(index)
@@ -57,15 +67,11 @@ def doubted(
     for index, two in zip(tried, solve(problems, camera), strict=True):
         if two is not None and two.left_over.is_good and two.ranged.all():
             pairs[index] = min(pairs.get(index, two), two, key=lambda pair: pair.cost)
-    places_px = np.array([(one.u_px[0], one.v_px[0]) for one in chosen if one is not None])
     wider = {}
     for index, two in pairs.items():
         one = chosen[index]
         assert one is not None
-        apart_px = np.hypot(*(places_px - [one.u_px[0], one.v_px[0]]).T)
-        density_per_px2 = (apart_px < _AROUND_PX).sum() / (math.pi * _AROUND_PX**2)
-        likelier = 2.0 * math.log(max(density_per_px2 / NEIGHBOURS_PER_PX2, 1.0))
-        two = replace(two, deviance=one.deviance - gain(one, two) - likelier)
+        two = replace(two, deviance=one.deviance - gain(one, two) - _likelier_around(one, places_px))
         both = weighed(replace(one, is_doubtful=False), two)
         if not both.is_doubtful:
             continue
@@ -77,6 +83,13 @@ def doubted(
             log_range_of_two=math.sqrt(float(both.log_range_sigma[0] ** 2 - one.log_range_sigma[0] ** 2)),
         )
     return wider
+
+
+def _likelier_around(one: Solution, places_px: Array) -> float:
+    """Return how much likelier a neighbour is where others are around, as 2 Δ ln L."""
+    apart_px = np.hypot(*(places_px - [one.u_px[0], one.v_px[0]]).T)
+    density_per_px2 = np.count_nonzero(apart_px < _AROUND_PX) / (math.pi * _AROUND_PX**2)
+    return 2.0 * math.log(max(density_per_px2 / NEIGHBOURS_PER_PX2, 1.0))
 
 
 def _beside(lone: Solution) -> tuple[Start, Start]:

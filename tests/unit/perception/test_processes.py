@@ -35,7 +35,7 @@ def test_processes_find_what_one_finds_and_leave_nothing() -> None:
     sets = [_frames(number) for number in range(3)]
     with DetectorProcesses(CAMERAS, count=2) as detectors:
         found = [detectors.detect_frames(frames) for frames in sets]
-        memory = [worker._memory.name for worker in detectors._workers if worker._memory]
+        memory = list(detectors._memory._all)
         assert detectors.detect_frames([]) == []
         pipeline, alone = Pipeline(CAMERAS, detector=detectors.detect_frames), Pipeline(CAMERAS)
         for frames in sets:
@@ -44,7 +44,7 @@ def test_processes_find_what_one_finds_and_leave_nothing() -> None:
     for frames, several in zip(sets, found, strict=True):
         assert [len(one) for one in several] == [0, 2, 3]
         assert _told(several) == _told(perception.detect_frames(frames, CAMERAS))
-    assert len(memory) == 2
+    assert len(memory) == 3  # of a set of three frames all are in memory at once
     for name in memory:
         with pytest.raises(FileNotFoundError):
             SharedMemory(name)
@@ -82,7 +82,7 @@ def test_an_answer_that_nobody_waited_for_is_no_other_frames(monkeypatch: pytest
     """Ctrl-C while frames are away: all is ended, so that no later call takes their flares for its own."""
     with DetectorProcesses(CAMERAS, "paper", count=2) as detectors:
 
-        def interrupted(_: object) -> None:
+        def interrupted(_: object, timeout: float | None) -> None:
             raise KeyboardInterrupt
 
         monkeypatch.setattr(processes, "connection", SimpleNamespace(wait=interrupted))
@@ -102,3 +102,21 @@ def test_a_process_that_is_killed_ends_all_and_says_so() -> None:
             detectors.detect_frames(_frames(0))
         with pytest.raises(RuntimeError, match="were ended"):
             detectors.detect_frames(_frames(0))
+
+
+def test_larger_frames_take_the_place_of_smaller_ones() -> None:
+    """Memory that is too small is given back, and many frames need no more of it than few."""
+    with DetectorProcesses(CAMERAS, "paper", count=1) as detectors:
+        small = [replace(frame, data_dn=frame.data_dn[:5]) for frame in _frames(0)]
+        with pytest.raises(ValueError):
+            detectors.detect_frames(small)
+        before = list(detectors._memory._all)
+        assert before
+        found = detectors.detect_frames(_frames(1) * 4)
+        assert _told(found[:3]) == _told(found[9:])
+        pieces = detectors._memory._all.values()
+        assert len(pieces) <= 3
+        assert all(memory.size >= _frames(1)[0].data_dn.nbytes for memory in pieces)
+        for name in before:
+            with pytest.raises(FileNotFoundError):
+                SharedMemory(name)

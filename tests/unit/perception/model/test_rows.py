@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from perception.model.bearing import direction_camera
 from perception.model.discs.nodes import DiscNodes, disc_nodes
 from perception.model.discs.rows import disc_rows
+from perception.model.discs.spread import spread_nodes
 from perception.model.layout import Sources
 from perception.model.normal import strip_shares
-from perception.model.pixels import spread_nodes
 from perception.model.ranging import angular_radius_rad
 from perception.types import Calibration
 from tests.unit.perception.simulation import calibration
