@@ -57,6 +57,7 @@ def test_lone_ones_are_not_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(unparted, "weighed", counted)
     monkeypatch.setattr(unparted, "LONGER_CHI2", 3.0)  # noise does it once in 4.5
+    monkeypatch.setattr(unparted, "LONGER_ALONE_CHI2", 3.0)
     pulls = []
     for number in range(120):
         rng = random(163, number)
