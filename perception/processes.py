@@ -26,7 +26,6 @@ from perception.types import Calibration, Detections, RawFrame
 from perception.warm_up import warm_up_frames
 
 _ENDS_WITHIN_S = 2.0
-_MOST_HELD = 64  # pieces of memory that a process keeps open
 
 
 class DetectorProcesses:
@@ -37,6 +36,7 @@ class DetectorProcesses:
 
     They load the package anew: where a script makes it, that must stand below ``if __name__ == "__main__":``.
     It is made once they are ready: a second or two, minutes where the package's loops were never compiled.
+    Shared memory (`/dev/shm`) must have room for two frames for each process.
 
     Parameters
     ----------
@@ -196,11 +196,12 @@ class _Worker:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where the pixels of a frame lie."""
+    """Where the pixels of a frame lie, and in which pieces of memory others may."""
 
     memory: str
     shape: tuple[int, ...]
     dtype: str
+    pieces: frozenset[str]
 
 
 _Handed = tuple[RawFrame, _Place | None]
@@ -229,7 +230,7 @@ class _Memory:
             self._free.remove(name)
         np.copyto(np.ndarray(pixels.shape, pixels.dtype, self._all[name].buf), pixels)
         without = replace(frame, data_dn=np.empty((0, 0), dtype=np.uint16))
-        return without, _Place(name, pixels.shape, pixels.dtype.str)
+        return without, _Place(name, pixels.shape, pixels.dtype.str, frozenset(self._all))
 
     def give_back(self, handed: _Handed) -> None:
         """Take a frame's memory for another."""
@@ -266,18 +267,25 @@ def _serve(
         held: dict[str, SharedMemory] = {}
         while (handed := pipe.recv()) is not None:
             answer: Detections | Exception
+            frame: RawFrame | None = None
             try:
-                frame, place = handed
-                if place is not None:
-                    if place.memory not in held:
-                        if len(held) >= _MOST_HELD:
-                            held.clear()
-                        held[place.memory] = SharedMemory(place.memory)
-                    pixels = np.ndarray(place.shape, place.dtype, held[place.memory].buf)
-                    frame = replace(frame, data_dn=pixels)
+                frame = _taken(handed, held)
                 answer = detect(frame, calibrations[frame.camera], estimator, limit_s=limit_s)
             except ValueError as error:
                 answer = error
             except Exception as error:  # whatever it is, it is told where it is waited for
                 answer = RuntimeError(f"{type(error).__name__}: {error}")
+            frame = None  # nothing refers to its memory any more
             pipe.send(answer)
+
+
+def _taken(handed: _Handed, held: dict[str, SharedMemory]) -> RawFrame:
+    """Return a frame as it lies in memory; what is there no more is held no longer."""
+    frame, place = handed
+    if place is None:
+        return frame
+    for gone in held.keys() - place.pieces:
+        held.pop(gone).close()
+    if place.memory not in held:
+        held[place.memory] = SharedMemory(place.memory)
+    return replace(frame, data_dn=np.ndarray(place.shape, place.dtype, held[place.memory].buf))

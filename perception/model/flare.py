@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.discs.nodes import disc_nodes
-from perception.model.discs.spread import spread_nodes
 from perception.model.layout import Sources
 from perception.model.lens import stretch
+from perception.model.spread import spread_nodes
 from perception.types import Calibration
 
 Array = NDArray[np.float64]

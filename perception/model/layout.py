@@ -121,7 +121,7 @@ class Known(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """The sources of a window, laid out as quadrature nodes.
+    """The sources of a window, laid out as nodes: strips, or points.
 
     Attributes
     ----------

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.discs.spread import spread_nodes
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
 from perception.model.normal import log_upper_tail, of_clipped
+from perception.model.spread import spread_nodes
 
 Array = NDArray[np.float64]
 

@@ -154,7 +154,7 @@ def lay_out(
     finer: Array | None = None,
     in_points: bool = False,
 ) -> tuple[Sources, NDArray[np.bool_]]:
-    """Lay sources out as quadrature nodes, all of them at once.
+    """Lay sources out as nodes, strips or points, all of them at once.
 
     Parameters
     ----------

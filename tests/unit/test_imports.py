@@ -54,7 +54,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.robust": ("overlap", "search"),
     "perception.files": (),
     "perception.causes": (),
-    "perception.model": (),
+    "perception.model": ("discs",),
     "perception.odometry": (),
     "perception.own_code": (),
     "perception.compiled": (),

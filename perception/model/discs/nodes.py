@@ -1,4 +1,4 @@
-"""The image of a source in points: quadrature over a uniform sphere, seen through a lens.
+"""Nodes of sources' images, and the image of a source in points: quadrature over a sphere, through a lens.
 
 A sphere of radius r at distance d fills the cap of directions within asin(r / d) of its centre, at uniform
 radiance. Each direction ω of the cap gives light in proportion to cos θ · response(θ) · dΩ, θ the field

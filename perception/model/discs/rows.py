@@ -3,8 +3,9 @@
 What a point spread and pixels make of a straight strip is known in closed form (`normal.strip_shares`), so
 that only across the strips there is something to integrate: as many of them as points lie along a diameter,
 where points (`nodes`) fill a disc. Where strips end follows from the outline, the cap's rim seen through the
-lens, as a Fourier series of the angle around it; light along a strip is taken for a parabola. The few images
-of which this cannot be said, at a lens's fold or beside the horizon, are of points.
+lens, as a Fourier series of the angle around it; light along a strip is taken for a parabola. The images of
+which this cannot be said, beside a lens's fold or the horizon, or where a table of the response bends, are of
+points.
 """
 
 import math
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.bearing import pixel_turn
+from perception.model.bearing import angle_from_axis_rad, pixel_turn
 from perception.model.discs.nodes import DiscNodes, along_lines, disc_nodes, fineness_of
 from perception.model.lens import distortion_of, project
 from perception.types import Calibration
@@ -23,14 +24,16 @@ Array = NDArray[np.float64]
 # Rows per ratio of image radius to smoothing: the smallest numbers, found by comparison with three times as
 # many, that keep the error below 1e-4 of the peak for radii from 0 to 130 px.
 _ROWS_BASE, _ROWS_SLOPE = 1.4, 2.7
-_SMOOTH_RAD = 0.05  # half of a strip on the axis along which light is as in a parabola
+_SMOOTH_RAD, _MOST_PARTS = 0.05, 8  # half of a strip on the axis along which light is as in a parabola
 _HARMONICS = 7
 _AROUND = 2 * _HARMONICS + 2  # points of an outline
 _LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
 _TIMES_MOVED = 2
-_SHORT = (
-    0.5  # strips of half so many widths of the point spread are even: where their light's middle is says all
-)
+_PLACES = 5  # of a strip where light is looked at: its ends, its middle, and two between to try the parabola
+_MOST_OFF, _MOST_RATIO = 2e-4, 4.0  # of the greatest light; of that to the least
+_MOST_BENT = 1e-3  # of the response: how far a table's bend may change it over the radius
+# Strips of half so many widths of the point spread are even: where their light's middle is says all.
+_SHORT = 0.5
 _STEPS, _SETTLED = 40, 1e-8  # Newton's, in rad
 
 
@@ -55,28 +58,24 @@ def disc_rows(
     rows = np.where(is_disc, np.ceil(_ROWS_BASE + _ROWS_SLOPE * fineness), 1.0).astype(np.int64)
     # cos⁴ θ, as light falls off, bends so much more away from the axis.
     bend = np.sqrt(3.0 / direction[:, 2] ** 2 - 2.0)
-    parts = np.maximum(np.ceil(angular_radius_rad * bend / _SMOOTH_RAD), 1.0).astype(np.int64)
+    parts = np.clip(np.ceil(angular_radius_rad * bend / _SMOOTH_RAD), 1.0, _MOST_PARTS).astype(np.int64)
     first = np.cumsum([0, *(rows * parts).tolist()])
     strip_v_px, share, omega, is_known = _strips(
         first, rows, parts, outlines_px, direction, across, down, angular_radius_rad
     )
     of = np.repeat(np.arange(len(u_px)), np.diff(first))
-    at_px = project(omega.reshape(-1, 3), calibration).reshape(-1, 3, 2)
-    if calibration.lens_model != "rectilinear":
-        # Through other lenses what lies straight between both ends is not quite on the row.
-        turn = pixel_turn(np.stack([u_px, v_px], axis=1), calibration)[of, 1]
-        for _ in range(_TIMES_MOVED):
-            off_px = at_px[:, :, 1] - (strip_v_px + v_px[of])[:, None]
-            omega -= off_px[:, :, None] * turn[:, None, :]
-            at_px = project(omega.reshape(-1, 3), calibration).reshape(-1, 3, 2)
-    strips = _shaded(
-        first,
-        at_px[:, :, 0] - u_px[of][:, None],
-        strip_v_px,
-        share,
-        _light(omega, calibration),
-        _SHORT * calibration.psf_sigma_px,
-    )
+    with np.errstate(invalid="ignore", divide="ignore"):  # beyond a fold nothing is known
+        at_px = project(omega.reshape(-1, 3), calibration).reshape(-1, _PLACES, 2)
+        if calibration.lens_model != "rectilinear":
+            # Through other lenses what lies straight between both ends is not quite on the row.
+            turn = pixel_turn(np.stack([u_px, v_px], axis=1), calibration)[of, 1]
+            for _ in range(_TIMES_MOVED):
+                off_px = at_px[:, :, 1] - (strip_v_px + v_px[of])[:, None]
+                omega -= off_px[:, :, None] * turn[:, None, :]
+                at_px = project(omega.reshape(-1, 3), calibration).reshape(-1, _PLACES, 2)
+        light, psf_px = _light(omega, calibration), calibration.psf_sigma_px
+        strips, is_so = _shaded(first, at_px[:, :, 0] - u_px[of][:, None], strip_v_px, share, light, psf_px)
+    is_known &= is_so & ~_is_bent(direction, angular_radius_rad, calibration)
     if not is_known.all():
         strips = _with_points(strips, is_known, u_px, v_px, direction, angular_radius_rad, calibration, finer)
     return strips if moved_px is None else along_lines(strips, moved_px / smooth_px)
@@ -84,9 +83,26 @@ def disc_rows(
 
 def _light(omega: Array, calibration: Calibration) -> Array:
     """Return the light that falls on an area of the image from directions, shape (..., 3)."""
-    angle_rad = np.arctan2(np.hypot(omega[..., 0], omega[..., 1]), omega[..., 2])
+    angle_rad = angle_from_axis_rad(omega)
     response = np.interp(angle_rad, calibration.response_angle_rad, calibration.response_relative)
     return np.asarray(distortion_of(calibration).solid_angle_sr(omega) * np.cos(angle_rad) * response)
+
+
+def _is_bent(direction: Array, angular_radius_rad: Array, calibration: Calibration) -> NDArray[np.bool_]:
+    """Tell over which caps the table of the response, linear between its angles, bends by too much."""
+    knots_rad = np.asarray(calibration.response_angle_rad, dtype=np.float64)
+    relative = np.asarray(calibration.response_relative, dtype=np.float64)
+    if np.ptp(relative) == 0.0:
+        return np.zeros(len(direction), dtype=np.bool_)
+    slopes = np.concatenate([[0.0], np.diff(relative) / np.diff(knots_rad), [0.0]])  # held beyond its ends
+    bends = np.abs(np.diff(slopes))
+    if knots_rad[0] <= 0.0:
+        bends[0] *= 2.0  # on the axis it falls to all sides
+    angle_rad = angle_from_axis_rad(direction)
+    within = np.abs(knots_rad - angle_rad[:, None]) < angular_radius_rad[:, None]
+    most = np.max(np.where(within, bends, 0.0), axis=1)
+    least = _MOST_BENT * np.interp(angle_rad, knots_rad, relative)
+    return np.asarray(most * angular_radius_rad > least)
 
 
 @compiled
@@ -182,10 +198,10 @@ def _strips(
 
     Returns
     -------
-    Of each strip its v and its row's share of the height, shape (strips,); directions of its beginning,
-    middle and end, shape (strips, 3, 3); and of which sources all that is known, shape (sources,).
+    Of each strip its v and its row's share of the height, shape (strips,); directions of `_PLACES` along it,
+    ends included, shape (strips, places, 3); and of which sources all that is known, shape (sources,).
     """
-    v_px, share, omega = np.zeros(first[-1]), np.ones(first[-1]), np.empty((first[-1], 3, 3))
+    v_px, share, omega = np.zeros(first[-1]), np.ones(first[-1]), np.empty((first[-1], _PLACES, 3))
     is_known, ends = np.ones(len(rows), dtype=np.bool_), np.empty((2, 3))
     for cap in range(len(rows)):
         omega[first[cap] : first[cap + 1]] = direction[cap]
@@ -218,8 +234,8 @@ def _strips(
             for part in range(parts[cap]):
                 strip = first[cap] + row * parts[cap] + part
                 v_px[strip], share[strip] = at_v, math.sin(angle)
-                for place in range(3):
-                    along = (part + 0.5 * place) / parts[cap]
+                for place in range(_PLACES):
+                    along = (part + place / (_PLACES - 1)) / parts[cap]
                     here = omega[strip, place]
                     here[:] = (1.0 - along) * ends[0] + along * ends[1]
                     here /= math.sqrt((here**2).sum())
@@ -227,23 +243,31 @@ def _strips(
 
 
 def _shaded(
-    first: NDArray[np.int64], places_px: Array, v_px: Array, share: Array, light: Array, short_px: float
-) -> DiscNodes:
-    """Return strips in rows of such v and shares of the height.
+    first: NDArray[np.int64], places_px: Array, v_px: Array, share: Array, light: Array, psf_px: float
+) -> tuple[DiscNodes, NDArray[np.bool_]]:
+    """Return strips in rows of such v and shares of the height, and of which sources light is so.
 
-    Of their beginnings, middles and ends are given the places along u and the light, shape (strips, 3);
-    middles are only near to the middle. Between them light is as in a parabola.
+    Of places along them, ends and nearly the middle among these, are given u and the light, shape
+    (strips, `_PLACES`). Light is as in the parabola through ends and middle, if the others agree.
     """
-    middle_px, half_px = 0.5 * (places_px[:, 0] + places_px[:, 2]), 0.5 * (places_px[:, 2] - places_px[:, 0])
+    (left, _, centre, _, right), (one, _, two, _, three) = places_px.T, light.T
+    middle_px, half_px = 0.5 * (left + right), 0.5 * (right - left)
     length_px = np.where(half_px > 0.0, half_px, 1.0)
-    off = (places_px[:, 1] - middle_px) / length_px
-    ends, rise = 0.5 * (light[:, 0] + light[:, 2]), 0.5 * (light[:, 2] - light[:, 0])
-    bend = (ends - light[:, 1] + rise * off) / (1.0 - off**2)
+    off = (centre - middle_px) / length_px
+    ends, rise = 0.5 * (one + three), 0.5 * (three - one)
+    bend = (ends - two + rise * off) / (1.0 - off**2)
     mean = ends - bend / 1.5
+    along = (places_px - middle_px[:, None]) / length_px[:, None]
+    differs = np.abs(light - (ends - bend)[:, None] - (rise + bend * along.T).T * along).max(axis=1)
+    most = np.maximum.reduceat(light.max(axis=1), first[:-1])
+    least = np.minimum.reduceat(light.min(axis=1), first[:-1])
+    # Where a strip is shorter than the point spread is wide, how its light lies along it hardly matters.
+    most_off = np.maximum.reduceat(differs * np.minimum(0.5 * half_px / psf_px, 1.0), first[:-1])
+    is_so = (most_off <= _MOST_OFF * most) & (most <= _MOST_RATIO * least) & (least > 0.0)
     weight = share * length_px * mean
     total = np.repeat(np.add.reduceat(weight, first[:-1]), np.diff(first))
-    tilt, is_short = rise / mean, half_px < short_px
-    return DiscNodes(
+    tilt, is_short = rise / mean, half_px < _SHORT * psf_px
+    strips = DiscNodes(
         first,
         np.where(is_short, middle_px + tilt * half_px / 3.0, middle_px),
         v_px,
@@ -253,6 +277,7 @@ def _shaded(
         np.zeros(len(weight)),
         weight / total,
     )
+    return strips, np.asarray(is_so)
 
 
 def _with_points(

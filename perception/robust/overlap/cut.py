@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.discs.spread import spread_nodes
 from perception.model.flare import image_radius_px
 from perception.model.layout import Sources
+from perception.model.spread import spread_nodes
 from perception.model.window import Camera, is_usual_motion, lay_out
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.climb import Climb

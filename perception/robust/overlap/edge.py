@@ -112,7 +112,7 @@ def leaves_something(one: Solution) -> bool:
 
 
 def surely_leaves_something(one: Solution) -> bool:
-    """Tell whether a fit leaves over what noise does not, rather than only what noise may hide."""
+    """Tell whether a fit leaves over what noise hardly does: too large a χ², or a peak as of a flare."""
     return not one.left_over.is_nothing or one.left_over.peak_sigmas > RESIDUAL_SIGMAS
 
 
@@ -256,8 +256,7 @@ def _likeliest_edge(
     """Return height, place and angle of the edge that brings most, beside flares that may all be off.
 
     What an error of the flares' light, place and width, and of the even background, looks like is taken away
-    from the residual and from each edge. The height is 0 where none
-    brings as much as `least_gain`, in 2 Δ ln L.
+    from the residual and from each edge. The height is 0 where none brings `least_gain`, in 2 Δ ln L.
     """
     rows, columns = image_e.shape
     middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (rows - 1)

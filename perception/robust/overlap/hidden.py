@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.discs.spread import spread_nodes
 from perception.model.layout import Known, Sources, Structure, View
 from perception.model.normal import shares
+from perception.model.spread import spread_nodes
 
 Array = NDArray[np.float64]
 

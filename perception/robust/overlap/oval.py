@@ -8,8 +8,8 @@ one disc of any axes and brightness does.
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.discs.spread import spread_nodes
 from perception.model.layout import SEEN
+from perception.model.spread import spread_nodes
 from perception.model.window import Camera, lay_out
 from perception.robust.goodness import MODEL_ERROR, residual_e
 from perception.robust.solve import Solution

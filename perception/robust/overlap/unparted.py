@@ -22,11 +22,11 @@ from perception.robust.solve import NEIGHBOURS_PER_PX2, Solution, solve
 
 Array = NDArray[np.float64]
 
-LONGER_CHI2, LONGER_ALONE_CHI2 = 9.0, 13.0
-"""Of two degrees of freedom, from which two are tried: among others, and where no others are around.
+LONGER_CHI2, LEAST_CHI2 = 9.0, 17.0
+"""Of two degrees of freedom, from which two are tried; the second with what others around make two likelier.
 
-Noise does it once in 90, and in 700. Alone, two cost 24 to 30 more a priori than such a χ² says that they
-bring, and count only if that leaves them a hundredth, 9.2.
+Noise passes 9 once in 90; alone 12.9 must be passed, once in 600. Two bring about such a χ², cost 28 to 34 a
+priori, and count only if that leaves them a hundredth, 9.2.
 """
 
 _AROUND_PX = 50.0
@@ -55,7 +55,7 @@ def doubted(
         if one is None or lone is None or one.count != 1 or lone.count != 1 or one.is_eclipse:
             continue
         longer = longer_chi2(lone)
-        is_long = longer > LONGER_CHI2 and longer > LONGER_ALONE_CHI2 - _likelier_around(one, places_px)
+        is_long = longer > LONGER_CHI2 and longer + _likelier_around(one, places_px) > LEAST_CHI2
         if is_long or not lone.left_over.is_good:
             for starts in (halves(lone, 0), halves(lone, 0, _NEAR_WIDTHS) or _beside(lone)):
                 if starts is not None:
@@ -86,7 +86,7 @@ def doubted(
 
 
 def _likelier_around(one: Solution, places_px: Array) -> float:
-    """Return how much likelier a neighbour is where others are around, as 2 Δ ln L."""
+    """Return how much likelier a neighbour is where others are around, itself counted, as 2 Δ ln L."""
     apart_px = np.hypot(*(places_px - [one.u_px[0], one.v_px[0]]).T)
     density_per_px2 = np.count_nonzero(apart_px < _AROUND_PX) / (math.pi * _AROUND_PX**2)
     return 2.0 * math.log(max(density_per_px2 / NEIGHBOURS_PER_PX2, 1.0))

@@ -146,7 +146,7 @@ def exceeding(
         lowest_e = np.minimum(np.minimum(lowest_e, _shifted(limit_e, by)), _shifted(limit_e, -by))
     lowest_e = np.minimum(lowest_e, _shifted(lowest_e, 1))  # a row lies between two of the mesh's
     bright, count_of = np.empty((taps, columns), dtype=np.int64), np.zeros(taps, dtype=np.int64)
-    latest, kept_at = np.full(columns, -1), np.empty(taps, dtype=np.int64)
+    latest = np.full(columns, -1)
     samples = np.empty((sample_of.max() + 1, len(sampled)), dtype=np.float32)
     places, values, count = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.float32), 0
     for ahead in range(rows + half):
@@ -164,8 +164,6 @@ def exceeding(
             continue
         one, other, share = between(row, rows, len(limit_e))
         rest, part, before = np.float32(1.0 - share), np.float32(share), count
-        for step in range(taps):
-            kept_at[step] = (row + step - half) % taps
         for line in range(taps):
             for column in bright[line, : count_of[line]]:
                 if latest[column] == row:
@@ -173,7 +171,7 @@ def exceeding(
                 latest[column] = row
                 total = np.float32(0.0)
                 for step in range(taps):
-                    total += kernel[step] * across[kept_at[step], column]
+                    total += kernel[step] * across[(row + step - half) % taps, column]
                 if total > rest * limit_e[one, column] + part * limit_e[other, column]:
                     if count == len(places):
                         places = np.append(places, np.empty(count, dtype=np.int64))

@@ -120,3 +120,22 @@ def test_larger_frames_take_the_place_of_smaller_ones() -> None:
         for name in before:
             with pytest.raises(FileNotFoundError):
                 SharedMemory(name)
+
+
+def test_a_process_forgets_memory_that_is_gone() -> None:
+    frame, held = _frames(1)[1], dict[str, SharedMemory]()
+    memory = processes._Memory()
+    try:
+        small = replace(frame, data_dn=frame.data_dn[:9].copy())
+        for each in (small, small, frame):
+            handed = memory.place(each)
+            taken = processes._taken(handed, held)
+            assert np.array_equal(taken.data_dn, each.data_dn)
+            del taken
+            memory.give_back(handed)
+        assert held.keys() == memory._all.keys()
+        assert len(held) == 1
+    finally:
+        for one in held.values():
+            one.close()
+        memory.close()

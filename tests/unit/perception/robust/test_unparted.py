@@ -6,12 +6,16 @@ of its σ, and most of them undoubted.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from perception import Detection, detect
+from perception.model.window import Camera
 from perception.robust.overlap import rivals, unparted
+from perception.robust.problem import Problem
+from perception.robust.solve import Solution, solve
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 CAMERA = calibration(width_px=64, height_px=64, cx_px=31.5, cy_px=31.5, bit_depth=16, saturation_dn=65535)
@@ -45,6 +49,29 @@ def test_two_in_one_flare_cover_both(apart_px: float, ratio: float, most: int) -
     assert wrong <= most
 
 
+@pytest.mark.parametrize(
+    ("around", "chi2", "is_tried"), [(0, 12.5, False), (0, 13.3, True), (4, 9.5, False), (4, 10.2, True)]
+)
+def test_two_are_tried_where_they_could_count(
+    around: int, chi2: float, is_tried: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Alone from 17 less 4.1 on (ln of one in 50 px, twice), with four others within 50 px from 17 less 7.3."""
+    tried, whole = list[int](), solve
+
+    def counted(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
+        tried.append(len(problems))
+        return whole(problems, camera)
+
+    monkeypatch.setattr(unparted, "solve", counted)
+    monkeypatch.setattr(unparted, "longer_chi2", lambda _: chi2)
+    places = [(31.5, 31.5, 4.0)] + [
+        (31.5 + 20.0 * du, 31.5 + 20.0 * dv, 4.0) for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    mean_e = expected_e(CAMERA, places[: 1 + around], EXPOSURE_S, BACKGROUND_E)
+    assert len(detect(expose(mean_e, CAMERA, random(165, around), EXPOSURE_S), CAMERA)) == 1 + around
+    assert bool(sum(tried)) == is_tried
+
+
 def test_lone_ones_are_not_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 120 from 1.5 to 9 m none is; some are tried, as noise makes them longer than wide."""
     tried = 0
@@ -57,7 +84,7 @@ def test_lone_ones_are_not_doubted(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(unparted, "weighed", counted)
     monkeypatch.setattr(unparted, "LONGER_CHI2", 3.0)  # noise does it once in 4.5
-    monkeypatch.setattr(unparted, "LONGER_ALONE_CHI2", 3.0)
+    monkeypatch.setattr(unparted, "LEAST_CHI2", 3.0)
     pulls = []
     for number in range(120):
         rng = random(163, number)
