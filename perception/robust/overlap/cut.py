@@ -39,7 +39,7 @@ _MOST_TURN_RAD, _MOST_SHIFT_PX = 0.3, 1.0
 _LOOSE = 1e-6  # precision of the line's prior
 _LEAST_HIDDEN, _LEAST_SEEN = 0.01, 0.15  # of the disc's area
 _MOST_TRIED = 8  # of a frame's flares, those longest for their width
-_LONGER_CHI2 = 12.0  # of two degrees of freedom: noise does it once in 400
+_LONGER_CHI2 = 14.0  # of two degrees of freedom: noise does it once in 1 100
 _RARE = 9.2  # -2 ln of how often an edge hides a part of a flare: once in a hundred
 _NEARER = 0.2  # in ln range: first guess of how much nearer what is hidden in part is than it seems
 
