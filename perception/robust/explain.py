@@ -12,7 +12,7 @@ from perception.robust.before_edges import brightest_alone, likelier_before_edge
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.motion import moving
-from perception.robust.overlap.cut import behind_edges, cut_discs
+from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import (
     LEAST_GAIN,
     RESIDUAL_SIGMAS,
@@ -124,8 +124,6 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, pair in rivals.items():
         chosen[index] = _beside_rival(chosen[index], pair)
     if prepared.frame.line_time_s == 0.0:
-        for index, one_or_part in behind_edges(found, chosen, plain, camera).items():
-            chosen[index] = one_or_part
         for index, one_or_two in doubted(chosen, plain, camera).items():
             chosen[index] = one_or_two
     for index in cut_short:

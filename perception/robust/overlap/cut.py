@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from perception.model.flare import image_radius_px
 from perception.model.layout import Sources
 from perception.model.spread import spread_nodes
-from perception.model.window import Camera, is_usual_motion, lay_out
+from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
 from perception.robust.overlap.eclipse import finer, is_as_bright, lit_pixels
 from perception.robust.overlap.hidden import RAMP_PX
-from perception.robust.overlap.pairs import LEAST_RADIUS_PX, longer_chi2
-from perception.robust.overlap.rivals import NO_RIVAL, weighed
+from perception.robust.overlap.pairs import LEAST_RADIUS_PX
+from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
 from perception.robust.solve import Fit, Solution, log_range_by_size, solutions_of
 
@@ -38,10 +38,6 @@ _BESIDE_PX = 1.0
 _MOST_TURN_RAD, _MOST_SHIFT_PX = 0.3, 1.0
 _LOOSE = 1e-6  # precision of the line's prior
 _LEAST_HIDDEN, _LEAST_SEEN = 0.01, 0.15  # of the disc's area
-_MOST_TRIED = 8  # of a frame's flares, those longest for their width
-_LONGER_CHI2 = 14.0  # of two degrees of freedom: noise does it once in 1 100
-_RARE = 9.2  # -2 ln of how often an edge hides a part of a flare: once in a hundred
-_NEARER = 0.2  # in ln range: first guess of how much nearer what is hidden in part is than it seems
 
 
 def cut_discs(
@@ -85,63 +81,6 @@ def cut_discs(
         if good:
             cuts[index] = min(good, key=lambda cut: cut.cost)
     return cuts
-
-
-def behind_edges(
-    found: Sequence[Cluster],
-    chosen: Sequence[Solution | None],
-    at_rest: Sequence[Solution | None],
-    camera: Camera,
-) -> dict[int, Solution]:
-    """Weigh lone small flares with spheres that an edge hides in part, and return by index the likelier.
-
-    A part of a small disc looks like a whole one that is farther, but for being longer than wide: so those
-    that are are tried, unless a robot's usual motion makes them so, or what moves is on texture and no robot.
-
-    Parameters
-    ----------
-    found
-        The clusters.
-    chosen, at_rest
-        What explains each so far, and what a single flare at rest does; None where there is none.
-    camera
-        The camera.
-    """
-    longer = {
-        index: longer_chi2(lone)
-        for index, (cluster, one, lone) in enumerate(zip(found, chosen, at_rest, strict=True))
-        if lone is not None and lone.count == 1 and not cluster.is_in_crowd
-        if one is not None and one.count <= 2 and not one.is_eclipse and not _moves_as_usual(one, camera)
-    }
-    likelier = {}
-    for index in sorted(longer, key=longer.__getitem__)[-_MOST_TRIED:]:
-        one, lone = chosen[index], at_rest[index]
-        if longer[index] > _LONGER_CHI2 and one is not None and lone is not None:
-            parts = _parts_behind(found[index], lone, one.cost + NO_RIVAL, camera)
-            if parts:
-                likelier[index] = weighed(*sorted([one, *parts], key=lambda each: each.cost))
-    return likelier
-
-
-def _moves_as_usual(one: Solution, camera: Camera) -> bool:
-    """Tell whether a robot's usual motion explains why flares are longer than wide; on texture, any."""
-    if one.motion_px is None:
-        return False
-    if one.window.on_edges or one.window.structure_e > 0.0:
-        return True
-    return bool(is_usual_motion(np.hypot(*one.motion_px.T), one.log_range, camera).all())
-
-
-def _parts_behind(cluster: Cluster, lone: Solution, to_beat: float, camera: Camera) -> list[Solution]:
-    """Fit spheres of which an edge along the length of an image hides a part, on either side of it."""
-    (u_px, v_px, log_range), (_, along_u, along_v, _) = lone.starts[0], lone.drawn_out
-    across = math.atan2(along_v, along_u) + 0.5 * math.pi
-    parts = []
-    for turn in (across, across + math.pi):
-        fit = _Cut(cluster, (u_px, v_px, log_range - _NEARER, turn, 0.0), camera)
-        if (part := fit.solution(to_beat - _RARE)) is not None:
-            parts.append(replace(part, log_information=part.log_information + _RARE))
-    return parts
 
 
 def _where_light_lacks(one: Solution) -> Guess:
