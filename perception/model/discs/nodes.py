@@ -18,6 +18,7 @@ from perception.model.lens import project, stretch
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
 
 # Quadrature nodes per ratio of image radius to smoothing: the smallest numbers, found by comparison with
 # three times as many, that keep the error below 1e-4 of the peak for radii from 0 to 130 px.
@@ -159,6 +160,14 @@ def _line_rule(nodes: int) -> tuple[Array, Array]:
 
 
 @compiled
+def across_and_down(x: float, y: float, z: float) -> tuple[Vector, Vector]:
+    """Return two unit vectors that complete a direction, which is not along x, to an orthonormal frame."""
+    norm = math.hypot(y, z)
+    down_y, down_z = z / norm, -y / norm
+    return (down_y * z - down_z * y, down_z * x, -down_y * x), (0.0, down_y, down_z)
+
+
+@compiled
 def _over_caps(
     first: NDArray[np.int64], rules: Array, direction: Array, angular_radius_rad: Array,
     response_angle_rad: Array, response_relative: Array,
@@ -167,10 +176,7 @@ def _over_caps(
     omega, weight, at = np.empty((rules.shape[1], 3)), np.empty(rules.shape[1]), 0
     for cap in range(len(direction)):
         x, y, z = direction[cap]
-        # Two unit vectors that complete the direction, which is not along x, to an orthonormal frame.
-        norm = math.hypot(y, z)
-        down_y, down_z = z / norm, -y / norm
-        across_x, across_y, across_z = down_y * z - down_z * y, down_z * x, -down_y * x
+        (across_x, across_y, across_z), (_, down_y, down_z) = across_and_down(x, y, z)
         height, total = 2.0 * math.sin(0.5 * angular_radius_rad[cap]) ** 2, 0.0
         for node in range(first[cap], first[cap + 1]):
             # dΩ = dh dφ with h = 1 - cos α: uniform in h.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.bearing import angle_from_axis_rad, pixel_turn
-from perception.model.discs.nodes import DiscNodes, along_lines, disc_nodes, fineness_of
+from perception.model.discs.nodes import DiscNodes, across_and_down, along_lines, disc_nodes, fineness_of
 from perception.model.lens import distortion_of, project
 from perception.types import Calibration
 
@@ -107,17 +107,11 @@ def _is_bent(direction: Array, angular_radius_rad: Array, calibration: Calibrati
 
 @compiled
 def _rims(direction: Array, angular_radius_rad: Array) -> tuple[Array, Array, Array]:
-    """Return directions around the rim of each cap, shape (caps, `_AROUND`, 3), and two across it, (caps, 3).
-
-    These complete its own, which is not along x, to an orthonormal frame.
-    """
+    """Return directions around each cap's rim, shape (caps, `_AROUND`, 3), and `across_and_down` of it."""
     caps = len(direction)
     rims, across, down = np.empty((caps, _AROUND, 3)), np.empty((caps, 3)), np.empty((caps, 3))
     for cap in range(caps):
-        x, y, z = direction[cap]
-        norm = math.hypot(y, z)
-        down[cap] = 0.0, z / norm, -y / norm
-        across[cap] = down[cap, 1] * z - down[cap, 2] * y, down[cap, 2] * x, -down[cap, 1] * x
+        across[cap], down[cap] = across_and_down(direction[cap, 0], direction[cap, 1], direction[cap, 2])
         cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
         for at in range(_AROUND):
             turn = 2.0 * math.pi * at / _AROUND
