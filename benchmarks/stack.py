@@ -3,8 +3,8 @@
 Robots stand about a rig of four cameras and repeat a word each at 10 Hz; the frames, 30 sets a second, are
 drawn before anything is timed (`tests/unit/perception/simulation.py`) and each is read once, so that it comes
 from memory as a camera leaves it there. Figures are of the sets after the first second: how long a set takes,
-and of that detection by itself, in threads and in processes; how many tracks there are at the end, and how
-many messages were read.
+and of that detection by itself, in threads, in processes, and in processes that are at work with the next set
+while this one is followed; how many tracks there are at the end, and how many messages were read.
 `--seconds 7` and more lets whole packets be heard.
 """
 
@@ -13,7 +13,7 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +32,8 @@ FPS, BITS_PER_S, WARM_S = 30.0, 10.0, 1.0
 EXPOSURE_S = 2e-4
 NEAREST_M, FARTHEST_M, APART_RAD = 1.5, 6.0, 0.12
 CAMERAS = rig(own_source=True)
-Detector = Callable[[Sequence[RawFrame]], Sequence[Sequence[Detection]]]
+Sets = Iterable[Sequence[RawFrame]]
+Reader = Callable[[Sets], Iterator[tuple[Sequence[RawFrame], Sequence[Sequence[Detection]]]]]
 
 
 def sets_of(robots: int, seconds: float) -> list[list[RawFrame]]:
@@ -75,18 +76,20 @@ def _parts(
     return parts
 
 
-def timed(robots: int, seconds: float, find: Detector) -> dict[str, float | int]:
+def timed(robots: int, seconds: float, read: Reader) -> dict[str, float | int]:
     """Time the whole stack on sets of so many robots, and its parts."""
     pipeline = perception.Pipeline(CAMERAS)
     spent: list[tuple[float, float]] = []
     messages, tracks = 0, 0
-    for frames in sets_of(robots, seconds):
-        started = time.perf_counter()
-        found = find(frames)
+    reading = read(sets_of(robots, seconds))
+    started = time.perf_counter()
+    for frames, found in reading:
         detected = time.perf_counter()
         heard = pipeline.follow(frames, found)
-        spent.append((detected - started, time.perf_counter() - detected))
+        followed = time.perf_counter()
+        spent.append((detected - started, followed - detected))
         messages, tracks = messages + len(heard.messages), len(heard.tracks)
+        started = time.perf_counter()
     settled = [1e3 * np.array(each) for each in spent[round(WARM_S * FPS) :]]
     whole_ms = [float(each.sum()) for each in settled]
     return {
@@ -108,12 +111,13 @@ def main() -> None:
     chosen = parser.parse_args()
     perception.warm_up()
     with perception.DetectorProcesses(CAMERAS) as beside:
-        ways: dict[str, Detector] = {
-            "threads": lambda frames: detect_frames(frames, CAMERAS),
-            "processes": beside.detect_frames,
+        ways: dict[str, Reader] = {
+            "threads": lambda sets: ((frames, detect_frames(frames, CAMERAS)) for frames in sets),
+            "processes": lambda sets: ((frames, beside.detect_frames(frames)) for frames in sets),
+            "processes_ahead": beside.detect_sets,
         }
         figures = {
-            str(robots): {way: timed(robots, chosen.seconds, find) for way, find in ways.items()}
+            str(robots): {way: timed(robots, chosen.seconds, read) for way, read in ways.items()}
             for robots in chosen.robots
         }
     print(json.dumps({"benchmark": "stack", "cameras": len(CAMERAS), "robots": figures}))

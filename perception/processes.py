@@ -12,8 +12,9 @@ import signal
 import threading
 import weakref
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from multiprocessing import connection, get_context
 from multiprocessing.shared_memory import SharedMemory
 from types import TracebackType
@@ -75,6 +76,7 @@ class DetectorProcesses:
         self._one_at_a_time = threading.RLock()
         self._workers: list[_Worker] = []
         self._memory = _Memory()
+        self._is_ahead = False
         weakref.finalize(self, _end, self._workers, self._memory)  # where nobody closes it
         try:
             for _ in range(count):
@@ -97,21 +99,38 @@ class DetectorProcesses:
         RuntimeError
             A process has ended, which ends the others too, or they were ended before.
         """
-        require_calibrations(frames, self._calibrations)
         with self._one_at_a_time:
-            if not self._workers:
-                raise RuntimeError("the detector's processes were ended: make others")
-            try:
-                answers = self._answers(frames)
-            except BaseException:  # an answer that nobody waits for would be taken for the next frame's
-                self.close()
-                raise
-        found = []
-        for answer in answers:
-            if isinstance(answer, Exception):
-                raise answer
-            found.append(answer)
-        return found
+            return self._ended(self._begun(frames))
+
+    def detect_sets(
+        self, sets: Iterable[Sequence[RawFrame]]
+    ) -> Generator[tuple[Sequence[RawFrame], list[Detections]], None, None]:
+        """Yield sets of frames and the flares of each, as `detect_frames` finds them.
+
+        The processes are at work with the next set while the caller is with this one, which is told once the
+        next is at hand: for what was recorded, and for cameras that are faster than both together.
+
+            for frames, found in detectors.detect_sets(sets):
+                heard = pipeline.follow(frames, found)
+
+        Raises
+        ------
+        ValueError, RuntimeError
+            As `detect_frames`; also if other frames are asked for before the last set was told.
+        """
+        begun: _Reading | None = None
+        try:
+            for frames in chain(sets, [None]):
+                with self._one_at_a_time:
+                    read, begun = begun, None
+                    found = [] if read is None else self._ended(read)
+                    begun = None if frames is None else self._begun(frames, ahead=True)
+                if read is not None:
+                    yield read.frames, found
+        finally:
+            if begun is not None:  # nobody asks for the rest
+                with self._one_at_a_time, contextlib.suppress(ValueError, RuntimeError):
+                    self._ended(begun)
 
     def close(self) -> None:
         """End the processes, and give their memory back."""
@@ -126,33 +145,75 @@ class DetectorProcesses:
     ) -> None:
         self.close()
 
-    def _answers(self, frames: Sequence[RawFrame]) -> list[Detections | Exception]:
-        """Give each process a frame, and the next one when it answers; that is in memory by then."""
-        answers: dict[int, Detections | Exception] = {}
-        waiting = iter(enumerate(frames))
-        placed: deque[tuple[int, _Handed]] = deque()
-        busy: dict[Any, tuple[_Worker, int, _Handed]] = {}
-        idle = list(self._workers)
-        while len(answers) < len(frames):
-            while idle and (placed or self._place_next(waiting, placed)):
-                worker, (index, handed) = idle.pop(), placed.popleft()
-                worker.hand_over(handed)
-                busy[worker.pipe] = (worker, index, handed)
-            # One at a time, as long as nobody waits.
-            goes_on = len(placed) < len(self._workers) and self._place_next(waiting, placed)
-            for ready in connection.wait(list(busy), timeout=0.0 if goes_on else None):
-                worker, index, handed = busy.pop(ready)
-                answers[index] = worker.answer("has ended, and the others with it: make others")
-                self._memory.give_back(handed)
-                idle.append(worker)
-        return [answers[index] for index in range(len(frames))]
+    def _begun(self, frames: Sequence[RawFrame], *, ahead: bool = False) -> "_Reading":
+        """Put the processes to work with a set."""
+        require_calibrations(frames, self._calibrations)
+        if not self._workers:
+            raise RuntimeError("the detector's processes were ended: make others")
+        if self._is_ahead:
+            raise RuntimeError("the detector's processes are at work with the next of several sets")
+        reading = _Reading(frames, self._workers, self._memory)
+        self._is_ahead = ahead
+        try:
+            reading.begin()
+        except BaseException:
+            self.close()
+            raise
+        return reading
 
-    def _place_next(
-        self, waiting: "Iterator[tuple[int, RawFrame]]", placed: "deque[tuple[int, _Handed]]"
-    ) -> bool:
+    def _ended(self, reading: "_Reading") -> list[Detections]:
+        """Return what they find in it; raise what one of them raised."""
+        self._is_ahead = False
+        if not self._workers:
+            raise RuntimeError("the detector's processes were ended: make others")
+        try:
+            answers = reading.answers()
+        except BaseException:  # an answer that nobody waits for would be taken for the next frame's
+            self.close()
+            raise
+        found = []
+        for answer in answers:
+            if isinstance(answer, Exception):
+                raise answer
+            found.append(answer)
+        return found
+
+
+class _Reading:
+    """The frames of a set on their way through the processes."""
+
+    def __init__(self, frames: Sequence[RawFrame], workers: "list[_Worker]", memory: "_Memory") -> None:
+        self.frames, self._memory, self._most_placed = frames, memory, len(workers)
+        self._waiting = iter(enumerate(frames))
+        self._placed: deque[tuple[int, _Handed]] = deque()
+        self._idle = list(workers)
+        self._busy: dict[Any, tuple[_Worker, int, _Handed]] = {}
+        self._answers: dict[int, Detections | Exception] = {}
+
+    def begin(self) -> None:
+        """Give each idle process a frame."""
+        while self._idle and (self._placed or self._place_next()):
+            worker, (index, handed) = self._idle.pop(), self._placed.popleft()
+            worker.hand_over(handed)
+            self._busy[worker.pipe] = (worker, index, handed)
+
+    def answers(self) -> list[Detections | Exception]:
+        """Give each process the next frame when it answers; that is in memory by then."""
+        while len(self._answers) < len(self.frames):
+            self.begin()
+            # One at a time, as long as nobody waits.
+            goes_on = len(self._placed) < self._most_placed and self._place_next()
+            for ready in connection.wait(list(self._busy), timeout=0.0 if goes_on else None):
+                worker, index, handed = self._busy.pop(ready)
+                self._answers[index] = worker.answer("has ended, and the others with it: make others")
+                self._memory.give_back(handed)
+                self._idle.append(worker)
+        return [self._answers[index] for index in range(len(self.frames))]
+
+    def _place_next(self) -> bool:
         """Put the next frame where processes find it; tell whether there was one."""
-        for index, frame in waiting:
-            placed.append((index, self._memory.place(frame)))
+        for index, frame in self._waiting:
+            self._placed.append((index, self._memory.place(frame)))
             return True
         return False
 

@@ -1,5 +1,6 @@
 """Frames side by side in processes: what they find is what one finds by itself, and nothing hangs or is left."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing.shared_memory import SharedMemory
 from types import SimpleNamespace
@@ -50,6 +51,44 @@ def test_processes_find_what_one_finds_and_leave_nothing() -> None:
             SharedMemory(name)
     with pytest.raises(RuntimeError, match="were ended"):
         detectors.detect_frames(sets[0])
+
+
+def test_sets_are_read_ahead() -> None:
+    """The same is told of each, whatever is done with it meanwhile, and who stops early leaves nothing behind."""
+    sets = [_frames(0), [], *(_frames(number) for number in range(1, 4))]
+    handed_over: list[int] = []
+
+    def counted() -> Iterator[list[RawFrame]]:
+        for number, frames in enumerate(sets):
+            handed_over.append(number)
+            yield frames
+
+    with DetectorProcesses(CAMERAS, count=2) as detectors:
+        alone = [detectors.detect_frames(frames) for frames in sets]
+        for number, (frames, found) in enumerate(detectors.detect_sets(counted())):
+            assert frames is sets[number]
+            assert _told(found) == _told(alone[number])
+            assert handed_over == list(range(min(number + 2, len(sets))))
+        assert list(detectors.detect_sets([])) == []
+        reading = detectors.detect_sets(sets)
+        next(reading)
+        with pytest.raises(RuntimeError, match="at work with the next"):
+            detectors.detect_frames(sets[0])
+        reading.close()
+        assert _told(detectors.detect_frames(sets[0])) == _told(alone[0])
+        with pytest.raises(ValueError, match=r"no calibration for r9\.up"):
+            list(detectors.detect_sets([sets[0], [replace(sets[0][0], camera="r9.up")]]))
+        wrong = [replace(sets[0][0], data_dn=sets[0][0].data_dn[:5])]
+        reading = detectors.detect_sets([sets[0], wrong, sets[0]])
+        assert _told(next(reading)[1]) == _told(alone[0])
+        with pytest.raises(ValueError):
+            next(reading)
+        assert _told(detectors.detect_frames(sets[0])) == _told(alone[0])
+        reading = detectors.detect_sets(sets)
+        next(reading)
+        detectors.close()
+        with pytest.raises(RuntimeError, match="were ended"):
+            next(reading)
 
 
 def test_what_is_wrong_with_a_frame_is_told_and_the_next_is_read() -> None:
