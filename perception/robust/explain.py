@@ -4,11 +4,26 @@ import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, Camera
-from perception.robust.before_edges import brightest_alone, likelier_before_edges, with_flares_and_edges
+from perception.robust.around.before_edges import (
+    brightest_alone,
+    likelier_before_edges,
+    with_flares_and_edges,
+)
+from perception.robust.around.edge import (
+    is_beyond_doubt,
+    leaves_something,
+    surely_leaves_something,
+    with_edges,
+)
+from perception.robust.around.halo import with_halo
+from perception.robust.around.highlight import likelier_beside_highlights, seems_highlit, with_highlights
+from perception.robust.around.uneven import (
+    MOST_LEFT,
+    retry_on_uneven_ground,
+    retry_without_spill,
+    without_spill,
+)
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.motion import moving
@@ -21,13 +36,6 @@ from perception.robust.overlap.deblend import (
     of_free_width,
 )
 from perception.robust.overlap.eclipse import eclipses
-from perception.robust.overlap.edge import (
-    is_beyond_doubt,
-    leaves_something,
-    surely_leaves_something,
-    with_edges,
-)
-from perception.robust.overlap.halo import with_halo
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import gain_over_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
@@ -35,14 +43,10 @@ from perception.robust.overlap.rivals import weighed
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.search.structure import EDGES, structure_of
 from perception.robust.solve import Solution, solve, start_costs
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 _ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
-
-MOST_LEFT = 0.25
-"""What a fit may leave over, relative to the flares' light, of what is still called a source."""
 
 
 def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
@@ -97,9 +101,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         pairs, rivals = eclipses(found, plain, parted, may_be, camera)
         _take_up(pairs, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
-        known = _take_lines(chosen, plain, halos, _without_spill(plain, prepared, camera), camera)
+        known = _take_lines(chosen, plain, halos, without_spill(plain, prepared, camera), camera)
         _drop_beside_lines(chosen, parted, halos, prepared.shape, camera, cut_short)
-    _retry_without_spill(chosen, parted, prepared, camera)
+    retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
     # Many flares where one blob was seen may be something wide: its whole residual counts.
     spread_e = {
@@ -115,10 +119,12 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     if prepared.frame.line_time_s == 0.0:
         edged |= _several_before_edges(found, at_rest, chosen, edged, parted, prepared.shape, camera)
-    for index, one in likelier_before_edges(edged, chosen, parted).items():
-        chosen[index], uneven_e[index] = one, one.left_over.structure_e
-        parted.pop(index, None)
-    _retry_on_uneven_ground(chosen, uneven_e, camera)
+    likelier = likelier_before_edges(edged, chosen, parted)
+    _adopt(likelier, chosen, parted, uneven_e)
+    if prepared.frame.line_time_s == 0.0:
+        highlit = _beside_highlights(found, at_rest, chosen, likelier, parted, camera)
+        _adopt(likelier_beside_highlights(highlit, chosen, parted), chosen, parted, uneven_e)
+    retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
         chosen[index] = _better(more, chosen[index])
     for index, pair in rivals.items():
@@ -282,6 +288,40 @@ def _several_before_edges(
     }
 
 
+def _beside_highlights(
+    found: Sequence[Cluster],
+    plain: Sequence[Solution | None],
+    chosen: Sequence[Solution | None],
+    done: Container[int],
+    parted: Mapping[int, Solution],
+    camera: Camera,
+) -> dict[int, Solution]:
+    """Explain by lone flares beside highlights what nothing else explains, or only several flares do."""
+    tried = {
+        index: one
+        for index, (cluster, one) in enumerate(zip(found, plain, strict=True))
+        if one is not None and one.count == 1 and not cluster.is_in_crowd and index not in done
+        if (held := parted.get(index, chosen[index])) is not one or surely_leaves_something(one)
+        if seems_highlit(held)
+    }
+    highlit = with_highlights(tried, camera)
+    of_all = [highlit.get(index) for index in range(len(found))]
+    fit_beside_forward_light(of_all, camera)
+    return {index: one for index, one in enumerate(of_all) if one is not None}
+
+
+def _adopt(
+    likelier: Mapping[int, Solution],
+    chosen: list[Solution | None],
+    parted: dict[int, Solution],
+    uneven_e: list[float],
+) -> None:
+    """Take what explains windows better, in place of one flare and of several."""
+    for index, one in likelier.items():
+        chosen[index], uneven_e[index] = one, one.left_over.structure_e
+        parted.pop(index, None)
+
+
 def _may_be_several(one: Solution | None) -> bool:
     """Tell whether what is a whole disc by its limb may be several flares: beside it, or too small to say.
 
@@ -338,56 +378,3 @@ def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:
     """Tell whether several flares explain all that is seen, each of them seen itself."""
     hardly_seen = (is_hardly_seen(several, k, shape) for k in range(several.count))
     return several.left_over.is_nothing and not any(hardly_seen)
-
-
-def _retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:
-    """Fit again where something lies around the flares: edges, of the strength that plain fits leave over.
-
-    What is too sharp even for them counts as noise of the window.
-    """
-    for is_noise in (False, True):
-        tried, problems = [], []
-        for index, solution in enumerate(best):
-            if solution is None or uneven_e[index] == 0.0:
-                continue
-            window, left_e = solution.window, solution.left_over.structure_e if is_noise else 0.0
-            if left_e > 0.0:
-                window = replace(window, floor_e2=window.floor_e2 + left_e**2)
-            elif not is_noise:
-                strength_e = math.hypot(uneven_e[index], window.structure_e)
-                edges = structure_of(EDGES, window.box.height, strength_e)
-                window = replace(window, structure=edges, structure_e=strength_e, on_edges=True)
-            else:
-                continue
-            tried.append(index)
-            problems.append(solution.again(window))
-        for index, again in zip(tried, solve(problems, camera), strict=True):
-            best[index] = again
-
-
-def _retry_without_spill(
-    best: list[Solution | None], parted: Container[int], prepared: PreparedFrame, camera: Camera
-) -> None:
-    """Fit badly fitted clipped flares without the columns of clipped pixels, where charge may spill."""
-    alone = [None if index in parted else one for index, one in enumerate(best)]
-    for index, again in _without_spill(alone, prepared, camera).items():
-        if again.left_over.share < MOST_LEFT:
-            best[index] = again
-
-
-def _without_spill(
-    found: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera
-) -> dict[int, Solution]:
-    """Return by index what badly fitted solutions are without columns of clipped pixels, where there are."""
-    tried, problems = [], []
-    for index, solution in enumerate(found):
-        if solution is None or solution.left_over.is_good:
-            continue
-        # Also those of flares that are none of the window's.
-        spilled = prepared.clipped_columns(solution.window.box)
-        if spilled.any():
-            tried.append(index)
-            state = np.where(spilled, UNUSABLE, solution.window.state).astype(np.uint8)
-            problems.append(solution.again(replace(solution.window, state=state)))
-    fits = zip(tried, solve(problems, camera), strict=True)
-    return {index: again for index, again in fits if again is not None}

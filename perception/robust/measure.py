@@ -11,8 +11,9 @@ from perception.model.ranging import range_from_flux
 from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux, centroid_sigmas, mask_in
+from perception.robust.around.uneven import MOST_LEFT
 from perception.robust.clusters import Candidate, Cluster, clusters, guess_by_outline
-from perception.robust.explain import MOST_LEFT, best
+from perception.robust.explain import best
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.motion import is_long_clutter
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size, of_free_width
@@ -166,7 +167,7 @@ def measure(
 
 def _may_be_before_edge(solution: Solution, shape: tuple[int, int]) -> bool:
     """Tell whether a flare is well explained, but beside something bright that its window leaves out."""
-    left_out = solution.window.edges is None and not solution.window.usable.all()
+    left_out = solution.window.features is None and not solution.window.usable.all()
     return (
         left_out and solution.count == 1 and solution.left_over.is_nothing and is_on_flank(solution, 0, shape)
     )
@@ -193,7 +194,7 @@ def _judged(
         return []
     blobs: list[Blob | None] = [member.blob for member in cluster.members]
     wanted: Sequence[int] = cluster.wanted
-    if solution.count != len(blobs) or solution.window.edges is not None:
+    if solution.count != len(blobs) or solution.window.features is not None:
         wanted = range(solution.count)
         blobs = divide([member.blob for member in cluster.members], solution.u_px, solution.v_px)
     return [
@@ -229,7 +230,7 @@ def _measurement(
     if may_be_in_fog(prepared.calibration):
         # The range that this fit states is loosely tied to the flux, which tells it in fog.
         told_sigma = math.hypot(0.5 * flux_sigma_e / flux_e, hidden / math.sqrt(3.0))
-    on_edge = solution.window.edges is not None
+    on_edge = solution.window.features is not None
     bound_only = saturated and not told_sigma < CLIPPED_RANGE_SIGMA
     return MeasuredFlare(
         u_px=u_px,

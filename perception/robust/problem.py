@@ -39,8 +39,8 @@ class Window:
     known_e, unsure
         Light that is there beside flares and background, shape (height, width); None where there is none. And
         what is not known of it, which lies on top of any structure; None where nothing is.
-    edges
-        Straight edges on the background, with what is not known of them; None where there are none.
+    features
+        Straight edges or highlights on the background, with what is not known of them; None where none are.
     """
 
     box: PixelBox
@@ -54,7 +54,7 @@ class Window:
     on_edges: bool = False
     known_e: Array | None = None
     unsure: Structure | None = None
-    edges: Structure | None = None
+    features: Structure | None = None
 
     @cached_property
     def view(self) -> View:
@@ -66,7 +66,7 @@ class Window:
     def beside(self) -> Structure:
         """All that may lie beside flares and even background."""
         whole = self.structure
-        for more in (self.unsure, self.edges):
+        for more in (self.unsure, self.features):
             if more is not None:
                 whole = joined(whole, more)
         return even(self.image_e.size) if whole is None else whole

@@ -93,7 +93,7 @@ def is_on_flank(solution: Solution, index: int, shape: tuple[int, int]) -> bool:
         place,
         (inner_px, inner_px + _FLANK_PX),
         solution.count == 1,
-        _FLANK_PEAKS if window.edges is None else _FLANK_PEAKS_ON_EDGES,
+        _FLANK_PEAKS if window.features is None else _FLANK_PEAKS_ON_EDGES,
     )
     return share > _FLANK_SHARE
 

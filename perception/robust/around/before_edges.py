@@ -9,6 +9,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from perception.model.window import Camera
+from perception.robust.around.edge import (
+    MOST_EDGES,
+    Edge,
+    leaves_something,
+    likeliest_edge_of,
+)
+from perception.robust.around.turns import fit_in_turns
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.deblend import (
     LEAST_GAIN,
@@ -17,13 +24,6 @@ from perception.robust.overlap.deblend import (
     gain,
     gaining,
     with_one_more,
-)
-from perception.robust.overlap.edge import (
-    MOST_EDGES,
-    Edge,
-    fit_in_turns,
-    leaves_something,
-    likeliest_edge_of,
 )
 from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem

@@ -1,0 +1,1 @@
+"""What lies around flares and is none: halos, edges, highlights; each with the flares before it."""

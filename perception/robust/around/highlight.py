@@ -1,0 +1,195 @@
+"""Lone flares beside the highlight that a glossy surface shows of them: a mirror image without an outline.
+
+Paint, plastic and polished floors mirror a source in facets that all lean a little otherwise. Where they
+lean as GGX says (Walter et al., Eurographics Symp. Rendering 2007, eq. 33), the mirror image of a source h
+before a wall of roughness α is a spot that falls off from its middle as (1 + ρ²/w²)^-2, w = 2 α h f / d
+pixels: it is narrow where h is. It lies where a mirror's image would, not around the flare as a halo does; a
+few flares add up to it, too.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.layout import SEEN
+from perception.model.window import Camera
+from perception.robust.around.edge import leaves_something
+from perception.robust.around.turns import (
+    Feature,
+    fit_in_turns,
+    free_of_flares,
+    offsets_px,
+    places_px,
+    sharp_px,
+)
+from perception.robust.goodness import MODEL_ERROR
+from perception.robust.overlap.deblend import LEAST_GAIN, gain
+from perception.robust.overlap.rivals import weighed
+from perception.robust.solve import Solution
+
+Array = NDArray[np.float64]
+
+MOST_HIGHLIGHTS = 2
+"""So many one window has at most: in walls that meet; and a halo looks like one in the flare's place."""
+
+_LEAST_WIDTHS = 2.0  # of what is sharp: a point's image is half as wide
+_WIDER = (1.0, 2.0, 4.0)  # first guesses
+_REACH_PX = 12.0  # from the flare, of first guesses
+_STEPS = 2.0  # a width
+_SEEMS_WIDE, _SEEMS_LIT = 9.0, 15.0  # 2 Δ ln L to first order, from which one is tried
+_FARTHEST = 10.0  # 1 + ρ²/w² of what counts in first guesses: a hundredth of the light there
+_LEAST_KEPT = 0.02  # of a highlight's power, beside what flares and an even background may take of it
+
+
+@dataclass(frozen=True)
+class Highlight(Feature):
+    """A spot of light that falls off as (1 + ρ²/w²)^-2 from x = `first`, y = `second`; w is `width_px`."""
+
+    STANDS_ON = False
+    PRIOR = (1.0, 4.0, 4.0, 0.7)
+    MOST_STEPS = (1.0, 1.0, 0.3)
+    LOG_WIDTHS = (0.0, math.log(8.0))
+
+    @staticmethod
+    def farthest(shape: tuple[int, int]) -> tuple[float, float]:
+        """Return the greatest of where it lies, in a window of that shape."""
+        return 0.5 * shape[1], 0.5 * shape[0]
+
+    def slopes(self, x_px: Array, y_px: Array) -> Array:
+        """Return its profile of height 1, and derivatives by `first`, `second` and ln width, (4, *places)."""
+        right, down = (x_px - self.first) / self.width_px, (y_px - self.second) / self.width_px
+        spread = 1.0 + right**2 + down**2
+        steep = 4.0 * spread**-3
+        return np.stack(
+            [spread**-2, steep * right / self.width_px, steep * down / self.width_px, steep * (spread - 1.0)]
+        )
+
+
+def with_highlights(flares: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
+    """Fit lone flares again beside highlights, one after another as long as something is left over.
+
+    Parameters
+    ----------
+    flares
+        Lone flares.
+    camera
+        The frame's camera.
+
+    Returns
+    -------
+    By index those that gain more by it than noise or a wrong point spread could give.
+    """
+    found: dict[int, Solution] = {}
+    known: dict[int, list[Highlight]] = {index: [] for index in flares}
+    going = dict(flares)
+    for _ in range(MOST_HIGHLIGHTS):
+        tried = {
+            index: [*known[index], highlight]
+            for index, one in going.items()
+            if (highlight := likeliest_highlight_of(one)[1]) is not None
+        }
+        best = fit_in_turns(tried, {index: going[index] for index in tried}, flares, camera)
+        going = {}
+        for index, (one, highlights) in best.items():
+            if gain(found.get(index, flares[index]), one) < LEAST_GAIN:
+                continue
+            found[index], known[index] = one, highlights
+            if leaves_something(one):
+                going[index] = one
+    return found
+
+
+def seems_highlit(held: Solution | None) -> bool:
+    """Tell whether what explains a window so far looks as if there were a highlight in it.
+
+    Several flares that add up to one; a second flare that is wider than a point; light that is left over.
+    """
+    if held is None or held.count > 2:
+        return True
+    if held.count == 2:
+        return _gain_if_wider(held, int(np.argmin(held.flux_e))) > _SEEMS_WIDE
+    return likeliest_highlight_of(held)[0] > _SEEMS_LIT
+
+
+def _gain_if_wider(one: Solution, index: int) -> float:
+    """Return what a wider image of a faint flare would bring, in 2 Δ ln L, beside errors of all others."""
+    window, width_px = one.window, sharp_px(one)
+    seen = window.state == SEEN
+    weight = 1.0 / np.sqrt(one.variance_e2(MODEL_ERROR)[seen])
+    x_px, y_px = offsets_px(window.image_e.shape)
+    right, down = (each[seen] for each in (x_px - places_px(one)[0][index], y_px - places_px(one)[1][index]))
+    image = np.exp(-0.5 * (right**2 + down**2) / width_px**2)
+    wider = image * ((right**2 + down**2) / width_px**2 - 2.0)
+    others = np.stack([np.ones_like(image), one.flares_e[seen], image, image * right, image * down]) * weight
+    left = np.stack([wider, one.residual_e[seen]]) * weight
+    left -= left @ np.linalg.pinv(others) @ others
+    score, power = float(left[0] @ left[1]), float(left[0] @ left[0])
+    return score**2 / power if score > 0.0 and power > 0.0 else 0.0
+
+
+def likelier_beside_highlights(
+    highlit: Mapping[int, Solution], chosen: Sequence[Solution | None], parted: Mapping[int, Solution]
+) -> dict[int, Solution]:
+    """Return by index lone flares beside highlights where these explain all, and better than what did so far.
+
+    What a single flare more explains nearly as well is one: that much light may be a robot.
+    """
+    likelier = {}
+    for index, one in highlit.items():
+        held = parted.get(index, chosen[index])
+        if not one.left_over.is_nothing or (held is not None and one.cost >= held.cost):
+            continue
+        if held is not None and held.count == one.count + 1 and gain(held, one) < LEAST_GAIN:
+            continue
+        likelier[index] = one if held is None or held.count != one.count else weighed(one, held)
+    return likelier
+
+
+def likeliest_highlight_of(one: Solution) -> tuple[float, Highlight | None]:
+    """Return the highlight that what is left over asks for most, and what it brings at least, in 2 Δ ln L.
+
+    That is what it brings where it is first guessed to be; 0 and None where there is none.
+    """
+    window, least_px = one.window, _LEAST_WIDTHS * sharp_px(one)
+    x_px, y_px = places_px(one)
+    brings, height_e, first, second, width_px = _likeliest_highlight(
+        window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu,
+        (float(x_px[0]), float(y_px[0])), least_px * np.array(_WIDER),
+    )  # fmt: skip
+    return brings, Highlight(height_e, first, second, width_px, least_px) if brings > 0.0 else None
+
+
+@compiled
+def _likeliest_highlight(
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float,
+    prnu: float, middle: tuple[float, float], widths_px: Array,
+) -> tuple[float, float, float, float, float]:  # fmt: skip
+    """Return what the highlight brings that brings most, its height, x, y and width.
+
+    Beside flares that may all be off; of places within `_REACH_PX` of `middle`.
+    """
+    parts, weights, at = free_of_flares(image_e, state, expected_e, flares_e, floor_e2, prnu)
+    most, height_e, x_px, y_px, wide_px = 0.0, 0.0, 0.0, 0.0, 0.0
+    shares = np.empty(6)
+    for width_px in widths_px:
+        steps = int(_STEPS * _REACH_PX / width_px)
+        for down in range(-steps, steps + 1):
+            for right in range(-steps, steps + 1):
+                x, y = middle[0] + right * width_px / _STEPS, middle[1] + down * width_px / _STEPS
+                whole, shares[:] = 0.0, 0.0
+                for pixel in range(len(weights)):
+                    spread = 1.0 + ((at[0, pixel] - x) ** 2 + (at[1, pixel] - y) ** 2) / width_px**2
+                    if spread < _FARTHEST:
+                        profile = weights[pixel] / (spread * spread)
+                        whole += profile**2
+                        for part in range(6):
+                            shares[part] += profile * parts[part, pixel]
+                power = whole - (shares[:5] ** 2).sum()
+                if power > _LEAST_KEPT * whole and shares[5] > 0.0 and shares[5] ** 2 > most * power:
+                    most, height_e = shares[5] ** 2 / power, shares[5] / power
+                    x_px, y_px, wide_px = x, y, width_px
+    return most, height_e, x_px, y_px, wide_px
