@@ -1,7 +1,7 @@
 """What explains a cluster best: flares at rest or drawn out, one or several, a halo, uneven ground, spill."""
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from perception.model.window import MOST_MOTION_PX, Camera
@@ -119,10 +119,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     uneven_e = [left_e or spread_e.get(index, 0.0) for index, left_e in enumerate(uneven_e)]
     if prepared.frame.line_time_s == 0.0:
         edged |= _several_before_edges(found, at_rest, chosen, edged, parted, prepared.shape, camera)
-    likelier = likelier_before_edges(edged, chosen, parted)
-    _adopt(likelier, chosen, parted, uneven_e)
+    _adopt(likelier_before_edges(edged, chosen, parted), chosen, parted, uneven_e)
     if prepared.frame.line_time_s == 0.0:
-        highlit = _beside_highlights(found, at_rest, chosen, likelier, parted, camera)
+        highlit = _beside_highlights(found, at_rest, chosen, parted, camera)
         _adopt(likelier_beside_highlights(highlit, chosen, parted), chosen, parted, uneven_e)
     retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
@@ -292,7 +291,6 @@ def _beside_highlights(
     found: Sequence[Cluster],
     plain: Sequence[Solution | None],
     chosen: Sequence[Solution | None],
-    done: Container[int],
     parted: Mapping[int, Solution],
     camera: Camera,
 ) -> dict[int, Solution]:
@@ -300,11 +298,13 @@ def _beside_highlights(
     tried = {
         index: one
         for index, (cluster, one) in enumerate(zip(found, plain, strict=True))
-        if one is not None and one.count == 1 and not cluster.is_in_crowd and index not in done
-        if (held := parted.get(index, chosen[index])) is not one or surely_leaves_something(one)
+        if one is not None and not cluster.is_in_crowd
+        if (held := parted.get(index, chosen[index])) is not one
+        or surely_leaves_something(one)
+        or one.count > 1
         if seems_highlit(held)
     }
-    highlit = with_highlights(tried, camera)
+    highlit = with_highlights(brightest_alone(tried, found, camera), camera)
     of_all = [highlit.get(index) for index in range(len(found))]
     fit_beside_forward_light(of_all, camera)
     return {index: one for index, one in enumerate(of_all) if one is not None}

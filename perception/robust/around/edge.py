@@ -36,7 +36,7 @@ class Edge(Feature):
     `width_px` the σ of the normal distribution across it, that of a sharp edge the usual one.
     """
 
-    STANDS_ON = True
+    IS_GROUND = True
     PRIOR = (1.0, 5.0, 1.0, 0.3)
     MOST_STEPS = (1.0, 0.15, 0.3)
     LOG_WIDTHS = (-0.1, math.log(4.0))

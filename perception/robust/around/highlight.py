@@ -37,6 +37,8 @@ MOST_HIGHLIGHTS = 2
 """So many one window has at most: in walls that meet; and a halo looks like one in the flare's place."""
 
 _LEAST_WIDTHS = 2.0  # of what is sharp: a point's image is half as wide
+_LAGUERRE_AT, _LAGUERRE_WEIGHT = np.polynomial.laguerre.laggauss(10)
+_LAGUERRE_SHARE = _LAGUERRE_WEIGHT * _LAGUERRE_AT
 _WIDER = (1.0, 2.0, 4.0)  # first guesses
 _REACH_PX = 12.0  # from the flare, of first guesses
 _STEPS = 2.0  # a width
@@ -49,7 +51,7 @@ _LEAST_KEPT = 0.02  # of a highlight's power, beside what flares and an even bac
 class Highlight(Feature):
     """A spot of light that falls off as (1 + ρ²/w²)^-2 from x = `first`, y = `second`; w is `width_px`."""
 
-    STANDS_ON = False
+    IS_GROUND = False
     PRIOR = (1.0, 4.0, 4.0, 0.7)
     MOST_STEPS = (1.0, 1.0, 0.3)
     LOG_WIDTHS = (0.0, math.log(8.0))
@@ -60,12 +62,18 @@ class Highlight(Feature):
         return 0.5 * shape[1], 0.5 * shape[0]
 
     def slopes(self, x_px: Array, y_px: Array) -> Array:
-        """Return its profile of height 1, and derivatives by `first`, `second` and ln width, (4, *places)."""
-        right, down = (x_px - self.first) / self.width_px, (y_px - self.second) / self.width_px
-        spread = 1.0 + right**2 + down**2
-        steep = 4.0 * spread**-3
+        """Return its profile of height 1, and derivatives by `first`, `second` and ln width, (4, *places).
+
+        As seen through the point spread, by (1 + x)^-2 = ∫ t e^-t e^-tx dt, a sum of normal distributions.
+        """
+        right, down = x_px - self.first, y_px - self.second
+        variance = (0.5 * self.width_px**2 / _LAGUERRE_AT).reshape(-1, *np.ones(right.ndim, dtype=int))
+        of_spread = (self.usual_px / _LEAST_WIDTHS) ** 2
+        seen, squared = variance + of_spread, right**2 + down**2
+        light = _LAGUERRE_SHARE.reshape(variance.shape) * variance / seen * np.exp(-0.5 * squared / seen)
+        grown = light * (squared * variance / seen + 2.0 * of_spread) / seen
         return np.stack(
-            [spread**-2, steep * right / self.width_px, steep * down / self.width_px, steep * (spread - 1.0)]
+            [each.sum(axis=0) for each in (light, light * right / seen, light * down / seen, grown)]
         )
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import SEEN, Structure
+from perception.model.ranging import covered_px_at_1_m
 from perception.model.window import Camera
 from perception.robust.goodness import noise_e2
 from perception.robust.problem import Window
@@ -50,8 +51,9 @@ class Feature(ABC):
     width_px: float
     usual_px: float
 
-    STANDS_ON: ClassVar[bool]
-    """Whether flares stand on it: it counts from its level there, which is that of their even background."""
+    IS_GROUND: ClassVar[bool]
+    """Whether flares stand on it: it counts from its level there, which is that of their even background, and
+    of it sources hide what they hide of that; else they hide all that is behind them."""
 
     PRIOR: ClassVar[tuple[float, float, float, float]]
     """σ of height over itself, of where it lies, twice, and of ln width, a priori."""
@@ -124,9 +126,9 @@ def fit_in_turns(
     current = dict(solutions)
     for _ in range(_ROUNDS):
         for index in known:
-            known[index] = _climbed(current[index], plain[index].window, known[index])
+            known[index] = _climbed(current[index], plain[index].window, known[index], camera)
         windows = {
-            index: replace(plain[index].window, features=_structure(features, current[index]))
+            index: replace(plain[index].window, features=_structure(features, current[index], camera))
             for index, features in known.items()
         }
         problems = [current[index].again(windows[index]) for index in known]
@@ -140,19 +142,20 @@ def fit_in_turns(
     return best
 
 
-def _columns(feature: Feature, one: Solution) -> Array:
-    """Return a feature's profile of height 1 and its derivatives, as seen beside flares, (4, *shape).
-
-    Discs hide what is behind them.
-    """
-    columns = feature.slopes(*offsets_px(one.window.image_e.shape))
-    if feature.STANDS_ON:
+def _columns(feature: Feature, one: Solution, camera: Camera) -> Array:
+    """Return a feature's profile of height 1 and its derivatives, as seen beside flares, (4, *shape)."""
+    columns, hidden = feature.slopes(*offsets_px(one.window.image_e.shape)), 1.0
+    if feature.IS_GROUND:
         columns[0] -= feature.slopes(*places_px(one))[0].mean()
-    plateau_e = float((one.flux_e / np.maximum(math.pi * one.image_radius_px**2, 1e-9)).max())
-    return np.asarray(columns * (1.0 - np.clip(one.flares_e / plateau_e, 0.0, 1.0)))
+        hidden = camera.calibration.hidden_background
+    # A disc is as bright all over, so that its image tells how much of each pixel it covers.
+    at_1_m_px = covered_px_at_1_m(np.column_stack([one.u_px, one.v_px]), camera.calibration)
+    of_disc_e = one.flux_e / np.maximum(at_1_m_px * np.exp(-2.0 * one.log_range), 1e-9)
+    covered = np.clip(one.flares_e / float(of_disc_e.max()), 0.0, 1.0)
+    return np.asarray(columns * (1.0 - hidden * covered))
 
 
-def _climbed(one: Solution, window: Window, features: list[Kind]) -> list[Kind]:
+def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera) -> list[Kind]:
     """Return features moved to where they explain best what flares leave, as these have come out.
 
     Levenberg's steps; heights, and the even background, are linear and follow.
@@ -173,7 +176,7 @@ def _climbed(one: Solution, window: Window, features: list[Kind]) -> list[Kind]:
     def fitted(values: Array) -> tuple[list[Kind], float, Array]:
         """Return features, how badly they fit, and the slopes of what is left by their unknowns."""
         there = [f.moved_to(*row) for f, row in zip(features, values.tolist(), strict=True)]
-        profiles = [_columns(feature, one)[:, usable] * weight for feature in there]
+        profiles = [_columns(feature, one, camera)[:, usable] * weight for feature in there]
         linear = np.stack([weight, *(profile[0] for profile in profiles)], axis=1)
         heights, *_ = np.linalg.lstsq(linear, left, rcond=None)
         after = left - linear @ heights
@@ -206,9 +209,9 @@ def _climbed(one: Solution, window: Window, features: list[Kind]) -> list[Kind]:
     return best
 
 
-def _structure(features: Sequence[Feature], one: Solution) -> Structure:
+def _structure(features: Sequence[Feature], one: Solution, camera: Camera) -> Structure:
     """Return what features may add to a window: their heights, and what else is not known of them."""
-    columns = np.concatenate([_columns(feature, one).reshape(4, -1) for feature in features])
+    columns = np.concatenate([_columns(feature, one, camera).reshape(4, -1) for feature in features])
     sigma = np.concatenate(
         [np.multiply(feature.PRIOR, max(abs(feature.height_e), _LEAST_HEIGHT_E)) for feature in features]
     )
