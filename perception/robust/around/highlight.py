@@ -29,7 +29,8 @@ from perception.robust.around.turns import (
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
 from perception.robust.overlap.rivals import weighed
-from perception.robust.solve import Solution
+from perception.robust.problem import Problem, Window
+from perception.robust.solve import Solution, solve
 
 Array = NDArray[np.float64]
 
@@ -89,7 +90,8 @@ def with_highlights(flares: Mapping[int, Solution], camera: Camera) -> dict[int,
 
     Returns
     -------
-    By index those that gain more by it than noise or a wrong point spread could give.
+    By index those that gain more by it than noise or a wrong point spread could give; several flares where
+    these explain nearly as much: what may be a robot is one.
     """
     found: dict[int, Solution] = {}
     known: dict[int, list[Highlight]] = {index: [] for index in flares}
@@ -108,7 +110,22 @@ def with_highlights(flares: Mapping[int, Solution], camera: Camera) -> dict[int,
             found[index], known[index] = one, highlights
             if leaves_something(one):
                 going[index] = one
+    problems = [_as_flares(one, flares[index].window, known[index]) for index, one in found.items()]
+    for index, several in zip(list(found), solve(problems, camera), strict=True):
+        if several is not None and gain(several, found[index]) < LEAST_GAIN:
+            found[index] = several
     return found
+
+
+def _as_flares(one: Solution, plain: Window, highlights: Sequence[Highlight]) -> Problem:
+    """Return the problem of a flare in the place of each highlight."""
+    (x_px, y_px), (u_px, v_px, log_range) = places_px(one), one.starts[0]
+    starts = [(u_px, v_px, log_range)]
+    for spot in highlights:
+        flux_e = max(spot.height_e * math.pi * spot.width_px**2, 1.0)
+        place = u_px + spot.first - float(x_px[0]), v_px + spot.second - float(y_px[0])
+        starts.append((*place, log_range + 0.5 * math.log(float(one.flux_e[0]) / flux_e)))
+    return Problem(plain, starts, one.background_e)
 
 
 def seems_highlit(held: Solution | None) -> bool:
@@ -142,16 +159,17 @@ def _gain_if_wider(one: Solution, index: int) -> float:
 def likelier_beside_highlights(
     highlit: Mapping[int, Solution], chosen: Sequence[Solution | None], parted: Mapping[int, Solution]
 ) -> dict[int, Solution]:
-    """Return by index lone flares beside highlights where these explain all, and better than what did so far.
+    """Return by index what `with_highlights` has found where that explains all, better than what did so far.
 
-    What a single flare more explains nearly as well is one: that much light may be a robot.
+    What a single flare more explains nearly as well is one.
     """
     likelier = {}
     for index, one in highlit.items():
         held = parted.get(index, chosen[index])
         if not one.left_over.is_nothing or (held is not None and one.cost >= held.cost):
             continue
-        if held is not None and held.count == one.count + 1 and gain(held, one) < LEAST_GAIN:
+        by_one_more = held is not None and held.count == one.count + 1 and one.window.features is not None
+        if held is not None and by_one_more and gain(held, one) < LEAST_GAIN:
             continue
         likelier[index] = one if held is None or held.count != one.count else weighed(one, held)
     return likelier
