@@ -108,9 +108,13 @@ def is_beyond_doubt(one: Solution, before: Solution) -> bool:
 
     Other flares, or halos, may be taken for an edge near to a flare; they reach no farther.
     """
+    return not leaves_something(one) and gain_around(before, one) >= LEAST_GAIN
+
+
+def gain_around(before: Solution, one: Solution) -> float:
+    """Return by how much another fit explains better what no flare reaches, as 2 Δ ln L."""
     variance = np.where(one.flares_e**2 < one.variance_e2(0.0), one.variance_e2(0.0), math.inf)
-    gain_around = float(np.sum((before.residual_e**2 - one.residual_e**2) / variance))
-    return not leaves_something(one) and gain_around >= LEAST_GAIN
+    return float(np.sum((before.residual_e**2 - one.residual_e**2) / variance))
 
 
 def leaves_something(one: Solution) -> bool:

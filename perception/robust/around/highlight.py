@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.layout import SEEN
 from perception.model.window import Camera
-from perception.robust.around.edge import leaves_something
+from perception.robust.around.edge import gain_around, leaves_something
 from perception.robust.around.turns import (
     Feature,
     fit_in_turns,
@@ -43,6 +43,9 @@ _LAGUERRE_SHARE = _LAGUERRE_WEIGHT * _LAGUERRE_AT
 _WIDER = (1.0, 2.0, 4.0)  # first guesses
 _REACH_PX = 12.0  # from the flare, of first guesses
 _STEPS = 2.0  # a width
+_LEAST_AROUND = (
+    20.0  # of 2 Δ ln L where the flare does not reach: within it, what is not as taken looks like one
+)
 _SEEMS_WIDE, _SEEMS_LIT = 9.0, 15.0  # 2 Δ ln L to first order, from which one is tried
 _FARTHEST = 10.0  # 1 + ρ²/w² of what counts in first guesses: a hundredth of the light there
 _LEAST_KEPT = 0.02  # of a highlight's power, beside what flares and an even background may take of it
@@ -105,7 +108,8 @@ def with_highlights(flares: Mapping[int, Solution], camera: Camera) -> dict[int,
         best = fit_in_turns(tried, {index: going[index] for index in tried}, flares, camera)
         going = {}
         for index, (one, highlights) in best.items():
-            if gain(found.get(index, flares[index]), one) < LEAST_GAIN:
+            before = found.get(index, flares[index])
+            if gain(before, one) < LEAST_GAIN or gain_around(before, one) < _LEAST_AROUND:
                 continue
             found[index], known[index] = one, highlights
             if leaves_something(one):
@@ -161,15 +165,17 @@ def likelier_beside_highlights(
 ) -> dict[int, Solution]:
     """Return by index what `with_highlights` has found where that explains all, better than what did so far.
 
-    What a single flare more explains nearly as well is one.
+    What a single flare more explains nearly as well is one; flares are taken in place of more of them.
     """
     likelier = {}
     for index, one in highlit.items():
         held = parted.get(index, chosen[index])
         if not one.left_over.is_nothing or (held is not None and one.cost >= held.cost):
             continue
-        by_one_more = held is not None and held.count == one.count + 1 and one.window.features is not None
-        if held is not None and by_one_more and gain(held, one) < LEAST_GAIN:
+        if one.window.features is None:
+            if held is None or held.count <= one.count:
+                continue
+        elif held is not None and held.count == one.count + 1 and gain(held, one) < LEAST_GAIN:
             continue
         likelier[index] = one if held is None or held.count != one.count else weighed(one, held)
     return likelier
