@@ -37,7 +37,8 @@ class DetectorProcesses:
 
     They load the package anew: where a script makes it, that must stand below ``if __name__ == "__main__":``.
     It is made once they are ready: a second or two, minutes where the package's loops were never compiled.
-    Shared memory (`/dev/shm`) must have room for two frames for each process.
+    Shared memory (`/dev/shm`) must have room for two frames for each process, and for a whole set where sets
+    are read ahead.
 
     Parameters
     ----------
@@ -108,7 +109,9 @@ class DetectorProcesses:
         """Yield sets of frames and the flares of each, as `detect_frames` finds them.
 
         The processes are at work with the next set while the caller is with this one, which is told once the
-        next is at hand: for what was recorded, and for cameras that are faster than both together.
+        next is at hand: for what was recorded, and for cameras that are faster than both together. The frames
+        of a set are copied before the next is asked for. What is wrong with one ends the iteration, once all
+        sets before it are told.
 
             for frames, found in detectors.detect_sets(sets):
                 heard = pipeline.follow(frames, found)
@@ -124,9 +127,15 @@ class DetectorProcesses:
                 with self._one_at_a_time:
                     read, begun = begun, None
                     found = [] if read is None else self._ended(read)
-                    begun = None if frames is None else self._begun(frames, ahead=True)
+                    wrong: Exception | None = None
+                    try:
+                        begun = None if frames is None else self._begun(frames, ahead=True)
+                    except ValueError as error:
+                        wrong = error
                 if read is not None:
                     yield read.frames, found
+                if wrong is not None:
+                    raise wrong
         finally:
             if begun is not None:  # nobody asks for the rest
                 with self._one_at_a_time, contextlib.suppress(ValueError, RuntimeError):
@@ -155,7 +164,7 @@ class DetectorProcesses:
         reading = _Reading(frames, self._workers, self._memory)
         self._is_ahead = ahead
         try:
-            reading.begin()
+            reading.begin(all_of_them=ahead)
         except BaseException:
             self.close()
             raise
@@ -190,12 +199,14 @@ class _Reading:
         self._busy: dict[Any, tuple[_Worker, int, _Handed]] = {}
         self._answers: dict[int, Detections | Exception] = {}
 
-    def begin(self) -> None:
-        """Give each idle process a frame."""
+    def begin(self, *, all_of_them: bool = False) -> None:
+        """Give each idle process a frame; put all others into memory, if asked to."""
         while self._idle and (self._placed or self._place_next()):
             worker, (index, handed) = self._idle.pop(), self._placed.popleft()
             worker.hand_over(handed)
             self._busy[worker.pipe] = (worker, index, handed)
+        while all_of_them and self._place_next():
+            pass
 
     def answers(self) -> list[Detections | Exception]:
         """Give each process the next frame when it answers; that is in memory by then."""

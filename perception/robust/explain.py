@@ -121,7 +121,7 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         edged |= _several_before_edges(found, at_rest, chosen, edged, parted, prepared.shape, camera)
     _adopt(likelier_before_edges(edged, chosen, parted), chosen, parted, uneven_e)
     if prepared.frame.line_time_s == 0.0:
-        highlit = _beside_highlights(found, at_rest, chosen, parted, camera)
+        highlit = _beside_highlights(found, at_rest, chosen, parted, prepared.shape, camera)
         _adopt(likelier_beside_highlights(highlit, chosen, parted), chosen, parted, uneven_e)
     retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
@@ -292,6 +292,7 @@ def _beside_highlights(
     plain: Sequence[Solution | None],
     chosen: Sequence[Solution | None],
     parted: Mapping[int, Solution],
+    shape: tuple[int, int],
     camera: Camera,
 ) -> dict[int, Solution]:
     """Explain by lone flares beside highlights what nothing else explains, or only several flares do."""
@@ -302,12 +303,12 @@ def _beside_highlights(
         if (held := parted.get(index, chosen[index])) is not one
         or surely_leaves_something(one)
         or one.count > 1
-        if seems_highlit(held)
+        if seems_highlit(one, held)
     }
     highlit = with_highlights(brightest_alone(tried, found, camera), camera)
     of_all = [highlit.get(index) for index in range(len(found))]
     fit_beside_forward_light(of_all, camera)
-    return {index: one for index, one in enumerate(of_all) if one is not None}
+    return {index: one for index, one in enumerate(of_all) if one is not None and _explains_all(one, shape)}
 
 
 def _adopt(

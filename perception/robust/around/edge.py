@@ -137,11 +137,6 @@ def likeliest_edge_of(one: Solution) -> Edge | None:
     return None if height_e == 0.0 else Edge(height_e, offset_px, angle_rad, width_px, width_px)
 
 
-def _sharp_px(one: Solution) -> float:
-    """Return the width of a sharp edge: point spread and pixel."""
-    return math.hypot(one.psf_sigma_px, math.sqrt(1.0 / 12.0))
-
-
 @compiled
 def _likeliest_edge(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array,

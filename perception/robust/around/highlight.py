@@ -27,7 +27,7 @@ from perception.robust.around.turns import (
     sharp_px,
 )
 from perception.robust.goodness import MODEL_ERROR
-from perception.robust.overlap.deblend import LEAST_GAIN, gain
+from perception.robust.overlap.deblend import LEAST_GAIN, gain, of_free_width
 from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem, Window
 from perception.robust.solve import Solution, solve
@@ -38,10 +38,10 @@ MOST_HIGHLIGHTS = 2
 """So many one window has at most: in walls that meet; and a halo looks like one in the flare's place."""
 
 _LEAST_WIDTHS = 2.0  # of what is sharp: a point's image is half as wide
-_LAGUERRE_AT, _LAGUERRE_WEIGHT = np.polynomial.laguerre.laggauss(10)
+_LAGUERRE_AT, _LAGUERRE_WEIGHT = np.polynomial.laguerre.laggauss(8)
 _LAGUERRE_SHARE = _LAGUERRE_WEIGHT * _LAGUERRE_AT
 _WIDER = (1.0, 2.0, 4.0)  # first guesses
-_REACH_PX = 12.0  # from the flare, of first guesses
+_REACH_PX = 12.0  # from a flare, beyond its disc, of first guesses
 _STEPS = 2.0  # a width
 _LEAST_AROUND = (
     20.0  # of 2 Δ ln L where the flare does not reach: within it, what is not as taken looks like one
@@ -93,8 +93,8 @@ def with_highlights(flares: Mapping[int, Solution], camera: Camera) -> dict[int,
 
     Returns
     -------
-    By index those that gain more by it than noise or a wrong point spread could give; several flares where
-    these explain nearly as much: what may be a robot is one.
+    By index those that gain more by it than noise or a wrong point spread could give; with flares in the
+    place of highlights where these explain nearly as much: what may be a robot is one.
     """
     found: dict[int, Solution] = {}
     known: dict[int, list[Highlight]] = {index: [] for index in flares}
@@ -111,14 +111,49 @@ def with_highlights(flares: Mapping[int, Solution], camera: Camera) -> dict[int,
             before = found.get(index, flares[index])
             if gain(before, one) < LEAST_GAIN or gain_around(before, one) < _LEAST_AROUND:
                 continue
+            if min(spot.height_e for spot in highlights) <= 0.0:
+                continue
             found[index], known[index] = one, highlights
             if leaves_something(one):
                 going[index] = one
-    problems = [_as_flares(one, flares[index].window, known[index]) for index, one in found.items()]
-    for index, several in zip(list(found), solve(problems, camera), strict=True):
-        if several is not None and gain(several, found[index]) < LEAST_GAIN:
-            found[index] = several
-    return found
+    wider = of_free_width([flares[index] for index in found], camera)
+    for index, other in zip(list(found), wider, strict=True):
+        if other is not None and gain(other, found[index]) < LEAST_GAIN:
+            del found[index], known[index]
+    return found | _with_flares({index: (one, known[index]) for index, one in found.items()}, flares, camera)
+
+
+def _with_flares(
+    highlit: Mapping[int, tuple[Solution, list[Highlight]]], flares: Mapping[int, Solution], camera: Camera
+) -> dict[int, Solution]:
+    """Return by index flares that explain nearly as much in the place of all highlights, or of one of two."""
+    tried: list[tuple[int, list[Highlight], Solution]] = []
+    problems = []
+    for index, (one, highlights) in highlit.items():
+        for left in ([], *([spot] for spot in highlights if len(highlights) > 1)):
+            taken = [spot for spot in highlights if spot not in left]
+            tried.append((index, left, one))
+            problems.append(_as_flares(one, flares[index].window, taken))
+    fits = list(zip(tried, solve(problems, camera), strict=True))
+    beside = {k: (left, fit) for k, ((_, left, _), fit) in enumerate(fits) if left and fit is not None}
+    of_both = fit_in_turns(
+        {k: left for k, (left, _) in beside.items()},
+        {k: fit for k, (_, fit) in beside.items()},
+        {k: fit for k, (_, fit) in beside.items()},
+        camera,
+    )
+    likeliest: dict[int, Solution] = {}
+    for k, ((index, left, one), alone) in enumerate(fits):
+        fit = alone
+        if left:
+            fit, spots = of_both.get(k, (None, []))
+            if any(spot.height_e <= 0.0 for spot in spots):
+                continue
+        if fit is None or gain(fit, one) >= LEAST_GAIN:
+            continue
+        if index not in likeliest or fit.cost < likeliest[index].cost:
+            likeliest[index] = fit
+    return {index: weighed(several, highlit[index][0]) for index, several in likeliest.items()}
 
 
 def _as_flares(one: Solution, plain: Window, highlights: Sequence[Highlight]) -> Problem:
@@ -126,27 +161,28 @@ def _as_flares(one: Solution, plain: Window, highlights: Sequence[Highlight]) ->
     (x_px, y_px), (u_px, v_px, log_range) = places_px(one), one.starts[0]
     starts = [(u_px, v_px, log_range)]
     for spot in highlights:
-        flux_e = max(spot.height_e * math.pi * spot.width_px**2, 1.0)
+        flux_e = spot.height_e * math.pi * spot.width_px**2
         place = u_px + spot.first - float(x_px[0]), v_px + spot.second - float(y_px[0])
         starts.append((*place, log_range + 0.5 * math.log(float(one.flux_e[0]) / flux_e)))
     return Problem(plain, starts, one.background_e)
 
 
-def seems_highlit(held: Solution | None) -> bool:
-    """Tell whether what explains a window so far looks as if there were a highlight in it.
+def seems_highlit(one: Solution, held: Solution | None) -> bool:
+    """Tell whether a window looks as if there were a highlight in it, by what explains it so far.
 
-    Several flares that add up to one; a second flare that is wider than a point; light that is left over.
+    Several flares that add up to one; a second flare that is wider than a point; light that is left over. If
+    nothing explains it, by what the lone flare leaves.
     """
-    if held is None or held.count > 2:
+    if held is None or held.count == 1:
+        return likeliest_highlight_of(held or one)[0] > _SEEMS_LIT
+    if held.count > 2:
         return True
-    if held.count == 2:
-        return _gain_if_wider(held, int(np.argmin(held.flux_e))) > _SEEMS_WIDE
-    return likeliest_highlight_of(held)[0] > _SEEMS_LIT
+    return _gain_if_wider(held, int(np.argmin(held.flux_e))) > _SEEMS_WIDE
 
 
 def _gain_if_wider(one: Solution, index: int) -> float:
     """Return what a wider image of a faint flare would bring, in 2 Δ ln L, beside errors of all others."""
-    window, width_px = one.window, sharp_px(one)
+    window, width_px = one.window, math.hypot(sharp_px(one), 0.5 * float(one.image_radius_px[index]))
     seen = window.state == SEEN
     weight = 1.0 / np.sqrt(one.variance_e2(MODEL_ERROR)[seen])
     x_px, y_px = offsets_px(window.image_e.shape)
@@ -170,14 +206,13 @@ def likelier_beside_highlights(
     likelier = {}
     for index, one in highlit.items():
         held = parted.get(index, chosen[index])
-        if not one.left_over.is_nothing or (held is not None and one.cost >= held.cost):
+        if held is not None and one.cost >= held.cost:
             continue
-        if one.window.features is None:
-            if held is None or held.count <= one.count:
-                continue
-        elif held is not None and held.count == one.count + 1 and gain(held, one) < LEAST_GAIN:
+        if one.count > 1 and (held is None or held.count <= one.count):
             continue
-        likelier[index] = one if held is None or held.count != one.count else weighed(one, held)
+        if one.count == 1 and held is not None and held.count == 2 and gain(held, one) < LEAST_GAIN:
+            continue
+        likelier[index] = one if held is None else weighed(one, held)
     return likelier
 
 
@@ -188,9 +223,10 @@ def likeliest_highlight_of(one: Solution) -> tuple[float, Highlight | None]:
     """
     window, least_px = one.window, _LEAST_WIDTHS * sharp_px(one)
     x_px, y_px = places_px(one)
+    reach_px = _REACH_PX + float(one.image_radius_px[0])
     brings, height_e, first, second, width_px = _likeliest_highlight(
         window.image_e, window.state, one.expected_e, one.flares_e, window.floor_e2, window.prnu,
-        (float(x_px[0]), float(y_px[0])), least_px * np.array(_WIDER),
+        (float(x_px[0]), float(y_px[0])), reach_px, least_px * np.array(_WIDER),
     )  # fmt: skip
     return brings, Highlight(height_e, first, second, width_px, least_px) if brings > 0.0 else None
 
@@ -198,17 +234,17 @@ def likeliest_highlight_of(one: Solution) -> tuple[float, Highlight | None]:
 @compiled
 def _likeliest_highlight(
     image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float,
-    prnu: float, middle: tuple[float, float], widths_px: Array,
+    prnu: float, middle: tuple[float, float], reach_px: float, widths_px: Array,
 ) -> tuple[float, float, float, float, float]:  # fmt: skip
     """Return what the highlight brings that brings most, its height, x, y and width.
 
-    Beside flares that may all be off; of places within `_REACH_PX` of `middle`.
+    Beside flares that may all be off; of places within `reach_px` of `middle`.
     """
     parts, weights, at = free_of_flares(image_e, state, expected_e, flares_e, floor_e2, prnu)
     most, height_e, x_px, y_px, wide_px = 0.0, 0.0, 0.0, 0.0, 0.0
     shares = np.empty(6)
     for width_px in widths_px:
-        steps = int(_STEPS * _REACH_PX / width_px)
+        steps = int(_STEPS * reach_px / width_px)
         for down in range(-steps, steps + 1):
             for right in range(-steps, steps + 1):
                 x, y = middle[0] + right * width_px / _STEPS, middle[1] + down * width_px / _STEPS
