@@ -166,7 +166,7 @@ def test_fainter_flares_are_no_highlights(frames: int) -> None:
 def test_robots_beside_highlights_are_told(frames: int) -> None:
     """A second robot 4 to 11 px from a source that has a highlight, 1 : 1 to 1 : 20: no highlight itself.
 
-    Told as a second highlight one in five was lost.
+    Where a highlight takes the place of a robot beside another highlight, 11 of 200 are lost.
     """
     lost = 0
     for frame in range(frames):
