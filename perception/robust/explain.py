@@ -73,11 +73,8 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     fit_beside_forward_light(chosen, camera)
     lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
     on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}
-    found_edges = with_edges(lone, on_structure, camera)
-    beside_edges = [found_edges.get(index) for index in range(len(found))]
     # What light fog throws forward goes by a flux that an edge no longer leads astray.
-    fit_beside_forward_light(beside_edges, camera)
-    edged = {index: one for index, one in enumerate(beside_edges) if one is not None}
+    edged = _beside_forward_light(with_edges(lone, on_structure, camera), camera)
     at_rest = list(chosen)
     certain = {index: one for index, one in edged.items() if is_beyond_doubt(one, lone[index])}
     for index in certain:
@@ -276,14 +273,10 @@ def _several_before_edges(
         if all(each is None or leaves_something(each) for each in so_far):
             tried[index] = one
     several = with_flares_and_edges(brightest_alone(tried, found, camera), camera)
-    of_all = [several.get(index) for index in range(len(found))]
-    fit_beside_forward_light(of_all, camera)
     return {
         index: one
-        for index, one in enumerate(of_all)
-        if one is not None
-        and _explains_all(one, shape)
-        and (index not in edged or one.cost < edged[index].cost)
+        for index, one in _beside_forward_light(several, camera).items()
+        if _explains_all(one, shape) and (index not in edged or one.cost < edged[index].cost)
     }
 
 
@@ -306,9 +299,15 @@ def _beside_highlights(
         if seems_highlit(one, held)
     }
     highlit = with_highlights(brightest_alone(tried, found, camera), camera)
-    of_all = [highlit.get(index) for index in range(len(found))]
-    fit_beside_forward_light(of_all, camera)
-    return {index: one for index, one in enumerate(of_all) if one is not None and _explains_all(one, shape)}
+    fits = _beside_forward_light(highlit, camera)
+    return {index: one for index, one in fits.items() if _explains_all(one, shape)}
+
+
+def _beside_forward_light(fits: Mapping[int, Solution], camera: Camera) -> dict[int, Solution]:
+    """Fit windows again beside what light fog throws forward of these flares; the others as they are."""
+    some: list[Solution | None] = list(fits.values())
+    fit_beside_forward_light(some, camera)
+    return {index: one for index, one in zip(fits, some, strict=True) if one is not None}
 
 
 def _adopt(

@@ -142,24 +142,27 @@ def fit_in_turns(
     return best
 
 
-def _columns(feature: Feature, one: Solution, seen: Array, camera: Camera) -> Array:
-    """Return a feature's profile of height 1 and its derivatives, as seen beside flares, (4, *shape)."""
+def _columns(feature: Feature, one: Solution, covered: Array, camera: Camera) -> Array:
+    """Return a feature's profile of height 1 and its derivatives, as seen beside flares, (4, *shape).
+
+    `covered` is what part of each pixel their discs cover.
+    """
     columns, hidden = feature.slopes(*offsets_px(one.window.image_e.shape)), 1.0
     if feature.IS_GROUND:
         columns[0] -= feature.slopes(*places_px(one))[0].mean()
         hidden = camera.calibration.hidden_background
-    return np.asarray(columns * (1.0 - hidden * (1.0 - seen)))
+    return np.asarray(columns * (1.0 - hidden * covered))
 
 
-def _seen_behind(one: Solution, camera: Camera) -> Array:
-    """Return what part of each pixel no flare's disc covers.
+def _covered(one: Solution, camera: Camera) -> Array:
+    """Return what part of each pixel the flares' discs cover.
 
     A disc is as bright all over, so that its image tells how much of a pixel it covers. Of several the one
     that seems brightest counts for all.
     """
     at_1_m_px = covered_px_at_1_m(np.column_stack([one.u_px, one.v_px]), camera.calibration)
     of_disc_e = one.flux_e / np.maximum(at_1_m_px * np.exp(-2.0 * one.log_range), 1e-9)
-    return np.asarray(1.0 - np.clip(one.flares_e / float(of_disc_e.max()), 0.0, 1.0))
+    return np.clip(one.flares_e / float(of_disc_e.max()), 0.0, 1.0)
 
 
 def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera) -> list[Kind]:
@@ -171,7 +174,7 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
     shape = window.image_e.shape
     weight = 1.0 / np.sqrt(one.variance_e2(0.0)[usable])
     known_e = 0.0 if window.known_e is None else window.known_e
-    left, seen = (window.image_e - one.flares_e - known_e)[usable] * weight, _seen_behind(one, camera)
+    left, covered = (window.image_e - one.flares_e - known_e)[usable] * weight, _covered(one, camera)
     now = np.array([feature.unknowns for feature in features])
     prior = np.array([feature.PRIOR[3] for feature in features])
     most_steps = np.array([feature.MOST_STEPS for feature in features])
@@ -183,7 +186,7 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
     def fitted(values: Array) -> tuple[list[Kind], float, Array]:
         """Return features, how badly they fit, and the slopes of what is left by their unknowns."""
         there = [f.moved_to(*row) for f, row in zip(features, values.tolist(), strict=True)]
-        profiles = [_columns(feature, one, seen, camera)[:, usable] * weight for feature in there]
+        profiles = [_columns(feature, one, covered, camera)[:, usable] * weight for feature in there]
         linear = np.stack([weight, *(profile[0] for profile in profiles)], axis=1)
         heights, *_ = np.linalg.lstsq(linear, left, rcond=None)
         after = left - linear @ heights
@@ -218,8 +221,8 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
 
 def _structure(features: Sequence[Feature], one: Solution, camera: Camera) -> Structure:
     """Return what features may add to a window: their heights, and what else is not known of them."""
-    seen = _seen_behind(one, camera)
-    columns = np.concatenate([_columns(feature, one, seen, camera).reshape(4, -1) for feature in features])
+    covered = _covered(one, camera)
+    columns = np.concatenate([_columns(feature, one, covered, camera).reshape(4, -1) for feature in features])
     sigma = np.concatenate(
         [np.multiply(feature.PRIOR, max(abs(feature.height_e), _LEAST_HEIGHT_E)) for feature in features]
     )
