@@ -79,7 +79,7 @@ from perception.files.tracks import (
 from perception.model.fisher import FlareLimit, flare_limit, flare_limits
 from perception.paper import PaperRegression, regress_paper_range_constant
 from perception.pipeline import Heard, Pipeline
-from perception.processes import DetectorProcesses
+from perception.processes.detectors import DetectorProcesses
 from perception.rig.frame_sets import frame_sets
 from perception.rig.measure_set import detect_set, measure_set
 from perception.track.tracker import Tracker

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import perception
-from perception import Calibration, DetectorProcesses, Pipeline, RawFrame, processes
+from perception import Calibration, DetectorProcesses, Pipeline, RawFrame
+from perception.processes import line
+from perception.processes.memory import Memory, taken
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 NAMES = ("r1.front", "r1.back", "r1.left")
@@ -69,6 +71,7 @@ def test_sets_are_read_ahead() -> None:
             assert frames is sets[number]
             assert _told(found) == _told(alone[number])
             assert handed_over == list(range(min(number + 2, len(sets))))
+            assert len(detectors._memory._all) <= 6  # of two sets
         assert list(detectors.detect_sets([])) == []
         reading = detectors.detect_sets(sets)
         next(reading)
@@ -137,7 +140,7 @@ def test_an_answer_that_nobody_waited_for_is_no_other_frames(monkeypatch: pytest
         def interrupted(_: object, timeout: float | None) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(processes, "connection", SimpleNamespace(wait=interrupted))
+        monkeypatch.setattr(line, "connection", SimpleNamespace(wait=interrupted))
         with pytest.raises(KeyboardInterrupt):
             detectors.detect_frames(_frames(0))
         monkeypatch.undo()
@@ -176,14 +179,13 @@ def test_larger_frames_take_the_place_of_smaller_ones() -> None:
 
 def test_a_process_forgets_memory_that_is_gone() -> None:
     frame, held = _frames(1)[1], dict[str, SharedMemory]()
-    memory = processes._Memory()
+    memory = Memory()
     try:
         small = replace(frame, data_dn=frame.data_dn[:9].copy())
         for each in (small, small, frame):
             handed = memory.place(each)
-            taken = processes._taken(handed, held)
-            assert np.array_equal(taken.data_dn, each.data_dn)
-            del taken
+            assert handed is not None
+            assert np.array_equal(taken(handed, held).data_dn, each.data_dn)
             memory.give_back(handed)
         assert held.keys() == memory._all.keys()
         assert len(held) == 1

@@ -1,0 +1,96 @@
+"""Frames in line for processes: which frame goes to which process, and when."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing import connection
+
+from perception.processes.memory import Handed, Memory
+from perception.processes.worker import Answer, Worker
+from perception.types import RawFrame
+
+
+class Reading:
+    """A set of frames, and what was found in each that is done."""
+
+    def __init__(self, frames: Sequence[RawFrame]) -> None:
+        self.frames = frames
+        self.answers: dict[int, Answer] = {}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A frame of a set, as it is handed to a process."""
+
+    reading: Reading
+    index: int
+    handed: Handed
+
+
+class Line:
+    """Frames on their way through the processes."""
+
+    def __init__(self, workers: list[Worker], memory: Memory, detected: Callable[[RawFrame], Answer]) -> None:
+        self._memory, self._detected = memory, detected
+        self._at_work: list[tuple[Worker, deque[Task]]] = [(worker, deque()) for worker in workers]
+        self._waiting: deque[tuple[Reading, int]] = deque()
+        self._placed: deque[Task] = deque()
+        self._most_each = 1
+        self._flares: dict[str, int] = {}
+
+    def append(self, reading: Reading, most_each: int) -> None:
+        """Let a set wait behind others; no process is to have more than so many frames at once.
+
+        One, where the caller is there to give it the next: so no frame waits for a process that is slow.
+        Frames of cameras in which most flares were found last come first: what takes long should not be what
+        all others wait for.
+        """
+        cameras = [frame.camera for frame in reading.frames]
+        first = sorted(range(len(cameras)), key=lambda index: -self._flares.get(cameras[index], 0))
+        self._waiting.extend((reading, index) for index in first)
+        self._most_each = most_each
+
+    def place_all(self) -> None:
+        """Put all that wait into memory, and into the hands of processes as many as these may have."""
+        self._hand_over()
+        while self._place_next():
+            self._hand_over()
+
+    def finish(self, reading: Reading) -> None:
+        """Give processes the next frame when they answer, until all of a set is done."""
+        while len(reading.answers) < len(reading.frames):
+            self._hand_over()
+            # One at a time, as long as nobody waits.
+            goes_on = len(self._placed) < len(self._at_work) and self._place_next()
+            busy = {worker.pipe: (worker, tasks) for worker, tasks in self._at_work if tasks}
+            if not busy:
+                continue
+            for ready in connection.wait(list(busy), timeout=0.0 if goes_on else None):
+                worker, tasks = next(each for pipe, each in busy.items() if pipe is ready)
+                self._done(tasks.popleft(), worker.answer("has ended, and the others with it: make others"))
+
+    def _done(self, task: Task, answer: Answer) -> None:
+        task.reading.answers[task.index] = answer
+        if not isinstance(answer, Exception):
+            self._flares[task.handed[0].camera] = len(answer)
+        self._memory.give_back(task.handed)
+
+    def _hand_over(self) -> None:
+        """Give frames to whichever process has the fewest."""
+        while self._placed or self._place_next():
+            worker, tasks = min(self._at_work, key=lambda each: len(each[1]))
+            if len(tasks) >= self._most_each:
+                return
+            tasks.append(self._placed.popleft())
+            worker.hand_over(tasks[-1].handed)
+
+    def _place_next(self) -> bool:
+        """Put the next frame where processes find it; tell whether there was one."""
+        while self._waiting:
+            reading, index = self._waiting.popleft()
+            handed = self._memory.place(reading.frames[index])
+            if handed is not None:
+                self._placed.append(Task(reading, index, handed))
+                return True
+            reading.answers[index] = self._detected(reading.frames[index])
+        return False
