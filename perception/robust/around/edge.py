@@ -47,7 +47,7 @@ class Edge(Feature):
         return 0.5 * math.hypot(*shape), math.inf
 
     def slopes(self, x_px: Array, y_px: Array) -> Array:
-        """Return its profile of height 1, and derivatives by `first`, `second` and ln width, (4, *places)."""
+        """Return its profile of height 1, and derivatives by `first`, `second` and ln width, (4, places)."""
         from scipy.special import ndtr
 
         cosine, sine = math.cos(self.second), math.sin(self.second)

@@ -71,7 +71,7 @@ class Feature(ABC):
 
     @abstractmethod
     def slopes(self, x_px: Array, y_px: Array) -> Array:
-        """Return its profile of height 1, and derivatives by `first`, `second` and ln width, (4, *places)."""
+        """Return its profile of height 1, and derivatives by `first`, `second` and ln width, (4, places)."""
 
     @property
     def unknowns(self) -> tuple[float, float, float]:
@@ -142,12 +142,14 @@ def fit_in_turns(
     return best
 
 
-def _columns(feature: Feature, one: Solution, covered: Array, camera: Camera) -> Array:
-    """Return a feature's profile of height 1 and its derivatives, as seen beside flares, (4, *shape).
+def _columns(
+    feature: Feature, x_px: Array, y_px: Array, covered: Array, one: Solution, camera: Camera
+) -> Array:
+    """Return a feature's profile of height 1 and its derivatives, as seen beside flares, (4, pixels).
 
     `covered` is what part of each pixel their discs cover.
     """
-    columns, hidden = feature.slopes(*offsets_px(one.window.image_e.shape)), 1.0
+    columns, hidden = feature.slopes(x_px, y_px), 1.0
     if feature.IS_GROUND:
         columns[0] -= feature.slopes(*places_px(one))[0].mean()
         hidden = camera.calibration.hidden_background
@@ -174,7 +176,8 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
     shape = window.image_e.shape
     weight = 1.0 / np.sqrt(one.variance_e2(0.0)[usable])
     known_e = 0.0 if window.known_e is None else window.known_e
-    left, covered = (window.image_e - one.flares_e - known_e)[usable] * weight, _covered(one, camera)
+    left, covered = (window.image_e - one.flares_e - known_e)[usable] * weight, _covered(one, camera)[usable]
+    x_px, y_px = (each[usable] for each in offsets_px(shape))
     now = np.array([feature.unknowns for feature in features])
     prior = np.array([feature.PRIOR[3] for feature in features])
     most_steps = np.array([feature.MOST_STEPS for feature in features])
@@ -186,12 +189,12 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
     def fitted(values: Array) -> tuple[list[Kind], float, Array]:
         """Return features, how badly they fit, and the slopes of what is left by their unknowns."""
         there = [f.moved_to(*row) for f, row in zip(features, values.tolist(), strict=True)]
-        profiles = [_columns(feature, one, covered, camera)[:, usable] * weight for feature in there]
-        linear = np.stack([weight, *(profile[0] for profile in profiles)], axis=1)
-        heights, *_ = np.linalg.lstsq(linear, left, rcond=None)
-        after = left - linear @ heights
+        profiles = [_columns(feature, x_px, y_px, covered, one, camera) * weight for feature in there]
+        linear = np.stack([weight, *(profile[0] for profile in profiles)])
+        heights = np.linalg.lstsq(linear @ linear.T, linear @ left, rcond=None)[0]
+        after = left - heights @ linear
         slopes = [heights[1 + k] * profile[1:] for k, profile in enumerate(profiles)]
-        whole = np.concatenate([linear.T, *slopes])
+        whole = np.concatenate([linear, *slopes])
         high = [replace(f, height_e=float(height)) for f, height in zip(there, heights[1:], strict=True)]
         return high, float(after @ after + ((values[:, 2] / prior) ** 2).sum()), np.vstack([whole, after])
 
@@ -221,8 +224,9 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
 
 def _structure(features: Sequence[Feature], one: Solution, camera: Camera) -> Structure:
     """Return what features may add to a window: their heights, and what else is not known of them."""
-    covered = _covered(one, camera)
-    columns = np.concatenate([_columns(feature, one, covered, camera).reshape(4, -1) for feature in features])
+    x_px, y_px = (each.ravel() for each in offsets_px(one.window.image_e.shape))
+    covered = _covered(one, camera).ravel()
+    columns = np.concatenate([_columns(each, x_px, y_px, covered, one, camera) for each in features])
     sigma = np.concatenate(
         [np.multiply(feature.PRIOR, max(abs(feature.height_e), _LEAST_HEIGHT_E)) for feature in features]
     )

@@ -119,10 +119,10 @@ def test_a_spot_is_what_pixels_see_of_it(width_px: float) -> None:
     x, y = np.meshgrid(grid, grid)
     sharp = (1.0 + ((x - 1.3) ** 2 + (y + 0.7) ** 2) / width_px**2) ** -2
     seen = gaussian_filter(sharp, 0.7 * 16, mode="nearest").reshape(25, 16, 25, 16).mean(axis=(1, 3))
-    offsets = offsets_px((25, 25))
+    offsets = [each.ravel() for each in offsets_px((25, 25))]
     profile, *slopes = spot.slopes(*offsets)
     inner = np.s_[4:-4, 4:-4]
-    np.testing.assert_allclose(profile[inner], seen[inner], atol=0.005)
+    np.testing.assert_allclose(profile.reshape(25, 25)[inner], seen[inner], atol=0.005)
     for k, slope in enumerate(slopes):
         step = 1e-4 * np.eye(3)[k]
         to = (
