@@ -4,10 +4,11 @@ import contextlib
 import math
 import os
 import threading
+import time
 import weakref
+from collections import deque
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import chain
 from types import TracebackType
 
 from perception.estimators import ESTIMATORS, require_calibrations
@@ -15,6 +16,8 @@ from perception.processes.line import Line, Reading
 from perception.processes.memory import Memory
 from perception.processes.worker import Worker, detected_in
 from perception.types import Calibration, Detections, RawFrame
+
+_ENDS_WITHIN_S = 2.0
 
 
 class DetectorProcesses:
@@ -25,6 +28,7 @@ class DetectorProcesses:
 
     They load the package anew: where a script makes it, that must stand below ``if __name__ == "__main__":``.
     It is made once they are ready: a second or two, minutes where the package's loops were never compiled.
+    Ctrl-C while they are at work ends them: make others.
     Shared memory (`/dev/shm`) must have room for two frames for each process, and for two whole sets where
     sets are read ahead.
 
@@ -58,25 +62,26 @@ class DetectorProcesses:
         if estimator not in ESTIMATORS:
             raise ValueError(f"estimator {estimator!r} is not known here; {' and '.join(ESTIMATORS)} are")
         if count is None:
-            count = max(1, min(os.cpu_count() or 1, len(calibrations)))
+            count = max(1, min(_cores(), len(calibrations)))
         if count < 1:
             raise ValueError(f"{count} processes detect nothing: give 1 or more")
         self._calibrations = dict(calibrations)
         self._one_at_a_time = threading.RLock()
         self._workers: list[Worker] = []
         self._memory = Memory()
-        detected = partial(detected_in, calibrations=self._calibrations, estimator=estimator, limit_s=limit_s)
         self._last: Reading | None = None  # of several sets, the one that was begun last
-        weakref.finalize(self, _end, self._workers, self._memory)  # where nobody closes it
+        detected = partial(detected_in, calibrations=self._calibrations, estimator=estimator, limit_s=limit_s)
+        weakref.finalize(self, _end, self._workers, self._memory, os.getpid())  # where nobody closes it
         try:
-            for _ in range(count):
-                self._workers.append(Worker(detected))
+            self._workers += [Worker() for _ in range(count)]
+            for worker in self._workers:
+                worker.send(detected)
             for worker in self._workers:
                 worker.answer(
                     'does not start; in a script it must be made below `if __name__ == "__main__":`'
                 )
         except BaseException:
-            self.close()
+            _end(self._workers, self._memory, os.getpid())
             raise
         self._line = Line(self._workers, self._memory, detected)
 
@@ -88,11 +93,13 @@ class DetectorProcesses:
         ValueError
             As for `detect`, or if a frame's camera has no calibration.
         RuntimeError
-            A process has ended, which ends the others too, or they were ended before.
+            A process has ended, which ends the others too, or they were ended before; or they are at work
+            with the next of several sets.
         """
         with self._one_at_a_time:
-            reading = self._begun(frames)
-            self._line.append(reading, most_each=1)
+            reading = self._admitted(frames, after=None)
+            with self._closed_by_faults():
+                self._line.append(reading, most_each=1)
             return self._ended(reading)
 
     def detect_sets(
@@ -101,9 +108,11 @@ class DetectorProcesses:
         """Yield sets of frames and the flares of each, as `detect_frames` finds them.
 
         The processes are at work with the next set while the caller is with this one, which is told once the
-        next is at hand: for what was recorded, and for cameras that are faster than both together. The frames
-        of a set are copied before the next is asked for. What is wrong with one ends the iteration, once all
-        sets before it are told.
+        next is at hand: for what was recorded, and for cameras that are faster than both together. What is
+        wrong with one, or ends the sets, ends the iteration once all sets before it are told.
+
+        Flares are found in copies. The frames told are those that were given, by then not the latest: where
+        their pixels are looked at, as `Pipeline.follow` does, no camera may have written there again.
 
             for frames, found in detectors.detect_sets(sets):
                 heard = pipeline.follow(frames, found)
@@ -113,29 +122,35 @@ class DetectorProcesses:
         ValueError, RuntimeError
             As `detect_frames`; also if other frames are asked for before the last set was told.
         """
-        begun: Reading | None = None
+        under_way: deque[Reading] = deque()
+        remaining, wrong, goes_on = iter(sets), None, True
         try:
-            for frames in chain(sets, [None]):
-                with self._one_at_a_time:
-                    read, wrong = begun, None
-                    try:
-                        begun = None if frames is None else self._ahead(frames, after=read)
-                    except ValueError as error:
-                        begun, wrong = None, error
-                    found = [] if read is None else self._ended(read)
-                if read is not None:
-                    yield read.frames, found
-                if wrong is not None:
-                    raise wrong
-        finally:
-            if begun is not None:  # nobody asks for the rest
-                with self._one_at_a_time, contextlib.suppress(ValueError, RuntimeError):
-                    self._ended(begun)
+            while goes_on:
+                try:
+                    self._begin_ahead(next(remaining), under_way)
+                except StopIteration:
+                    goes_on = False
+                except Exception as error:  # told once the set before is, if that can be told
+                    if not self._workers:
+                        raise
+                    goes_on, wrong = False, error
+                if len(under_way) > 1 or (under_way and not goes_on):
+                    with self._one_at_a_time:
+                        found = self._ended(under_way[0])
+                    yield under_way.popleft().frames, found
+            if wrong is not None:
+                raise wrong
+        finally:  # nobody asks for the rest
+            for reading in under_way:
+                with self._one_at_a_time, contextlib.suppress(Exception):
+                    self._ended(reading)
 
     def close(self) -> None:
         """End the processes, and give their memory back."""
         with self._one_at_a_time:
-            _end(self._workers, self._memory)
+            self._last = None
+            self._line.clear()
+            _end(self._workers, self._memory, os.getpid())
 
     def __enter__(self) -> "DetectorProcesses":
         return self
@@ -145,22 +160,25 @@ class DetectorProcesses:
     ) -> None:
         self.close()
 
-    def _begun(self, frames: Sequence[RawFrame], after: Reading | None = None) -> Reading:
-        """Return a set that the processes may begin, behind another of the same iteration if there is one."""
-        require_calibrations(frames, self._calibrations)
+    def _admitted(self, frames: Sequence[RawFrame], after: Reading | None) -> Reading:
+        """Return a set that may be begun; of one iteration two are under way, else one at a time."""
+        reading = Reading(frames)
+        require_calibrations(reading.frames, self._calibrations)
         if not self._workers:
             raise RuntimeError("the detector's processes were ended: make others")
         if self._last is not after:
             raise RuntimeError("the detector's processes are at work with the next of several sets")
-        return Reading(frames)
+        return reading
 
-    def _ahead(self, frames: Sequence[RawFrame], after: Reading | None) -> Reading:
+    def _begin_ahead(self, frames: Sequence[RawFrame], under_way: deque[Reading]) -> None:
         """Put a set into memory, and the processes to work with it once they are done with the one before."""
-        self._last = self._begun(frames, after)
-        with self._closed_by_faults():
-            self._line.append(self._last, most_each=2)
-            self._line.place_all()
-        return self._last
+        with self._one_at_a_time:
+            reading = self._admitted(frames, after=under_way[-1] if under_way else None)
+            with self._closed_by_faults():
+                under_way.append(reading)
+                self._last = reading
+                self._line.append(reading, most_each=2)
+                self._line.place_all()
 
     def _ended(self, reading: Reading) -> list[Detections]:
         """Return what they find in it; raise what one of them raised."""
@@ -168,8 +186,8 @@ class DetectorProcesses:
             raise RuntimeError("the detector's processes were ended: make others")
         with self._closed_by_faults():  # an answer that nobody waits for would be taken for the next frame's
             self._line.finish(reading)
-        if self._last is reading:
-            self._last = None
+            if self._last is reading:
+                self._last = None
         found = []
         for index in range(len(reading.frames)):
             answer = reading.answers[index]
@@ -187,7 +205,18 @@ class DetectorProcesses:
             raise
 
 
-def _end(workers: list[Worker], memory: Memory) -> None:
+def _end(workers: list[Worker], memory: Memory, process_id: int) -> None:
+    """End processes, and give memory back, unless another process has made them."""
+    if os.getpid() != process_id:
+        return
+    for worker in workers:
+        worker.pipe.close()  # it goes, once it is done with what it is at
+    until_s = time.monotonic() + _ENDS_WITHIN_S
     while workers:
-        workers.pop().end()
+        workers.pop().end(until_s)
     memory.close()
+
+
+def _cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,7 +1,7 @@
 """Frames in line for processes: which frame goes to which process, and when."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from multiprocessing import connection
 
@@ -11,10 +11,10 @@ from perception.types import RawFrame
 
 
 class Reading:
-    """A set of frames, and what was found in each that is done."""
+    """A set of frames under way, and what was found in each that is done."""
 
-    def __init__(self, frames: Sequence[RawFrame]) -> None:
-        self.frames = frames
+    def __init__(self, frames: Iterable[RawFrame]) -> None:
+        self.frames = tuple(frames)
         self.answers: dict[int, Answer] = {}
 
 
@@ -28,10 +28,15 @@ class Task:
 
 
 class Line:
-    """Frames on their way through the processes."""
+    """Frames on their way through the processes.
 
-    def __init__(self, workers: list[Worker], memory: Memory, detected: Callable[[RawFrame], Answer]) -> None:
-        self._memory, self._detected = memory, detected
+    `detected_here` looks at frames that cannot be put into memory: they are soon refused.
+    """
+
+    def __init__(
+        self, workers: list[Worker], memory: Memory, detected_here: Callable[[RawFrame], Answer]
+    ) -> None:
+        self._memory, self._detected_here = memory, detected_here
         self._at_work: list[tuple[Worker, deque[Task]]] = [(worker, deque()) for worker in workers]
         self._waiting: deque[tuple[Reading, int]] = deque()
         self._placed: deque[Task] = deque()
@@ -39,11 +44,11 @@ class Line:
         self._flares: dict[str, int] = {}
 
     def append(self, reading: Reading, most_each: int) -> None:
-        """Let a set wait behind others; no process is to have more than so many frames at once.
+        """Let a set wait behind others; from now on no process has more than so many frames at once.
 
-        One, where the caller is there to give it the next: so no frame waits for a process that is slow.
-        Frames of cameras in which most flares were found last come first: what takes long should not be what
-        all others wait for.
+        One where the caller waits and gives it the next, so that no frame waits for a process that is slow;
+        two where it goes away, so that a process that is done goes on. Frames of cameras in which most flares
+        were found last come first: what takes long should not be what all others wait for.
         """
         cameras = [frame.camera for frame in reading.frames]
         first = sorted(range(len(cameras)), key=lambda index: -self._flares.get(cameras[index], 0))
@@ -60,11 +65,11 @@ class Line:
         """Give processes the next frame when they answer, until all of a set is done."""
         while len(reading.answers) < len(reading.frames):
             self._hand_over()
+            if len(reading.answers) == len(reading.frames):
+                break
             # One at a time, as long as nobody waits.
             goes_on = len(self._placed) < len(self._at_work) and self._place_next()
             busy = {worker.pipe: (worker, tasks) for worker, tasks in self._at_work if tasks}
-            if not busy:
-                continue
             for ready in connection.wait(list(busy), timeout=0.0 if goes_on else None):
                 worker, tasks = next(each for pipe, each in busy.items() if pipe is ready)
                 self._done(tasks.popleft(), worker.answer("has ended, and the others with it: make others"))
@@ -73,7 +78,7 @@ class Line:
         task.reading.answers[task.index] = answer
         if not isinstance(answer, Exception):
             self._flares[task.handed[0].camera] = len(answer)
-        self._memory.give_back(task.handed)
+        self._memory.reuse(task.handed)
 
     def _hand_over(self) -> None:
         """Give frames to whichever process has the fewest."""
@@ -82,15 +87,26 @@ class Line:
             if len(tasks) >= self._most_each:
                 return
             tasks.append(self._placed.popleft())
-            worker.hand_over(tasks[-1].handed)
+            worker.send(tasks[-1].handed)
 
     def _place_next(self) -> bool:
         """Put the next frame where processes find it; tell whether there was one."""
         while self._waiting:
             reading, index = self._waiting.popleft()
-            handed = self._memory.place(reading.frames[index])
+            try:
+                handed = self._memory.place(reading.frames[index])
+            except OSError as error:  # no room: told where the frame's answer is waited for
+                reading.answers[index] = error
+                continue
             if handed is not None:
                 self._placed.append(Task(reading, index, handed))
                 return True
-            reading.answers[index] = self._detected(reading.frames[index])
+            reading.answers[index] = self._detected_here(reading.frames[index])
         return False
+
+    def clear(self) -> None:
+        """Forget all that is under way."""
+        self._waiting.clear()
+        self._placed.clear()
+        for _, tasks in self._at_work:
+            tasks.clear()

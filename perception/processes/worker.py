@@ -3,6 +3,7 @@
 import contextlib
 import gc
 import signal
+import time
 from collections.abc import Callable, Mapping
 from multiprocessing import connection, get_context
 from multiprocessing.shared_memory import SharedMemory
@@ -13,45 +14,42 @@ from perception.processes.memory import Handed, taken
 from perception.types import Calibration, Detections, RawFrame
 from perception.warm_up import warm_up_frames
 
-_ENDS_WITHIN_S = 2.0
+_STATUS_WITHIN_S = 2.0
 
 Answer = Detections | Exception
 """The flares of a frame, or what is wrong with it."""
 
 
 class Worker:
-    """A process, and the pipe to it."""
+    """A process, and the pipe to it: it is sent what detects, and then frames."""
 
-    def __init__(self, detected: Callable[[RawFrame], Answer]) -> None:
+    def __init__(self) -> None:
         context = get_context("spawn")
         self.pipe, its = context.Pipe()
-        self.process = context.Process(target=_serve, args=(its, detected), daemon=True)
+        self.process = context.Process(target=_serve, args=(its,), daemon=True)
         self.process.start()
         its.close()
 
-    def hand_over(self, handed: Handed) -> None:
-        """Give it a frame, which waits for those before it."""
+    def send(self, message: Callable[[RawFrame], Answer] | Handed) -> None:
+        """Give it a frame, which waits for those before it; or, first of all, what detects."""
         with contextlib.suppress(OSError):  # one that has ended is told where its answer is waited for
-            self.pipe.send(handed)
+            self.pipe.send(message)
 
     def answer(self, otherwise: str) -> Any:
         """Wait for its answer; raise RuntimeError where it ends without one."""
         try:
             return self.pipe.recv()
         except (EOFError, OSError):
-            self.process.join(_ENDS_WITHIN_S)
+            self.process.join(_STATUS_WITHIN_S)
             status = self.process.exitcode
             raise RuntimeError(f"a process of the detector (status {status}) {otherwise}") from None
 
-    def end(self) -> None:
-        """End it, within seconds."""
-        with contextlib.suppress(OSError):
-            self.pipe.send(None)
-        self.process.join(_ENDS_WITHIN_S)
+    def end(self, until_s: float) -> None:
+        """Wait until that time of the monotonic clock for its end, after its pipe was closed; then end it."""
+        self.process.join(max(until_s - time.monotonic(), 0.0))
         if self.process.is_alive():
             self.process.kill()
             self.process.join()
-        self.pipe.close()
 
 
 def detected_in(
@@ -66,14 +64,24 @@ def detected_in(
         return RuntimeError(f"{type(error).__name__}: {error}")
 
 
-def _serve(pipe: connection.Connection, detected: Callable[[RawFrame], Answer]) -> None:
+def _serve(pipe: connection.Connection) -> None:
     """Find flares in frames until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for who started it
-    warm_up_frames()
-    gc.collect()
-    gc.freeze()  # what is there by now stays, and need not be looked through again and again
+    held: dict[str, SharedMemory] = {}
     with contextlib.suppress(EOFError, OSError):  # nobody is there any more
+        detected: Callable[[RawFrame], Answer] = pipe.recv()
+        warm_up_frames()
+        gc.collect()
+        gc.freeze()  # what is there by now stays, and need not be looked through again and again
         pipe.send("ready")
-        held: dict[str, SharedMemory] = {}
-        while (handed := pipe.recv()) is not None:
-            pipe.send(detected(taken(handed, held)))
+        while True:
+            handed: Handed = pipe.recv()
+            pipe.send(_answer(handed, held, detected))
+
+
+def _answer(handed: Handed, held: dict[str, SharedMemory], detected: Callable[[RawFrame], Answer]) -> Answer:
+    try:
+        frame = taken(handed, held)
+    except Exception as error:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return detected(frame)

@@ -11,7 +11,7 @@ import pytest
 
 import perception
 from perception import Calibration, DetectorProcesses, Pipeline, RawFrame
-from perception.processes import line
+from perception.processes import line, memory
 from perception.processes.memory import Memory, taken
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
@@ -38,7 +38,7 @@ def test_processes_find_what_one_finds_and_leave_nothing() -> None:
     sets = [_frames(number) for number in range(3)]
     with DetectorProcesses(CAMERAS, count=2) as detectors:
         found = [detectors.detect_frames(frames) for frames in sets]
-        memory = list(detectors._memory._all)
+        pieces = list(detectors._memory._all)
         assert detectors.detect_frames([]) == []
         pipeline, alone = Pipeline(CAMERAS, detector=detectors.detect_frames), Pipeline(CAMERAS)
         for frames in sets:
@@ -47,8 +47,8 @@ def test_processes_find_what_one_finds_and_leave_nothing() -> None:
     for frames, several in zip(sets, found, strict=True):
         assert [len(one) for one in several] == [0, 2, 3]
         assert _told(several) == _told(perception.detect_frames(frames, CAMERAS))
-    assert len(memory) == 3  # of a set of three frames all are in memory at once
-    for name in memory:
+    assert len(pieces) == 3  # of a set of three frames all are in memory at once
+    for name in pieces:
         with pytest.raises(FileNotFoundError):
             SharedMemory(name)
     with pytest.raises(RuntimeError, match="were ended"):
@@ -68,7 +68,7 @@ def test_sets_are_read_ahead() -> None:
     with DetectorProcesses(CAMERAS, count=2) as detectors:
         alone = [detectors.detect_frames(frames) for frames in sets]
         for number, (frames, found) in enumerate(detectors.detect_sets(counted())):
-            assert frames is sets[number]
+            assert all(one is other for one, other in zip(frames, sets[number], strict=True))
             assert _told(found) == _told(alone[number])
             assert handed_over == list(range(min(number + 2, len(sets))))
             assert len(detectors._memory._all) <= 6  # of two sets
@@ -94,6 +94,17 @@ def test_sets_are_read_ahead() -> None:
 
         for number, (_, found) in enumerate(detectors.detect_sets(rewritten())):
             assert _told(found) == _told(alone[2 + number])
+        # Nor does a list that is filled anew with each set.
+        same: list[RawFrame] = []
+
+        def refilled() -> Iterator[list[RawFrame]]:
+            for frames in (sets[2], sets[3][:1]):
+                same[:] = frames
+                yield same
+
+        for number, (frames, found) in enumerate(detectors.detect_sets(refilled())):
+            assert [frame.index for frame in frames] == [number + 1] * len(found)
+            assert _told(found) == _told(alone[2 + number])[: len(found)]
         wrong = [replace(sets[0][0], data_dn=sets[0][0].data_dn[:5])]
         reading = detectors.detect_sets([sets[0], wrong, sets[0]])
         assert _told(next(reading)[1]) == _told(alone[0])
@@ -105,6 +116,45 @@ def test_sets_are_read_ahead() -> None:
         detectors.close()
         with pytest.raises(RuntimeError, match="were ended"):
             next(reading)
+
+
+def test_sets_before_a_fault_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the sets themselves end by a fault, or memory has no room; then others are read."""
+
+    def broken() -> Iterator[list[RawFrame]]:
+        yield _frames(0)
+        yield _frames(1)
+        raise OSError("the recording ends here")
+
+    with DetectorProcesses(CAMERAS, "paper", count=2) as detectors:
+        reading = detectors.detect_sets(broken())
+        assert [frames[0].index for frames, _ in (next(reading), next(reading))] == [0, 1]
+        with pytest.raises(OSError, match="ends here"):
+            next(reading)
+        larger = [replace(_frames(2)[0], data_dn=np.zeros((3000, 3000), dtype=np.uint16))]
+        with monkeypatch.context() as patched:
+            patched.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=17_999_999))
+            reading = detectors.detect_sets([_frames(0), larger])
+            next(reading)
+            if memory.SHARED.is_dir():
+                with pytest.raises(OSError, match=r"room for 17999999 bytes, a frame needs 18000000"):
+                    next(reading)
+        assert len(detectors.detect_frames(_frames(1))) == 3
+
+
+def test_a_frame_whose_memory_is_gone_is_told_as_that() -> None:
+    with DetectorProcesses(CAMERAS, "paper", count=1) as detectors:
+        place = detectors._memory.place
+
+        def gone(frame: RawFrame) -> memory.Handed | None:
+            handed = place(frame)
+            assert handed is not None
+            return handed[0], replace(handed[1], memory="perception_gone")
+
+        detectors._line._memory.place = gone  # type: ignore[method-assign]
+        with pytest.raises(RuntimeError, match="FileNotFoundError"):
+            detectors.detect_frames(_frames(0)[:1])
+        assert detectors._workers[0].process.is_alive()
 
 
 def test_what_is_wrong_with_a_frame_is_told_and_the_next_is_read() -> None:
@@ -171,7 +221,7 @@ def test_larger_frames_take_the_place_of_smaller_ones() -> None:
         assert _told(found[:3]) == _told(found[9:])
         pieces = detectors._memory._all.values()
         assert len(pieces) <= 3
-        assert all(memory.size >= _frames(1)[0].data_dn.nbytes for memory in pieces)
+        assert all(piece.size >= _frames(1)[0].data_dn.nbytes for piece in pieces)
         for name in before:
             with pytest.raises(FileNotFoundError):
                 SharedMemory(name)
@@ -179,17 +229,17 @@ def test_larger_frames_take_the_place_of_smaller_ones() -> None:
 
 def test_a_process_forgets_memory_that_is_gone() -> None:
     frame, held = _frames(1)[1], dict[str, SharedMemory]()
-    memory = Memory()
+    shared = Memory()
     try:
         small = replace(frame, data_dn=frame.data_dn[:9].copy())
         for each in (small, small, frame):
-            handed = memory.place(each)
+            handed = shared.place(each)
             assert handed is not None
             assert np.array_equal(taken(handed, held).data_dn, each.data_dn)
-            memory.give_back(handed)
-        assert held.keys() == memory._all.keys()
+            shared.reuse(handed)
+        assert held.keys() == shared._all.keys()
         assert len(held) == 1
     finally:
         for one in held.values():
             one.close()
-        memory.close()
+        shared.close()
