@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 _ROUNDS, _CLIMBS = 3, 16
 _LEAST_HEIGHT_E = 0.1
-_SETTLED = 0.01  # of χ²
+_SETTLED, _SETTLED_IN_TURNS = 0.01, 0.1  # of χ²
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,11 @@ def fit_in_turns(
                 del known[index]
                 continue
             current[index] = again
-            if index not in best or again.deviance < best[index][0].deviance:
+            gained = best[index][0].deviance - again.deviance if index in best else math.inf
+            if gained > 0.0:
                 best[index] = again, known[index]
+            if gained < _SETTLED_IN_TURNS:
+                del known[index]
     return best
 
 
