@@ -319,6 +319,11 @@ def lamps(frames: int = 4, estimator: str = "robust", first: int = 0) -> dict[st
     return {"frames": frames, "lamps": count, "reported": alarms, "reported_share": alarms / count}
 
 
+def _covered(inside_px: Array) -> Array:
+    """Return what share of pixels is lit, by how far their middles lie within an edge: without stairs."""
+    return np.clip(inside_px + 0.5, 0.0, 1.0)
+
+
 def empty(kind: str, frames: int = 4, estimator: str = "robust", first: int = 0) -> dict[str, Any]:
     """Frames that hold no source: sheen, sun patches, blinds, or texture of 3 to 20 %, 4 to 30 px."""
     alarms = 0
@@ -344,13 +349,17 @@ def empty(kind: str, frames: int = 4, estimator: str = "robust", first: int = 0)
                 )
             if kind == "sun patches":
                 half_x, half_y = 10.0 ** generator.uniform(0.7, 2.0, 2)
-                mean_e += np.where((abs(x) < half_x) & (abs(y + 0.3 * x) < half_y), level, 0.0)
+                mean_e += (
+                    level
+                    * _covered(half_x - abs(x))
+                    * _covered((half_y - abs(y + 0.3 * x)) / math.hypot(1.0, 0.3))
+                )
         if kind == "blinds":
             turn, period_px = generator.uniform(-0.3, 0.3), generator.uniform(6.0, 25.0)
             phase = (rows + turn * columns) / period_px % 1.0
-            mean_e += np.where(phase < 0.5, 10.0 ** generator.uniform(2.0, 3.5), 0.0) * (
-                abs(columns - 280) < 200
-            )
+            inside_px = (0.25 - abs((phase + 0.25) % 1.0 - 0.5)) * period_px / math.hypot(1.0, turn)
+            level = 10.0 ** generator.uniform(2.0, 3.5)
+            mean_e += level * _covered(inside_px) * _covered(200.0 - abs(columns - 280))
         frame = expose(
             gaussian_filter(mean_e, POINT.psf_sigma_px), POINT, random(17, len(kind), index), EXPOSURE_S
         )

@@ -25,6 +25,7 @@ from perception.robust.solve import Solution, solve
 from perception.robust.verdict import (
     LEAST_RANGE_M,
     is_border,
+    is_clipped_elsewhere,
     is_hardly_seen,
     is_no_large_disc,
     is_on_flank,
@@ -191,6 +192,8 @@ def _judged(
     if doubted and left.share > most_left and solution.log_range_of_two == 0.0:
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
+        return []
+    if misfit and is_clipped_elsewhere(solution):
         return []
     blobs: list[Blob | None] = [member.blob for member in cluster.members]
     wanted: Sequence[int] = cluster.wanted
