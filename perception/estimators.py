@@ -133,7 +133,7 @@ def detect_frames(
 
     if len(frames) < 2:
         return [found(frame) for frame in frames]
-    with ThreadPoolExecutor(min(len(frames), os.cpu_count() or 1)) as threads:
+    with ThreadPoolExecutor(min(len(frames), cores())) as threads:
         return list(threads.map(found, frames))
 
 
@@ -337,3 +337,8 @@ _KINDS: dict[Any, Callable[[Any], Any]] = {
     bool: bool,
     tuple[float, float, float]: _vector,
 }
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

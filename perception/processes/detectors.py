@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from functools import partial
 from types import TracebackType
 
-from perception.estimators import ESTIMATORS, require_calibrations
+from perception.estimators import ESTIMATORS, cores, require_calibrations
 from perception.processes.line import Line, Reading
 from perception.processes.memory import Memory
 from perception.processes.worker import Worker, detected_in
@@ -62,7 +62,7 @@ class DetectorProcesses:
         if estimator not in ESTIMATORS:
             raise ValueError(f"estimator {estimator!r} is not known here; {' and '.join(ESTIMATORS)} are")
         if count is None:
-            count = max(1, min(_cores(), len(calibrations)))
+            count = max(1, min(cores(), len(calibrations)))
         if count < 1:
             raise ValueError(f"{count} processes detect nothing: give 1 or more")
         self._calibrations = dict(calibrations)
@@ -71,7 +71,8 @@ class DetectorProcesses:
         self._memory = Memory()
         self._last: Reading | None = None  # of several sets, the one that was begun last
         detected = partial(detected_in, calibrations=self._calibrations, estimator=estimator, limit_s=limit_s)
-        weakref.finalize(self, _end, self._workers, self._memory, os.getpid())  # where nobody closes it
+        self._end = partial(_end, self._workers, self._memory, os.getpid())
+        weakref.finalize(self, self._end)  # where nobody closes it
         try:
             self._workers += [Worker() for _ in range(count)]
             for worker in self._workers:
@@ -81,7 +82,7 @@ class DetectorProcesses:
                     'does not start; in a script it must be made below `if __name__ == "__main__":`'
                 )
         except BaseException:
-            _end(self._workers, self._memory, os.getpid())
+            self._end()
             raise
         self._line = Line(self._workers, self._memory, detected)
 
@@ -150,7 +151,7 @@ class DetectorProcesses:
         with self._one_at_a_time:
             self._last = None
             self._line.clear()
-            _end(self._workers, self._memory, os.getpid())
+            self._end()
 
     def __enter__(self) -> "DetectorProcesses":
         return self
@@ -215,8 +216,3 @@ def _end(workers: list[Worker], memory: Memory, process_id: int) -> None:
     while workers:
         workers.pop().end(until_s)
     memory.close()
-
-
-def _cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -69,10 +69,12 @@ class Line:
                 break
             # One at a time, as long as nobody waits.
             goes_on = len(self._placed) < len(self._at_work) and self._place_next()
-            busy = {worker.pipe: (worker, tasks) for worker, tasks in self._at_work if tasks}
-            for ready in connection.wait(list(busy), timeout=0.0 if goes_on else None):
-                worker, tasks = next(each for pipe, each in busy.items() if pipe is ready)
-                self._done(tasks.popleft(), worker.answer("has ended, and the others with it: make others"))
+            busy = [worker.pipe for worker, tasks in self._at_work if tasks]
+            answered = connection.wait(busy, timeout=0.0 if goes_on else None)
+            for worker, tasks in self._at_work:
+                if worker.pipe in answered:
+                    answer = worker.answer("has ended, and the others with it: make others")
+                    self._done(tasks.popleft(), answer)
 
     def _done(self, task: Task, answer: Answer) -> None:
         task.reading.answers[task.index] = answer
