@@ -1,11 +1,11 @@
 """Sets per second of the whole stack, from four raw frames of 1280 × 960 to tracks and bits: one JSON object.
 
-Robots stand about a rig of four cameras and repeat a word each at 10 Hz; the frames, 30 sets a second, are
-drawn before anything is timed (`tests/unit/perception/simulation.py`) and each is read once, so that it comes
-from memory as a camera leaves it there. Figures are of the sets after the first second: how many are done in
-a second, slow ones and all; how long a set takes, and of that detection by itself, in threads, in processes,
-and in processes that are at work with the next set while this one is followed; how many tracks there are at
-the end, and how many messages were read.
+Robots stand about a rig of four cameras and repeat a word each at 10 Hz; the frames, 30 sets a second,
+are drawn before anything is timed (`tests/unit/perception/simulation.py`) and each is read once in every
+way, so that it comes from memory as a camera leaves it there. Figures are of the sets after the first
+second: how many are done in a second, slow ones and all; how long a set takes, and of that detection by
+itself, in threads, in processes, and in processes that are at work with the next set while this one is
+followed; how many tracks there are at the end, and how many messages were read.
 `--seconds 7` and more lets whole packets be heard.
 """
 
@@ -77,12 +77,12 @@ def _parts(
     return parts
 
 
-def timed(robots: int, seconds: float, read: Reader) -> dict[str, float | int]:
-    """Time the whole stack on sets of so many robots, and its parts."""
+def timed(sets: Sequence[Sequence[RawFrame]], read: Reader) -> dict[str, float | int]:
+    """Time the whole stack on sets of frames, and its parts."""
     pipeline = perception.Pipeline(CAMERAS)
     spent: list[tuple[float, float]] = []
     messages, tracks = 0, 0
-    reading = read(sets_of(robots, seconds))
+    reading = read(sets)
     started = time.perf_counter()
     for frames, found in reading:
         detected = time.perf_counter()
@@ -117,10 +117,10 @@ def main() -> None:
             "processes": lambda sets: ((frames, beside.detect_frames(frames)) for frames in sets),
             "processes_ahead": beside.detect_sets,
         }
-        figures = {
-            str(robots): {way: timed(robots, chosen.seconds, read) for way, read in ways.items()}
-            for robots in chosen.robots
-        }
+        figures = {}
+        for robots in chosen.robots:
+            sets = sets_of(robots, chosen.seconds)
+            figures[str(robots)] = {way: timed(sets, read) for way, read in ways.items()}
     print(json.dumps({"benchmark": "stack", "cameras": len(CAMERAS), "robots": figures}))
 
 
