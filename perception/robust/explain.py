@@ -293,7 +293,8 @@ def _beside_highlights(
         index: one
         for index, (cluster, one) in enumerate(zip(found, plain, strict=True))
         if one is not None and not cluster.is_in_crowd
-        if (held := parted.get(index, chosen[index])) is not one
+        if (held := parted.get(index, chosen[index])) is None
+        or not held.is_fit_of(one)
         or surely_leaves_something(one)
         or one.count > 1
         if seems_highlit(one, held)

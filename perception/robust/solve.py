@@ -122,6 +122,10 @@ class Solution:
         """Number of flares."""
         return len(self.flux_e)
 
+    def is_fit_of(self, other: "Solution") -> bool:
+        """Tell whether it is the same fit as another, only σ or doubts being others."""
+        return self.expected_e is other.expected_e
+
     @property
     def starts(self) -> list[Start]:
         """The flares as first guesses of another fit."""

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 _ROUNDS, _CLIMBS = 3, 16
 _LEAST_HEIGHT_E = 0.1
 _SETTLED, _SETTLED_IN_TURNS = 0.01, 0.1  # of χ²
+_SETTLED_SHARE = 0.002  # of what χ² is beyond noise: where much is left that no feature explains
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ def fit_in_turns(
     solutions: Mapping[int, Solution],
     plain: Mapping[int, Solution],
     camera: Camera,
+    least_share: float = 0.0,
 ) -> dict[int, tuple[Solution, list[Kind]]]:
     """Fit flares and features in turns: each together with how the other may be off, to first order.
 
@@ -116,10 +118,14 @@ def fit_in_turns(
         The flares, beside some of these features or none, and without any.
     camera
         The frame's camera.
+    least_share
+        So much of the χ² that `solutions` leave beside noise the first turn must explain: no more turns are
+        taken where it is less.
 
     Returns
     -------
-    By index the likeliest of what both have come to; nothing where flares did not converge.
+    By index the likeliest of what both have come to; nothing where flares did not converge, or the first turn
+    explained too little.
     """
     known = dict(tried)
     best: dict[int, tuple[Solution, list[Kind]]] = {}
@@ -136,13 +142,28 @@ def fit_in_turns(
             if again is None:
                 del known[index]
                 continue
-            current[index] = again
+            before, current[index] = current[index], again
+            if index not in best and share_explained(before, again) < least_share:
+                del known[index]
+                continue
             gained = best[index][0].deviance - again.deviance if index in best else math.inf
             if gained > 0.0:
                 best[index] = again, known[index]
-            if gained < _SETTLED_IN_TURNS:
+            beyond_noise = max(_chi2(again) - float(again.window.usable.sum()), 0.0)
+            if gained < _SETTLED_IN_TURNS + _SETTLED_SHARE * beyond_noise:
                 del known[index]
     return best
+
+
+def share_explained(before: Solution, one: Solution) -> float:
+    """Return how much of the χ² that one fit leaves beside noise another explains."""
+    chi2, noise = _chi2(before), float(before.window.usable.sum())
+    return (chi2 - _chi2(one)) / max(chi2 - noise, 1.0)
+
+
+def _chi2(one: Solution) -> float:
+    """Return what a fit leaves over in its window, against noise."""
+    return float((one.residual_e**2 / one.variance_e2(0.0)).sum())
 
 
 def _columns(
@@ -216,7 +237,8 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
         moved = np.clip(moved, least, most)
         there, cost_there, design_there = fitted(moved)
         if cost_there < cost:
-            settled = cost - cost_there < _SETTLED
+            beyond_noise = max(cost_there - len(left), 0.0)
+            settled = cost - cost_there < _SETTLED + _SETTLED_SHARE * beyond_noise
             now, best, cost, design, damping = moved, there, cost_there, design_there, 0.2 * damping
             if settled:
                 break

@@ -56,6 +56,8 @@ def autocorrelation(
             np.asarray((a.T if turned else a)[step // 2 :: step], dtype=np.float64)
             for a in (excess_e, sigma_e, noise_e)
         )
+        told = (sigma > 0.0).any(axis=1)  # the other lines tell nothing
+        excess, sigma, noise = excess[told], sigma[told], noise[told]
         total = np.hypot(sigma, noise)
         # Flares, and whatever else stands far out, are no part of it.
         counted = (sigma > 0.0) & (np.abs(excess) < _CLIP_SIGMAS * total)
