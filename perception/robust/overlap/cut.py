@@ -25,6 +25,7 @@ from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
 from perception.robust.solve import Fit, Solution, log_range_by_size, solutions_of
+from perception.robust.verdict import LEAST_RANGE_M
 
 Array = NDArray[np.float64]
 
@@ -117,7 +118,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
         along, across = (places - middle) @ away, (places - middle) @ beside
         height, width = float(np.ptp(along)) + 1.0, float(np.ptp(across)) + 1.0
         radius_px = 0.5 * width if height >= 0.5 * width else width**2 / (8.0 * height) + 0.5 * height
-        if radius_px < LEAST_RADIUS_PX:
+        if radius_px < LEAST_RADIUS_PX or at_1_m_px / radius_px < LEAST_RANGE_M:
             continue
         at = float(along.min()) - 0.5 + radius_px
         place = corner + middle + at * away + 0.5 * (float(across.max()) + float(across.min())) * beside

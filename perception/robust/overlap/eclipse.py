@@ -35,6 +35,7 @@ from perception.robust.overlap.pairs import (
 )
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Fit, Solution, log_range_by_size, solutions_of
+from perception.robust.verdict import LEAST_RANGE_M
 
 Array = NDArray[np.float64]
 
@@ -162,7 +163,9 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     u_px, v_px = (corner + middle).tolist()
     at_1_m_px = float(image_radius_px(u_px, v_px, math.asin(min(camera.radius_m, 1.0)), camera.calibration))
     most_e = math.inf if cluster.is_clipped else level_e
-    if not at_1_m_px > 0.0 or not is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
+    if not at_1_m_px > 0.0 or at_1_m_px / near_px < LEAST_RANGE_M:
+        return []
+    if not is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
         return []
     guesses = []
     for sign in (1.0, -1.0):
