@@ -29,6 +29,7 @@ from perception.robust.verdict import (
     is_hardly_seen,
     is_no_large_disc,
     is_on_flank,
+    is_other_limb,
     is_other_size,
 )
 
@@ -193,7 +194,7 @@ def _judged(
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
-    if misfit and is_clipped_elsewhere(solution):
+    if misfit and (is_clipped_elsewhere(solution) or (cluster.is_clipped and is_other_limb(solution))):
         return []
     blobs: list[Blob | None] = [member.blob for member in cluster.members]
     wanted: Sequence[int] = cluster.wanted
