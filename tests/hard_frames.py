@@ -297,9 +297,11 @@ def textured(
     return {**_counts(scored), "pull_rms_u_v": _rms(pulls)}
 
 
-def lamps(frames: int = 4, estimator: str = "robust", first: int = 0) -> dict[str, Any]:
+def lamps(
+    frames: int = 4, estimator: str = "robust", first: int = 0, source_radius_m: float = 1e-6
+) -> dict[str, Any]:
     """Evenly bright rectangles and discs of 6 to 60 px, a third of them clipped, and nothing else."""
-    camera = replace(POINT, bit_depth=12, saturation_dn=4095)
+    camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=source_radius_m)
     alarms = count = 0
     for index in range(first, first + frames):
         generator = random(12, index)
@@ -434,6 +436,7 @@ ROWS: dict[str, Callable[..., dict[str, Any]]] = {
     "120 hot pixels": lambda **more: bad_pixels(0, 120, **more),
     **{f"texture of {px} px": lambda px=px, **more: textured(px, **more) for px in (4, 6, 15, 30)},
     "lamps": lamps,
+    "lamps where sources are balls of 1 cm": lambda **more: lamps(source_radius_m=0.01, **more),
     **{f"empty, {kind}": lambda kind=kind, **more: empty(kind, **more)
        for kind in ("texture", "sheen", "sun patches", "blinds")},
     "crowd of 300": lambda **more: crowd(300, **more),

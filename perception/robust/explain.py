@@ -44,7 +44,7 @@ from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve, start_costs
-from perception.robust.verdict import is_hardly_seen, is_one_pixel
+from perception.robust.verdict import is_hardly_seen, is_one_pixel, is_other_limb
 
 _ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
@@ -270,6 +270,8 @@ def _several_before_edges(
         so_far = (edged.get(index), chosen[index], by_few)
         if cluster.is_in_crowd or not (one is None or surely_leaves_something(one)):
             continue
+        if _is_clipped_otherwise(cluster, one):
+            continue
         if all(each is None or leaves_something(each) for each in so_far):
             tried[index] = one
     several = with_flares_and_edges(brightest_alone(tried, found, camera), camera)
@@ -278,6 +280,11 @@ def _several_before_edges(
         for index, one in _beside_forward_light(several, camera).items()
         if _explains_all(one, shape) and (index not in edged or one.cost < edged[index].cost)
     }
+
+
+def _is_clipped_otherwise(cluster: Cluster, one: Solution | None) -> bool:
+    """Tell whether the limb of what is clipped is no source's: the background does not make up for that."""
+    return cluster.is_clipped and one is not None and is_other_limb(one)
 
 
 def _beside_highlights(
@@ -292,7 +299,7 @@ def _beside_highlights(
     tried = {
         index: one
         for index, (cluster, one) in enumerate(zip(found, plain, strict=True))
-        if one is not None and not cluster.is_in_crowd
+        if one is not None and not cluster.is_in_crowd and not _is_clipped_otherwise(cluster, one)
         if (held := parted.get(index, chosen[index])) is None
         or not held.is_fit_of(one)
         or surely_leaves_something(one)

@@ -19,7 +19,7 @@ from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
 from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
-from perception.robust.overlap.eclipse import finer, is_as_bright, lit_pixels
+from perception.robust.overlap.eclipse import MOST_GIVEN_UP, finer, is_as_bright, lit_pixels
 from perception.robust.overlap.hidden import RAMP_PX
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
@@ -75,9 +75,14 @@ def cut_discs(
             fits.insert(0, _Cut(cluster, _where_light_lacks(one), camera))
         to_beat = parted[index].cost + NO_RIVAL if index in parted else math.inf
         good: list[Solution] = []
+        given_up = 0
         for fit in fits[:_TRIED]:
-            cut = fit.solution(to_beat) if len(good) < _GOOD else None
-            if cut is not None and cut.left_over.is_good and (one is None or gain(one, cut) >= LEAST_GAIN):
+            if len(good) == _GOOD or (given_up == MOST_GIVEN_UP and not good):
+                break
+            cut = fit.solution(to_beat)
+            if cut is None:
+                given_up += 1
+            elif cut.left_over.is_good and (one is None or gain(one, cut) >= LEAST_GAIN):
                 good.append(cut)
         if good:
             cuts[index] = min(good, key=lambda cut: cut.cost)

@@ -49,6 +49,9 @@ _DIMMEST, _BRIGHTEST = (
     1.5,
 )  # of what is lit, over the brightness of sources: where clipped it seems dimmer
 
+MOST_GIVEN_UP = 3
+"""After so many guesses, from the likeliest on, that come to nothing none of the others comes to anything."""
+
 _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
 
@@ -101,9 +104,14 @@ def eclipses(
         fits.sort(key=lambda fit: fit.objective)
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
         good: list[Solution] = []
+        given_up = 0
         for fit in fits:
-            pair = fit.solution() if len(good) < _TRIED else None
-            if pair is not None and pair.left_over.is_good and are_apart(pair, camera):
+            if len(good) == _TRIED or (given_up == MOST_GIVEN_UP and not good):
+                break
+            pair = fit.solution()
+            if pair is None:
+                given_up += 1
+            elif pair.left_over.is_good and are_apart(pair, camera):
                 good.append(pair)
         if not good:
             continue
