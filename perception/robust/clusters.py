@@ -41,6 +41,7 @@ MOST_FITTED_RADIUS_PX = 130.0
 _SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX)
 _CLIPPED_FACTORS = (1.0, 4.0, 16.0, 64.0)
 _CUT_FACTORS = (1.0, 2.0, 4.0)
+_LEAST_DISC_PX2 = 50  # of what is clipped, from which on its outline tells a disc's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,6 +260,8 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
         b.top == 0 or b.left == 0 or b.top + b.height == height or b.left + b.width == width for b in boxes
     )
     factors = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
+    if len(cluster.members) == 1 and cluster.is_clipped:
+        factors = tuple(sorted({*factors, *_factor_by_outline(cluster.members[0], prepared)}))
     floor_e = 3.0 * math.sqrt(prepared.floor_e2)
     sets: list[list[Start]] = []
     for factor in factors:
@@ -284,6 +287,16 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
             flux_e = 4.0 * math.pi * smooth_px**2 * member.blob.peak_e
             sets.append([(u_px, v_px, member.log_range(max(flux_e, floor_e)))])
     return sets
+
+
+def _factor_by_outline(member: Candidate, prepared: PreparedFrame) -> tuple[float, ...]:
+    """Return how many times as bright a clipped flare is if it is a disc as large as what is clipped."""
+    places = np.argwhere(prepared.clipped_in(member.blob.box))
+    if len(places) < _LEAST_DISC_PX2 or not member.image_radius_px > 0.0:
+        return ()
+    # Along its longer axis an ellipse scatters by the square of half of that axis, over four.
+    longest_px = 2.0 * math.sqrt(float(np.linalg.eigvalsh(np.cov(places.T))[1]))
+    return (max((longest_px / member.image_radius_px) ** 2, 1.0),)
 
 
 def guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> list[Start] | None:

@@ -192,7 +192,7 @@ def is_other_limb(solution: Solution) -> bool:
 
     How bright it is within nobody sees; but the limb of a lamp that is dimmer than sources are, or not round,
     lies elsewhere. Sources leave less than a tenth of the light there, seen through a point spread that is a
-    fifth wider than the calibration's, too; lamps of 0.35 to 0.75 of their brightness 11 to 24 %.
+    seventh wider than the calibration's, too; lamps of 0.35 to 0.75 of their brightness 11 to 24 %.
     """
     is_disc = solution.count == 1 and float(solution.image_radius_px[0]) > _LIMB_RADIUS_PX
     return is_disc and solution.left_over.share > _MOST_LEFT_OF_LIMB

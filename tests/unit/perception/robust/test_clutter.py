@@ -44,6 +44,24 @@ def test_a_clipped_lamp_is_no_source(frame: int) -> None:
     assert ROWS["lamps"](frames=1, first=frame)["reported"] == 0
 
 
+@pytest.mark.parametrize("frame", [6, pytest.param(2, marks=pytest.mark.verify)])
+def test_the_limb_of_a_clipped_lamp_is_no_source_s(frame: int) -> None:
+    """Discs and ovals of 4 to 14 px, 0.4 and 0.6 times as bright as balls of 1 cm: told at .4 to 1.4 m."""
+    assert ROWS["lamps where sources are balls of 1 cm"](frames=1, first=frame)["reported"] == 0
+
+
+def test_clipped_sources_are_told_through_a_wider_point_spread() -> None:
+    """24 balls of 1 to 14 px, clipped 13 times, their limbs a seventh wider than the calibration says: 22 are told."""
+    camera = calibration()
+    places = [(120.3 + 200.13 * (k % 6), 120.2 + 200.21 * (k // 6)) for k in range(24)]
+    ranges_m = np.geomspace(0.35, 3.0, 24).tolist()
+    drawn = [(u, v, range_m) for (u, v), range_m in zip(places, ranges_m, strict=True)]
+    image_e = expected_e(replace(camera, psf_sigma_px=1.15 * camera.psf_sigma_px), drawn, 4e-3)
+    found = perception.detect(expose(image_e + 20.0, camera, random(5, 115), 4e-3), camera)
+    near = [min(math.hypot(one.u_px - u, one.v_px - v) for one in found) for u, v in places]
+    assert sum(apart_px < 0.5 for apart_px in near) >= 22
+
+
 @pytest.mark.verify
 @pytest.mark.parametrize("row", EMPTY)
 def test_false_alarms_are_rarer_than_one_in_ten_frames(row: str) -> None:
