@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.layout import Sources
-from perception.model.pixels import maximise, unlikeliness
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import MOTION_PX, Camera, lay_out
 from perception.model.window import motion_cost as cost_of_motion
+from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import LeftOver, drawn_out, left_over, residual_e
 from perception.robust.problem import Motion, Problem, Start, Window
 
@@ -27,6 +27,7 @@ _MOST_LAYOUTS = 7
 # How far the range by size may move before images are laid out anew: their shape changes with its square.
 _LAYOUT_KEPT = 0.02
 _LAYOUT_KEPT_PX = 0.05
+_LARGE_PX, _LAYOUT_KEPT_SIGMAS = 3.0, 0.1  # of large discs also where that moves what is seen by so many σ
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
 _OF_STARTS = 0.5  # so fine are images that are only to tell which first guess is likelier
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
@@ -221,63 +222,6 @@ def start_costs(problems: Sequence[Problem], camera: Camera) -> list[float]:
     return [f.unlikeliness(laid.part(a, b)) if imaged[a:b].all() else math.inf for f, a, b in parts]
 
 
-class Fit:
-    """The fit of one window, on its way from first guesses."""
-
-    def __init__(self, problem: Problem, camera: Camera) -> None:
-        window = problem.window
-        self.window, self.known = window, camera.known(window.clip_e)
-        self.structure = window.beside
-        self.layout = self.known.layout(len(problem.starts), len(self.structure.columns))
-        self.values = np.zeros(self.layout.size)
-        self.own[:, :3] = problem.starts
-        if problem.motions is not None:
-            self.own[:, self.layout.motion :] = problem.motions
-        self.values[self.layout.background] = problem.background_e
-        self.covariance = np.empty((self.layout.size, self.layout.size))
-        self.expected_e = np.empty(window.image_e.shape)
-        self.deviance = self.log_information = math.inf
-        self.converged = False
-        self.log_flux_at_1_m, self.image_radius_px = (np.empty(self.layout.sources) for _ in range(2))
-
-    @property
-    def own(self) -> Array:
-        """The sources' unknowns, a view of shape (sources, unknowns of each)."""
-        return self.layout.of_sources(self.values)
-
-    @property
-    def background_e(self) -> Array:
-        """Of a pixel, for each source."""
-        return np.full(self.layout.sources, self.values[self.layout.background])
-
-    @property
-    def of_sources(self) -> Array:
-        """Their covariances, shape (sources, unknowns of each, unknowns of each)."""
-        step = self.layout.per_source
-        return np.array(
-            [self.covariance[at : at + step, at : at + step] for at in range(0, self.layout.width, step)]
-        )
-
-    @property
-    def prior(self) -> Array:
-        """Precision of the unknowns a priori."""
-        return self.layout.prior(self.structure, self.known.motion_px)
-
-    def unlikeliness(self, sources: Sources) -> float:
-        """Return −2 ln L of the present values but for a constant, with images as laid out for them."""
-        return unlikeliness(self.window.view, sources, self.structure, self.known, self.prior, self.values)
-
-    def climb(self, sources: Sources, reach_px: Array) -> None:
-        """Go on to the greatest likelihood, with images as laid out, of so large radii."""
-        self.deviance, self.log_information = maximise(
-            self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
-            self.values, self.covariance, self.expected_e.ravel(),
-        )  # fmt: skip
-        self.converged = math.isfinite(self.deviance)
-        growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
-        self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
-
-
 def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
@@ -291,7 +235,7 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
         fit.converged = False
         if imaged[first:end].all():
             fit.climb(laid.part(first, end), reach_px[first:end])
-    own = np.concatenate([fit.own for fit in fits])
+    laid_at, own = own[:, :2], np.concatenate([fit.own for fit in fits])
     change = laid.log_range_at - log_range_by_size(own, fits[0])
     moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
     if laid_px is not None and (motion_px := _motion_px(own, fits[0])) is not None:
@@ -299,6 +243,13 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     if hidden_px is not None:
         more_e = np.concatenate([fit.background_e for fit in fits]) - background_e
         moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
+    large = np.flatnonzero(reach_px > _LARGE_PX)
+    if large.size:
+        # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
+        away_px = abs(change[large]) * reach_px[large] + np.hypot(*(own[large, :2] - laid_at[large]).T)
+        angle_rad = camera.radius_m * np.exp(-laid.log_range_at[large])
+        sigma_px = np.concatenate([fit.place_sigmas_px for fit in fits])[large]
+        moved[large] |= 2.0 * angle_rad * away_px > _LAYOUT_KEPT_SIGMAS * sigma_px
     if not moved.any():
         return []
     return [
@@ -319,11 +270,6 @@ def _laid_out(
     by_size = log_range_by_size(own, fits[0])
     fineness = np.full(len(own), finer)
     return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px, fineness), hidden_px
-
-
-def log_range_by_size(own: Array, fit: Fit) -> Array:
-    """Return the logarithm of the range that each source's size stands for."""
-    return np.asarray(own[:, 2] - fit.known.tie_spread * own[:, 3]) if fit.layout.has_slack else own[:, 2]
 
 
 def _motion_px(own: Array, fit: Fit) -> Array | None:

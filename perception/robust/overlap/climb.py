@@ -23,7 +23,8 @@ from perception.model.pixels import (
 )
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera
-from perception.robust.solve import Fit, solutions_of
+from perception.robust.fit import Fit
+from perception.robust.solve import solutions_of
 
 Array = NDArray[np.float64]
 

@@ -17,6 +17,7 @@ from perception.model.layout import Sources
 from perception.model.spread import spread_nodes
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
+from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
 from perception.robust.overlap.eclipse import MOST_GIVEN_UP, finer, is_as_bright, lit_pixels
@@ -24,7 +25,7 @@ from perception.robust.overlap.hidden import RAMP_PX
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
-from perception.robust.solve import Fit, Solution, log_range_by_size, solutions_of
+from perception.robust.solve import Solution, solutions_of
 from perception.robust.verdict import LEAST_RANGE_M
 
 Array = NDArray[np.float64]

@@ -17,6 +17,7 @@ from perception.model.flare import image_radius_px
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import Cluster
+from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
@@ -34,7 +35,7 @@ from perception.robust.overlap.pairs import (
     pair_of,
 )
 from perception.robust.problem import Problem, Start
-from perception.robust.solve import Fit, Solution, log_range_by_size, solutions_of
+from perception.robust.solve import Solution, solutions_of
 from perception.robust.verdict import LEAST_RANGE_M
 
 Array = NDArray[np.float64]

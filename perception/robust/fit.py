@@ -1,0 +1,81 @@
+"""The fit of one window, on its way from first guesses to the greatest likelihood."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.layout import Sources
+from perception.model.pixels import maximise, unlikeliness
+from perception.model.window import Camera
+from perception.robust.problem import Problem
+
+Array = NDArray[np.float64]
+
+
+class Fit:
+    """The fit of one window, on its way from first guesses."""
+
+    def __init__(self, problem: Problem, camera: Camera) -> None:
+        window = problem.window
+        self.window, self.known = window, camera.known(window.clip_e)
+        self.structure = window.beside
+        self.layout = self.known.layout(len(problem.starts), len(self.structure.columns))
+        self.values = np.zeros(self.layout.size)
+        self.own[:, :3] = problem.starts
+        if problem.motions is not None:
+            self.own[:, self.layout.motion :] = problem.motions
+        self.values[self.layout.background] = problem.background_e
+        self.covariance = np.full((self.layout.size, self.layout.size), np.nan)
+        self.expected_e = np.empty(window.image_e.shape)
+        self.deviance = self.log_information = math.inf
+        self.converged = False
+        self.log_flux_at_1_m, self.image_radius_px = (np.empty(self.layout.sources) for _ in range(2))
+
+    @property
+    def own(self) -> Array:
+        """The sources' unknowns, a view of shape (sources, unknowns of each)."""
+        return self.layout.of_sources(self.values)
+
+    @property
+    def background_e(self) -> Array:
+        """Of a pixel, for each source."""
+        return np.full(self.layout.sources, self.values[self.layout.background])
+
+    @property
+    def of_sources(self) -> Array:
+        """Their covariances, shape (sources, unknowns of each, unknowns of each)."""
+        step = self.layout.per_source
+        return np.array(
+            [self.covariance[at : at + step, at : at + step] for at in range(0, self.layout.width, step)]
+        )
+
+    @property
+    def place_sigmas_px(self) -> Array:
+        """Standard deviation of each source's column."""
+        step = self.layout.per_source
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)[: step * self.layout.sources : step]))
+
+    @property
+    def prior(self) -> Array:
+        """Precision of the unknowns a priori."""
+        return self.layout.prior(self.structure, self.known.motion_px)
+
+    def unlikeliness(self, sources: Sources) -> float:
+        """Return −2 ln L of the present values but for a constant, with images as laid out for them."""
+        return unlikeliness(self.window.view, sources, self.structure, self.known, self.prior, self.values)
+
+    def climb(self, sources: Sources, reach_px: Array) -> None:
+        """Go on to the greatest likelihood, with images as laid out, of so large radii."""
+        self.deviance, self.log_information = maximise(
+            self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
+            self.values, self.covariance, self.expected_e.ravel(),
+        )  # fmt: skip
+        self.converged = math.isfinite(self.deviance)
+        growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
+        self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
+
+
+def log_range_by_size(own: Array, fit: Fit) -> Array:
+    """Return the logarithm of the range that each source's size stands for."""
+    return np.asarray(own[:, 2] - fit.known.tie_spread * own[:, 3]) if fit.layout.has_slack else own[:, 2]
