@@ -190,7 +190,9 @@ def _judged(
     drawn_out = solution.motion_px is not None and solution.window.on_edges
     doubted = misfit or cluster.is_clipped or drawn_out
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
-    if doubted and left.share > most_left and solution.log_range_of_two == 0.0:
+    # Of what is clipped enough is unseen for two flares to explain the rest of anything.
+    may_be_two = solution.log_range_of_two > 0.0 and not cluster.is_clipped
+    if doubted and left.share > most_left and not may_be_two:
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
