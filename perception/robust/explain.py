@@ -20,6 +20,7 @@ from perception.robust.around.halo import with_halo
 from perception.robust.around.highlight import likelier_beside_highlights, seems_highlit, with_highlights
 from perception.robust.around.uneven import (
     MOST_LEFT,
+    by_flanks,
     retry_on_uneven_ground,
     retry_without_spill,
     without_spill,
@@ -70,6 +71,8 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, (cluster, solution) in enumerate(zip(found, chosen, strict=True)):
         if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
             chosen[index] = None
+    for index, fit in by_flanks(found, chosen, prepared, camera).items():
+        chosen[index] = fit
     fit_beside_forward_light(chosen, camera)
     lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
     on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}

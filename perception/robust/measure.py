@@ -38,6 +38,8 @@ CLIPPED_RANGE_SIGMA = 0.125
 
 MOST_LEFT_ON_EDGES = 0.1
 
+_MOST_OF_CLIPPED = 2  # flares more than blobs: as many as it takes have the outline of any clipped lamp
+
 _ODD_SIGMAS = 3.0
 
 _IN_VIEW_PX = 1000  # farther than any window reaches
@@ -195,6 +197,8 @@ def _judged(
     if doubted and left.share > most_left and not may_be_two:
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
+        return []
+    if cluster.is_clipped and solution.count > len(cluster.members) + _MOST_OF_CLIPPED:
         return []
     if misfit and (is_clipped_elsewhere(solution) or (cluster.is_clipped and is_other_limb(solution))):
         return []

@@ -8,12 +8,17 @@ import numpy as np
 
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera
+from perception.robust.clusters import Cluster
+from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.search.structure import EDGES, structure_of
 from perception.robust.solve import Solution, solve
 
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
+
+_WIDTHS_OF_DISC = (0.5, 1.0)
+"""Of what is clipped, first guesses: a disc is as wide, the image of a point is so by its point spread."""
 
 
 def retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:
@@ -49,6 +54,33 @@ def retry_without_spill(
     for index, again in without_spill(alone, prepared, camera).items():
         if again.left_over.share < MOST_LEFT:
             best[index] = again
+
+
+def by_flanks(
+    found: Sequence[Cluster], solutions: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera
+) -> dict[int, Solution]:
+    """Return by index what lone clipped flares that nothing explains are beside columns of clipped pixels.
+
+    Charge that spills along columns hides where a disc ends along them, and makes what is clipped many times
+    as long as wide; across them it is as wide as it is, or the point spread makes it.
+    """
+    tried, problems = [], []
+    for index, (cluster, solution) in enumerate(zip(found, solutions, strict=True)):
+        if solution is not None or len(cluster.members) > 1 or not cluster.is_clipped:
+            continue
+        (member,), window = cluster.members, cluster.window
+        width_px = int(prepared.clipped_in(member.blob.box).any(axis=0).sum())
+        state = np.where(prepared.clipped_columns(window.box), UNUSABLE, window.state).astype(np.uint8)
+        for part in _WIDTHS_OF_DISC:
+            times = (0.5 * part * width_px / max(member.image_radius_px, 1e-9)) ** 2
+            start = member.u_px, member.v_px, member.log_range(max(times * member.flux_e, 1.0))
+            tried.append(index)
+            problems.append(Problem(replace(window, state=state), [start], cluster.background_e))
+    likeliest: dict[int, Solution] = {}
+    for index, one in zip(tried, solve(problems, camera), strict=True):
+        if one is not None and one.left_over.share < MOST_LEFT:
+            likeliest[index] = min(likeliest.get(index, one), one, key=lambda fit: fit.deviance)
+    return likeliest
 
 
 def without_spill(

@@ -1,11 +1,13 @@
 """Near sources anywhere in the frame, clipped up to fifty times: none is lost, and their sigmas hold."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import perception
+from nir_render.camera.sensor.well import bloom_into
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 
@@ -37,3 +39,26 @@ def test_balls_are_found_and_ranged_however_clipped(frames: int) -> None:
     assert np.max(np.abs(pulls)) < 5.0
     within = 3.0 / math.sqrt(2 * len(pulls))
     assert np.sqrt(np.mean(np.square(pulls), axis=0)) == pytest.approx([1.0] * 3, abs=within + 0.03)
+
+
+@pytest.mark.parametrize(
+    "place", [(679.2, 342.3, 1.37), (917.2, 342.3, 0.89), (600.5, 400.5, 0.7), (600.5, 400.5, 2.0)]
+)
+@pytest.mark.parametrize("spilled", [0.3, 1.0])
+def test_balls_whose_charge_spills_are_ranged_by_their_flanks(
+    place: tuple[float, float, float], spilled: float
+) -> None:
+    """One and a half to 2.6 times full scale, the charge beyond it spilled along columns: all but one were lost."""
+    camera, exposure_s = calibration(), 8e-4
+    generator, full_e = random(79, 1), 4095 / 0.74
+    charge_e = generator.poisson(expected_e(camera, [place], exposure_s) + 20.0).astype(np.float32)
+    bloom_into(charge_e, full_e, spilled)
+    seen = replace(camera, read_noise_e=0.0)
+    charge_e += generator.normal(0.0, camera.read_noise_e, charge_e.shape).astype(np.float32)
+    frame = expose(np.zeros(charge_e.shape), seen, generator, exposure_s)
+    counts_dn = np.clip(np.rint(camera.system_gain_dn_per_e * charge_e + camera.black_level_dn), 0, 4095)
+    (told,) = perception.detect(replace(frame, data_dn=counts_dn.astype(np.uint16)), camera)
+    u, v, range_m = place
+    off = told.u_px - u, told.v_px - v, told.range_m - range_m
+    assert np.abs(np.divide(off, (told.u_sigma_px, told.v_sigma_px, told.range_sigma_m))).max() < 4.5
+    assert told.range_sigma_m < 0.003 * range_m

@@ -96,7 +96,9 @@ def test_halos_are_what_a_lens_shows_of_a_lit_wall(
     def image(width_px: float) -> Array:
         light = (1.0 + (x**2 + y**2) / width_px**2) ** -1.5 * seen / (2.0 * np.pi * width_px**2)
         blurred = gaussian_filter(light, SIGMA_PX * fine)
-        return blurred.reshape(SIDE + 2 * rim, fine, -1, fine).mean(axis=(1, 3))[rim:-rim, rim:-rim]
+        return np.asarray(
+            blurred.reshape(SIDE + 2 * rim, fine, -1, fine).mean(axis=(1, 3))[rim:-rim, rim:-rim]
+        )
 
     (halo,) = _halos(cast("Solution", flare), [width_px])
     expected = image(width_px), (image(1.01 * width_px) - image(width_px / 1.01)) / (2.0 * np.log(1.01))
