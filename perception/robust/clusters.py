@@ -291,7 +291,7 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
 
 def _factor_by_outline(member: Candidate, prepared: PreparedFrame) -> tuple[float, ...]:
     """Return how many times as bright a clipped flare is if it is a disc as large as what is clipped."""
-    places = np.argwhere(prepared.clipped_in(member.blob.box))
+    places = np.argwhere(prepared.clipped_in(member.blob.box) & member.blob.pixels)
     if len(places) < _LEAST_DISC_PX2 or not member.image_radius_px > 0.0:
         return ()
     # Along its longer axis an ellipse scatters by the square of half of that axis, over four.

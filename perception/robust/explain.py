@@ -45,7 +45,7 @@ from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve, start_costs
-from perception.robust.verdict import is_hardly_seen, is_one_pixel, is_other_limb
+from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 _ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
@@ -273,8 +273,6 @@ def _several_before_edges(
         so_far = (edged.get(index), chosen[index], by_few)
         if cluster.is_in_crowd or not (one is None or surely_leaves_something(one)):
             continue
-        if _is_clipped_otherwise(cluster, one):
-            continue
         if all(each is None or leaves_something(each) for each in so_far):
             tried[index] = one
     several = with_flares_and_edges(brightest_alone(tried, found, camera), camera)
@@ -285,11 +283,6 @@ def _several_before_edges(
     }
 
 
-def _is_clipped_otherwise(cluster: Cluster, one: Solution | None) -> bool:
-    """Tell whether the limb of what is clipped is no source's: the background does not make up for that."""
-    return cluster.is_clipped and one is not None and is_other_limb(one)
-
-
 def _beside_highlights(
     found: Sequence[Cluster],
     plain: Sequence[Solution | None],
@@ -298,11 +291,14 @@ def _beside_highlights(
     shape: tuple[int, int],
     camera: Camera,
 ) -> dict[int, Solution]:
-    """Explain by lone flares beside highlights what nothing else explains, or only several flares do."""
+    """Explain by lone flares beside highlights what nothing else explains, or only several flares do.
+
+    Not what the lone flare itself explains best, whatever rivals have widened its sigmas.
+    """
     tried = {
         index: one
         for index, (cluster, one) in enumerate(zip(found, plain, strict=True))
-        if one is not None and not cluster.is_in_crowd and not _is_clipped_otherwise(cluster, one)
+        if one is not None and not cluster.is_in_crowd
         if (held := parted.get(index, chosen[index])) is None
         or not held.is_fit_of(one)
         or surely_leaves_something(one)

@@ -52,9 +52,9 @@ class Fit:
 
     @property
     def place_sigmas_px(self) -> Array:
-        """Standard deviation of each source's column."""
-        step = self.layout.per_source
-        return np.asarray(np.sqrt(np.diagonal(self.covariance)[: step * self.layout.sources : step]))
+        """Standard deviation of each source's place, the lesser of both."""
+        variances = self.layout.of_sources(np.diagonal(self.covariance))[:, :2]
+        return np.asarray(np.sqrt(variances.min(axis=1)))
 
     @property
     def prior(self) -> Array:

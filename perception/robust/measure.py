@@ -24,6 +24,7 @@ from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
 from perception.robust.verdict import (
     LEAST_RANGE_M,
+    is_any_outline,
     is_border,
     is_clipped_elsewhere,
     is_hardly_seen,
@@ -38,10 +39,7 @@ CLIPPED_RANGE_SIGMA = 0.125
 
 MOST_LEFT_ON_EDGES = 0.1
 
-_MOST_OF_CLIPPED = 2  # flares more than blobs: as many as it takes have the outline of any clipped lamp
-
 _ODD_SIGMAS = 3.0
-
 _IN_VIEW_PX = 1000  # farther than any window reaches
 
 _TIMES_LAID_OUT = 2  # large discs: a pixel elsewhere the lens stretches them otherwise
@@ -192,15 +190,17 @@ def _judged(
     drawn_out = solution.motion_px is not None and solution.window.on_edges
     doubted = misfit or cluster.is_clipped or drawn_out
     most_left = MOST_LEFT_ON_EDGES if solution.window.on_edges else MOST_LEFT
-    # Of what is clipped enough is unseen for two flares to explain the rest of anything.
-    may_be_two = solution.log_range_of_two > 0.0 and not cluster.is_clipped
-    if doubted and left.share > most_left and not may_be_two:
+    # Of what is clipped too much is unseen for that it may be two to excuse it.
+    if doubted and left.share > most_left and (cluster.is_clipped or solution.log_range_of_two == 0.0):
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
-    if cluster.is_clipped and solution.count > len(cluster.members) + _MOST_OF_CLIPPED:
+    if cluster.is_clipped and is_any_outline(solution, len(cluster.members)):
         return []
-    if misfit and (is_clipped_elsewhere(solution) or (cluster.is_clipped and is_other_limb(solution))):
+    if misfit and is_clipped_elsewhere(solution):
+        return []
+    is_at_once = prepared.frame.line_time_s == 0.0  # else flares that move are not fitted as such
+    if misfit and cluster.is_clipped and is_at_once and is_other_limb(solution, camera):
         return []
     blobs: list[Blob | None] = [member.blob for member in cluster.members]
     wanted: Sequence[int] = cluster.wanted

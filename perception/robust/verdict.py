@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.bearing import pixel_turn
 from perception.model.layout import CLIPPED, UNUSABLE
+from perception.model.window import Camera
 from perception.robust.clusters import Candidate
 from perception.robust.goodness import MODEL_ERROR, noise_e2
+from perception.robust.overlap.deblend import of_free_width
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
 
@@ -27,6 +29,7 @@ _FLANK_PX, _FLANK_SHARE = 3.0, 0.25
 _FLANK_PEAKS, _FLANK_PEAKS_ON_EDGES = 0.5, 1.0
 _LEAST_SEEN, _MOST_OFF = 2.0 / 3.0, 0.5
 _CLIPPED_DIM, _MOST_CLIPPED_DIM = 0.5, 0.1
+_MOST_OF_CLIPPED = 2  # flares more than blobs
 _LIMB_RADIUS_PX, _MOST_LEFT_OF_LIMB = 2.0, 0.1
 
 
@@ -187,15 +190,23 @@ def is_clipped_elsewhere(solution: Solution) -> bool:
     return int(dim.sum()) > _MOST_CLIPPED_DIM * int(clipped.sum())
 
 
-def is_other_limb(solution: Solution) -> bool:
+def is_any_outline(solution: Solution, blobs: int) -> bool:
+    """Tell whether it takes so many more flares than blobs that they have the outline of any clipped lamp."""
+    return solution.count > blobs + _MOST_OF_CLIPPED
+
+
+def is_other_limb(solution: Solution, camera: Camera) -> bool:
     """Tell whether what is seen of the limb of a clipped disc is not that of a source.
 
     How bright it is within nobody sees; but the limb of a lamp that is dimmer than sources are, or not round,
-    lies elsewhere. Sources leave less than a tenth of the light there, seen through a point spread that is a
-    seventh wider than the calibration's, too; lamps of 0.35 to 0.75 of their brightness 11 to 24 %.
+    lies elsewhere: lamps of 0.35 to 0.75 of their brightness leave 11 to 24 % of the light there. Sources
+    leave less than a tenth, fitted with the point spread's width free where it is not the calibration's.
     """
-    is_disc = solution.count == 1 and float(solution.image_radius_px[0]) > _LIMB_RADIUS_PX
-    return is_disc and solution.left_over.share > _MOST_LEFT_OF_LIMB
+    radius_px = float(solution.image_radius_px.max()) - 0.5 * solution.most_motion_px
+    if solution.count > 1 or radius_px < _LIMB_RADIUS_PX or solution.left_over.share < _MOST_LEFT_OF_LIMB:
+        return False
+    (wider,) = of_free_width([solution], camera)
+    return wider is None or wider.left_over.share > _MOST_LEFT_OF_LIMB
 
 
 def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) -> bool:

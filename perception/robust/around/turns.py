@@ -18,7 +18,8 @@ from perception.compiled import compiled
 from perception.model.layout import SEEN, Structure
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.window import Camera
-from perception.robust.goodness import noise_e2
+from perception.robust.goodness import MODEL_ERROR, noise_e2
+from perception.robust.overlap.deblend import gain
 from perception.robust.problem import Window
 from perception.robust.solve import Solution, solve
 
@@ -149,21 +150,20 @@ def fit_in_turns(
             gained = best[index][0].deviance - again.deviance if index in best else math.inf
             if gained > 0.0:
                 best[index] = again, known[index]
-            beyond_noise = max(_chi2(again) - float(again.window.usable.sum()), 0.0)
-            if gained < _SETTLED_IN_TURNS + _SETTLED_SHARE * beyond_noise:
+            if gained < _SETTLED_IN_TURNS + _SETTLED_SHARE * max(_beyond_noise(again), 0.0):
                 del known[index]
     return best
 
 
 def share_explained(before: Solution, one: Solution) -> float:
-    """Return how much of the χ² that one fit leaves beside noise another explains."""
-    chi2, noise = _chi2(before), float(before.window.usable.sum())
-    return (chi2 - _chi2(one)) / max(chi2 - noise, 1.0)
+    """Return how much another explains of the χ² beyond noise that a fit leaves, with an imperfect model."""
+    return gain(before, one) / max(_beyond_noise(before), 1.0)
 
 
-def _chi2(one: Solution) -> float:
-    """Return what a fit leaves over in its window, against noise."""
-    return float((one.residual_e**2 / one.variance_e2(0.0)).sum())
+def _beyond_noise(one: Solution) -> float:
+    """Return by how much χ² in a window, with an imperfect model, exceeds what noise leaves on average."""
+    seen = one.window.state == SEEN
+    return float((one.residual_e**2 / one.variance_e2(MODEL_ERROR))[seen].sum() - seen.sum())
 
 
 def _columns(
@@ -199,6 +199,7 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
     usable = window.state == SEEN
     shape = window.image_e.shape
     weight = 1.0 / np.sqrt(one.variance_e2(0.0)[usable])
+    of_model = 1.0 / (weight**2 * one.variance_e2(MODEL_ERROR)[usable])
     known_e = 0.0 if window.known_e is None else window.known_e
     left, covered = (window.image_e - one.flares_e - known_e)[usable] * weight, _covered(one, camera)[usable]
     x_px, y_px = (each[usable] for each in offsets_px(shape))
@@ -237,7 +238,7 @@ def _climbed(one: Solution, window: Window, features: list[Kind], camera: Camera
         moved = np.clip(moved, least, most)
         there, cost_there, design_there = fitted(moved)
         if cost_there < cost:
-            beyond_noise = max(cost_there - len(left), 0.0)
+            beyond_noise = max(float(of_model @ design_there[-1] ** 2) - len(left), 0.0)
             settled = cost - cost_there < _SETTLED + _SETTLED_SHARE * beyond_noise
             now, best, cost, design, damping = moved, there, cost_there, design_there, 0.2 * damping
             if settled:
