@@ -62,7 +62,8 @@ def by_flanks(
     """Return by index what lone clipped flares that nothing explains are beside columns of clipped pixels.
 
     Charge that spills along columns hides where a disc ends along them, and makes what is clipped many times
-    as long as wide; across them it is as wide as it is, or the point spread makes it.
+    as long as wide; across them it is as wide as it is, or the point spread makes it. It must be so bright
+    that it clips: the end of such a column is no flare.
     """
     tried, problems = [], []
     for index, (cluster, solution) in enumerate(zip(found, solutions, strict=True)):
@@ -78,7 +79,8 @@ def by_flanks(
             problems.append(Problem(replace(window, state=state), [start], cluster.background_e))
     likeliest: dict[int, Solution] = {}
     for index, one in zip(tried, solve(problems, camera), strict=True):
-        if one is not None and one.left_over.share < MOST_LEFT:
+        clips = one is not None and float(one.expected_e.max()) > one.window.clip_e
+        if one is not None and clips and one.left_over.share < MOST_LEFT:
             likeliest[index] = min(likeliest.get(index, one), one, key=lambda fit: fit.deviance)
     return likeliest
 
