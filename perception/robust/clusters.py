@@ -31,6 +31,9 @@ _FAR_OFF_PX = 1.5  # of a blob's brightest pixel from the middle of its light
 _TOUCHING_PX = 4
 _KEPT_PX = 2
 
+LEAST_RANGE_M = 0.03
+"""Nothing is taken for a source that would stand nearer to the lens."""
+
 MAX_IMAGE_RADIUS_PX = 28.0
 """Sources that look larger are fitted as they are, or not at all: looking for what may hide them is dear."""
 

@@ -12,7 +12,7 @@ from perception.model.sensor import gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.aperture import aperture_flux, centroid_sigmas, mask_in
 from perception.robust.around.uneven import MOST_LEFT
-from perception.robust.clusters import Candidate, Cluster, clusters, guess_by_outline
+from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters, guess_by_outline
 from perception.robust.explain import best
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.motion import is_long_clutter
@@ -23,7 +23,6 @@ from perception.robust.search.blobs import Blob, dilated, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
 from perception.robust.verdict import (
-    LEAST_RANGE_M,
     is_any_outline,
     is_border,
     is_clipped_elsewhere,

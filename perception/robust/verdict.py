@@ -9,16 +9,13 @@ from perception.compiled import compiled
 from perception.model.bearing import pixel_turn
 from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.window import Camera
-from perception.robust.clusters import Candidate
+from perception.robust.clusters import LEAST_RANGE_M, Candidate
 from perception.robust.goodness import MODEL_ERROR, noise_e2
 from perception.robust.overlap.deblend import of_free_width
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
-
-LEAST_RANGE_M = 0.03
-"""Nothing is taken for a source that would stand nearer to the lens."""
 
 REACH_PX, REACHED_SHARE = 2, 0.02
 _DISC_FILLS = (0.88, 1.12)

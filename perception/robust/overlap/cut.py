@@ -16,7 +16,7 @@ from perception.model.flare import image_radius_px
 from perception.model.layout import Sources
 from perception.model.spread import spread_nodes
 from perception.model.window import Camera, lay_out
-from perception.robust.clusters import Cluster
+from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.overlap.climb import Climb
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
@@ -26,7 +26,6 @@ from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
 from perception.robust.solve import Solution, solutions_of
-from perception.robust.verdict import LEAST_RANGE_M
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from perception.model.bearing import direction_camera, pixel_turn
 from perception.model.flare import image_radius_px
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera, lay_out
-from perception.robust.clusters import Cluster
+from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.climb import Climb
@@ -36,7 +36,6 @@ from perception.robust.overlap.pairs import (
 )
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution, solutions_of
-from perception.robust.verdict import LEAST_RANGE_M
 
 Array = NDArray[np.float64]
 
