@@ -1,7 +1,7 @@
 """Flares are fitted to windows: the maximum-likelihood fit of any number of them in each.
 
 What is maximised is the likelihood of `model.pixels`, with the λ and the priors of `model.window`. Images are
-laid out for all windows at once, and anew where a size has moved far from the one they were laid out for.
+laid out for all windows at once, and anew where a size, or a large disc, has moved far from where they were.
 """
 
 import math
@@ -143,6 +143,13 @@ class Solution:
         return 0.0 if self.motion_px is None else float(np.hypot(*self.motion_px.T).max())
 
     @property
+    def radius_at_rest_px(self) -> Array:
+        """Radii of the flares' images, but for how far they move."""
+        if self.motion_px is None:
+            return self.image_radius_px
+        return np.asarray(self.image_radius_px - 0.5 * np.hypot(*self.motion_px.T))
+
+    @property
     def motions(self) -> list[Motion] | None:
         """How they move as first guesses of another fit."""
         return None if self.motion_px is None else [(float(u), float(v)) for u, v in self.motion_px]
@@ -223,7 +230,7 @@ def start_costs(problems: Sequence[Problem], camera: Camera) -> list[float]:
 
 
 def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
-    """Lay images out and climb; return those in which sizes changed so much that it is to be done anew."""
+    """Lay images out and climb; return those that have moved so far that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
     background_e = np.concatenate([fit.background_e for fit in fits])
     motion_px = _motion_px(own, fits[0])

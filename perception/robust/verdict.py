@@ -199,8 +199,8 @@ def is_other_limb(solution: Solution, camera: Camera) -> bool:
     lies elsewhere: lamps of 0.35 to 0.75 of their brightness leave 11 to 24 % of the light there. Sources
     leave less than a tenth, fitted with the point spread's width free where it is not the calibration's.
     """
-    radius_px = float(solution.image_radius_px.max()) - 0.5 * solution.most_motion_px
-    if solution.count > 1 or radius_px < _LIMB_RADIUS_PX or solution.left_over.share < _MOST_LEFT_OF_LIMB:
+    is_disc = solution.count == 1 and float(solution.radius_at_rest_px[0]) >= _LIMB_RADIUS_PX
+    if not is_disc or solution.left_over.share < _MOST_LEFT_OF_LIMB:
         return False
     (wider,) = of_free_width([solution], camera)
     return wider is None or wider.left_over.share > _MOST_LEFT_OF_LIMB

@@ -88,14 +88,9 @@ def _seems_to_have_one(solution: Solution) -> bool:
     return bool(seems > _SEEMS_SIGMAS)
 
 
-def _radius_px(solution: Solution) -> float:
-    """Return the radius of a flare's image at rest."""
-    return float(solution.image_radius_px[0]) - 0.5 * solution.most_motion_px
-
-
 def _bounds_px(solution: Solution) -> tuple[float, float]:
     """Return how wide a halo may be: wider than its ball, narrower than its window."""
-    least_px = max(_LEAST_WIDTH_PX, _LEAST_WIDTH_RADII * _radius_px(solution))
+    least_px = max(_LEAST_WIDTH_PX, _LEAST_WIDTH_RADII * float(solution.radius_at_rest_px[0]))
     return least_px, _MOST_WIDTH_SIDES * min(solution.window.image_e.shape)
 
 
@@ -157,7 +152,7 @@ def _covered(flare: Solution) -> tuple[tuple[slice, slice], tuple[Array, Array],
     """
     from scipy.special import ndtr
 
-    (u_px, v_px, _), box, radius_px = flare.starts[0], flare.window.box, _radius_px(flare)
+    (u_px, v_px, _), box, radius_px = flare.starts[0], flare.window.box, float(flare.radius_at_rest_px[0])
     sigma_px = flare.psf_sigma_px
     reach_px = math.ceil(radius_px + 0.5 * flare.most_motion_px + 4.0 * sigma_px) + 1
     there, offsets_px, shares = [], [], []

@@ -256,34 +256,23 @@ def _likeliest_highlight(
     """
     parts, weights, at = free_of_flares(image_e, state, expected_e, flares_e, floor_e2, prnu)
     most, height_e, x_px, y_px, wide_px = 0.0, 0.0, 0.0, 0.0, 0.0
-    lit, profile = np.empty(len(weights), dtype=np.int64), np.empty(len(weights))
+    shares = np.empty(6)
     for width_px in widths_px:
         steps, far_px = int(_STEPS * reach_px / width_px), math.sqrt(_FARTHEST - 1.0) * width_px
         for down in range(-steps, steps + 1):
-            y = middle[1] + down * width_px / _STEPS
-            first, end = np.searchsorted(at[1], np.array([y - far_px, y + far_px]))  # rows after rows
             for right in range(-steps, steps + 1):
-                x = middle[0] + right * width_px / _STEPS
-                count, whole, score = 0, 0.0, 0.0
+                x, y = middle[0] + right * width_px / _STEPS, middle[1] + down * width_px / _STEPS
+                whole, shares[:] = 0.0, 0.0
+                first, end = np.searchsorted(at[1], np.array([y - far_px, y + far_px]))  # rows after rows
                 for pixel in range(first, end):
-                    across = at[0, pixel] - x
-                    if abs(across) < far_px:
-                        spread = 1.0 + (across**2 + (at[1, pixel] - y) ** 2) / width_px**2
-                        if spread < _FARTHEST:
-                            seen = weights[pixel] / (spread * spread)
-                            whole += seen**2
-                            score += seen * parts[5, pixel]
-                            lit[count], profile[count] = pixel, seen
-                            count += 1
-                if score <= 0.0 or score**2 <= most * _LEAST_KEPT * whole:
-                    continue
-                power = whole
-                for part in range(5):
-                    share = 0.0
-                    for k in range(count):
-                        share += profile[k] * parts[part, lit[k]]
-                    power -= share**2
-                if power > _LEAST_KEPT * whole and score**2 > most * power:
-                    most, height_e = score**2 / power, score / power
+                    spread = 1.0 + ((at[0, pixel] - x) ** 2 + (at[1, pixel] - y) ** 2) / width_px**2
+                    if spread < _FARTHEST:
+                        profile = weights[pixel] / (spread * spread)
+                        whole += profile**2
+                        for part in range(6):
+                            shares[part] += profile * parts[part, pixel]
+                power = whole - (shares[:5] ** 2).sum()
+                if power > _LEAST_KEPT * whole and shares[5] > 0.0 and shares[5] ** 2 > most * power:
+                    most, height_e = shares[5] ** 2 / power, shares[5] / power
                     x_px, y_px, wide_px = x, y, width_px
     return most, height_e, x_px, y_px, wide_px

@@ -5,11 +5,12 @@ from collections.abc import Container, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster
-from perception.robust.problem import Problem
+from perception.robust.problem import Problem, Window
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.search.structure import EDGES, structure_of
 from perception.robust.solve import Solution, solve
@@ -71,12 +72,12 @@ def by_flanks(
             continue
         (member,), window = cluster.members, cluster.window
         width_px = int(prepared.clipped_in(member.blob.box).any(axis=0).sum())
-        state = np.where(prepared.clipped_columns(window.box), UNUSABLE, window.state).astype(np.uint8)
+        beside = _without(prepared.clipped_columns(window.box), window)
         for part in _WIDTHS_OF_DISC:
             times = (0.5 * part * width_px / max(member.image_radius_px, 1e-9)) ** 2
             start = member.u_px, member.v_px, member.log_range(max(times * member.flux_e, 1.0))
             tried.append(index)
-            problems.append(Problem(replace(window, state=state), [start], cluster.background_e))
+            problems.append(Problem(beside, [start], cluster.background_e))
     likeliest: dict[int, Solution] = {}
     for index, one in zip(tried, solve(problems, camera), strict=True):
         clips = one is not None and float(one.expected_e.max()) > one.window.clip_e
@@ -97,7 +98,11 @@ def without_spill(
         spilled = prepared.clipped_columns(solution.window.box)
         if spilled.any():
             tried.append(index)
-            state = np.where(spilled, UNUSABLE, solution.window.state).astype(np.uint8)
-            problems.append(solution.again(replace(solution.window, state=state)))
+            problems.append(solution.again(_without(spilled, solution.window)))
     fits = zip(tried, solve(problems, camera), strict=True)
     return {index: again for index, again in fits if again is not None}
+
+
+def _without(columns: NDArray[np.bool_], window: Window) -> Window:
+    """Return a window that does not look at some of its columns."""
+    return replace(window, state=np.where(columns, UNUSABLE, window.state).astype(np.uint8))

@@ -7,6 +7,7 @@ about its end; one that has come so far, and explains too little, is given up.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from perception.model.pixels import (
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera
 from perception.robust.fit import Fit
-from perception.robust.solve import solutions_of
+from perception.robust.solve import Solution, solutions_of
 
 Array = NDArray[np.float64]
 
@@ -32,7 +33,27 @@ _MOST_STEPS = 30  # what is of another shape goes on without an end
 # In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
 _SETTLED = 0.02
 _JUDGED_AFTER = 4  # steps
+_MOST_GIVEN_UP = 3  # guesses, from the likeliest on, after which none of the others comes to anything
 _MORE_TO_GAIN, _TIMES_TO_GAIN = 10.0, 3.0  # in −2 ln L, over what is to be had to first order
+
+
+def good_ones(
+    solutions: Iterable[Solution | None], is_good: Callable[[Solution], bool], enough: int
+) -> list[Solution]:
+    """Return what guesses come to, followed one by one, as far as it is good; until there are enough.
+
+    None of those first ones comes to anything where `_MOST_GIVEN_UP` have come to nothing.
+    """
+    good: list[Solution] = []
+    given_up = 0
+    for solution in solutions:
+        if solution is None:
+            given_up += 1
+        elif is_good(solution):
+            good.append(solution)
+        if len(good) == enough or (given_up == _MOST_GIVEN_UP and not good):
+            break
+    return good
 
 
 class Climb(ABC):

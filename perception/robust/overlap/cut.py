@@ -8,6 +8,7 @@ bright the source is and how its limb bends still tell how far it is.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +19,9 @@ from perception.model.spread import spread_nodes
 from perception.model.window import Camera, lay_out
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
-from perception.robust.overlap.climb import Climb
+from perception.robust.overlap.climb import Climb, good_ones
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
-from perception.robust.overlap.eclipse import MOST_GIVEN_UP, finer, is_as_bright, lit_pixels
+from perception.robust.overlap.eclipse import finer, is_as_bright, lit_pixels
 from perception.robust.overlap.hidden import RAMP_PX
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
@@ -74,19 +75,15 @@ def cut_discs(
         if fits and one is not None and one.count == 1:
             fits.insert(0, _Cut(cluster, _where_light_lacks(one), camera))
         to_beat = parted[index].cost + NO_RIVAL if index in parted else math.inf
-        good: list[Solution] = []
-        given_up = 0
-        for fit in fits[:_TRIED]:
-            if len(good) == _GOOD or (given_up == MOST_GIVEN_UP and not good):
-                break
-            cut = fit.solution(to_beat)
-            if cut is None:
-                given_up += 1
-            elif cut.left_over.is_good and (one is None or gain(one, cut) >= LEAST_GAIN):
-                good.append(cut)
+        cut = (fit.solution(to_beat) for fit in fits[:_TRIED])
+        good = good_ones(cut, partial(_explains_more, one), _GOOD)
         if good:
             cuts[index] = min(good, key=lambda cut: cut.cost)
     return cuts
+
+
+def _explains_more(one: Solution | None, cut: Solution) -> bool:
+    return cut.left_over.is_good and (one is None or gain(one, cut) >= LEAST_GAIN)
 
 
 def _where_light_lacks(one: Solution) -> Guess:

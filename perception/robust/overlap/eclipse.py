@@ -19,7 +19,7 @@ from perception.model.window import Camera, lay_out
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import MODEL_ERROR
-from perception.robust.overlap.climb import Climb
+from perception.robust.overlap.climb import Climb, good_ones
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
 from perception.robust.overlap.hidden import expectation_of_two
 from perception.robust.overlap.oval import gain_over_oval
@@ -48,9 +48,6 @@ _DIMMEST, _BRIGHTEST = (
     0.5,
     1.5,
 )  # of what is lit, over the brightness of sources: where clipped it seems dimmer
-
-MOST_GIVEN_UP = 3
-"""After so many guesses, from the likeliest on, that come to nothing none of the others comes to anything."""
 
 _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
@@ -103,16 +100,11 @@ def eclipses(
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
         fits.sort(key=lambda fit: fit.objective)
         fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
-        good: list[Solution] = []
-        given_up = 0
-        for fit in fits:
-            if len(good) == _TRIED or (given_up == MOST_GIVEN_UP and not good):
-                break
-            pair = fit.solution()
-            if pair is None:
-                given_up += 1
-            elif pair.left_over.is_good and are_apart(pair, camera):
-                good.append(pair)
+        good = good_ones(
+            (fit.solution() for fit in fits),
+            lambda pair: pair.left_over.is_good and are_apart(pair, camera),
+            _TRIED,
+        )
         if not good:
             continue
         rivals[index] = likeliest = min(good, key=lambda pair: pair.cost)
@@ -293,9 +285,7 @@ def hidden_log_range(solution: Solution, index: int) -> float:
     if solution.is_eclipse or solution.count == 1:
         return 0.0
     apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
-    others_px = solution.image_radius_px
-    if solution.motion_px is not None:
-        others_px = others_px - 0.5 * np.hypot(*solution.motion_px.T)
+    others_px = solution.radius_at_rest_px
     own_px = float(others_px[index])
     farther = solution.log_range[index] - solution.log_range[apart_px < 2.0 * others_px]
     # Of two discs of unlike size the chord of the smaller one: what a half plane at the mean edge cuts off.

@@ -50,12 +50,11 @@ def test_balls_whose_charge_spills_are_ranged_by_their_flanks(
 ) -> None:
     """One and a half to 2.6 times full scale, the charge beyond it spilled along columns: all but one were lost."""
     camera, exposure_s = calibration(), 8e-4
-    generator, full_e = random(79, 1), 4095 / 0.74
+    generator, full_e = random(79, 1), camera.saturation_dn / camera.system_gain_dn_per_e
     charge_e = generator.poisson(expected_e(camera, [place], exposure_s) + 20.0).astype(np.float32)
     bloom_into(charge_e, full_e, spilled)
-    seen = replace(camera, read_noise_e=0.0)
     charge_e += generator.normal(0.0, camera.read_noise_e, charge_e.shape).astype(np.float32)
-    frame = expose(np.zeros(charge_e.shape), seen, generator, exposure_s)
+    frame = expose(np.zeros(charge_e.shape), camera, generator, exposure_s)
     counts_dn = np.clip(np.rint(camera.system_gain_dn_per_e * charge_e + camera.black_level_dn), 0, 4095)
     (told,) = perception.detect(replace(frame, data_dn=counts_dn.astype(np.uint16)), camera)
     u, v, range_m = place

@@ -81,7 +81,7 @@ def test_halos_are_what_a_lens_shows_of_a_lit_wall(
         psf_sigma_px=SIGMA_PX,
         starts=[(40.0 + PLACE[0], 30.0 + PLACE[1], 1.0)],
         flux_e=np.array([1000.0]),
-        image_radius_px=np.array([radius_px + 0.5 * most_px]),
+        radius_at_rest_px=np.array([radius_px]),
         most_motion_px=most_px,
         motion_px=None if motion is None else np.array([motion]),
     )
