@@ -15,7 +15,7 @@ from perception import Calibration, Detection, RawFrame
 from perception.model.bearing import bearing_body
 from perception.model.ranging import range_from_flux
 from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2
-from perception.robust.aperture import aperture_flux
+from perception.robust.large.aperture import aperture_flux
 
 APERTURE_PX = 12.0
 RING_PX = (16.0, 24.0)  # the background is measured between these radii

@@ -302,19 +302,21 @@ def lamps(
 ) -> dict[str, Any]:
     """Evenly bright rectangles and discs of 6 to 60 px, a third of them clipped, and nothing else."""
     camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=source_radius_m)
+    parts = 8
+    within = (np.arange(parts * CELL_PX) + 0.5) / parts - 0.5 * CELL_PX  # from a cell's middle
     alarms = count = 0
     for index in range(first, first + frames):
         generator = random(12, index)
         mean_e = np.full((camera.height_px, camera.width_px), BACKGROUND_E)
-        rows, columns = np.indices(mean_e.shape)
         for u, v in cell_centres(1):
             half_u, half_v = 0.5 * 10.0 ** generator.uniform(0.8, 1.7, 2)
             level_e = 10.0 ** generator.uniform(2.0, 4.2)
-            x, y = (columns - u) / half_u, (rows - v) / half_v
-            inside = (
-                (np.hypot(x, y) < 1.0) if generator.random() < 0.5 else (np.maximum(abs(x), abs(y)) < 1.0)
-            )
-            mean_e += np.where(inside, level_e, 0.0)
+            du, dv = generator.uniform(-0.5, 0.5, 2)
+            x, y = (within - du) / half_u, (within[:, None] - dv) / half_v
+            inside = np.hypot(x, y) < 1.0 if generator.random() < 0.5 else np.maximum(abs(x), abs(y)) < 1.0
+            covered = inside.reshape(CELL_PX, parts, CELL_PX, parts).mean(axis=(1, 3))  # no stairs
+            top, left = round(v + 0.5) - CELL_PX // 2, round(u + 0.5) - CELL_PX // 2
+            mean_e[top : top + CELL_PX, left : left + CELL_PX] += level_e * covered
             count += 1
         frame = expose(gaussian_filter(mean_e, camera.psf_sigma_px), camera, random(13, index), EXPOSURE_S)
         alarms += len(perception.detect(frame, camera, estimator))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import direction_camera, pixel_turn
+from perception.model.bearing import direction_camera
 from perception.model.flare import PixelBox
 from perception.model.lens import stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
@@ -36,9 +36,6 @@ LEAST_RANGE_M = 0.03
 
 MAX_IMAGE_RADIUS_PX = 28.0
 """Sources that look larger are fitted as they are, or not at all: looking for what may hide them is dear."""
-
-MOST_FITTED_RADIUS_PX = 130.0
-"""So far are images laid out exactly (`model.discs`)."""
 
 # Few sizes of windows, as what texture looks like is reckoned once for each.
 _SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX)
@@ -84,8 +81,7 @@ class Candidate:
     def is_too_large(self) -> bool:
         """Whether its image is larger than is fitted."""
         clipped_disc_px = math.sqrt(self.clipped_px / math.pi)
-        longest_px = max(self.blob.box.height, self.blob.box.width)
-        return max(self.image_radius_px, clipped_disc_px, longest_px / 3.0) > MAX_IMAGE_RADIUS_PX
+        return is_large(self.blob) or max(self.image_radius_px, clipped_disc_px) > MAX_IMAGE_RADIUS_PX
 
     @property
     def is_beyond_fit(self) -> bool:
@@ -96,6 +92,11 @@ class Candidate:
         """Logarithm of the range of a source of that flux; where no range can be had, of flux 1 at 1 m."""
         at_one_metre_e = self.at_one_metre_e if self.at_one_metre_e > 0.0 else 1.0
         return 0.5 * math.log(at_one_metre_e / flux_e)
+
+
+def is_large(blob: Blob) -> bool:
+    """Tell whether a blob is longer than what is fitted."""
+    return max(blob.box.height, blob.box.width) > 3.0 * MAX_IMAGE_RADIUS_PX
 
 
 def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate]:
@@ -265,7 +266,7 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
     factors = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
     if len(cluster.members) == 1 and cluster.is_clipped:
         factors = tuple(sorted({*factors, *_factor_by_outline(cluster.members[0], prepared)}))
-    floor_e = 3.0 * math.sqrt(prepared.floor_e2)
+    floor_e = least_flux_e(prepared)
     sets: list[list[Start]] = []
     for factor in factors:
         starts: list[Start] = []
@@ -292,6 +293,11 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
     return sets
 
 
+def least_flux_e(prepared: PreparedFrame) -> float:
+    """Return the least flux that first guesses begin with."""
+    return 3.0 * math.sqrt(prepared.floor_e2)
+
+
 def _factor_by_outline(member: Candidate, prepared: PreparedFrame) -> tuple[float, ...]:
     """Return how many times as bright a clipped flare is if it is a disc as large as what is clipped."""
     places = np.argwhere(prepared.clipped_in(member.blob.box) & member.blob.pixels)
@@ -300,44 +306,6 @@ def _factor_by_outline(member: Candidate, prepared: PreparedFrame) -> tuple[floa
     # Along its longer axis an ellipse scatters by the square of half of that axis, over four.
     longest_px = 2.0 * math.sqrt(float(np.linalg.eigvalsh(np.cov(places.T))[1]))
     return (max((longest_px / member.image_radius_px) ** 2, 1.0),)
-
-
-def guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> list[Start] | None:
-    """Return first guesses of large discs from what is seen of their outlines, which the frame may cut.
-
-    Of a sphere's image the half axes along columns and rows follow from its angular radius; the frame's edge
-    may cut one of them, hardly both. None where a member is clipped, has no range, or is larger than images
-    are laid out for.
-    """
-    calibration, (height, width) = prepared.calibration, prepared.shape
-    if not calibration.source_radius_m > 0.0:
-        return None
-    starts: list[Start] = []
-    for member in cluster.members:
-        box = member.blob.box
-        if member.is_clipped or not member.at_one_metre_e > 0.0:
-            return None
-        (turn,) = pixel_turn([[member.u_px, member.v_px]], calibration)
-        px_per_rad = np.sqrt(np.diagonal(np.linalg.inv(turn @ turn.T)))
-        lit_px = np.array([box.width, box.height], dtype=np.float64)
-        angle_rad = float((0.5 * lit_px / px_per_rad).max())
-        along_u_px, along_v_px = (angle_rad * px_per_rad).tolist()
-        if not max(along_u_px, along_v_px) < MOST_FITTED_RADIUS_PX:
-            return None
-        u_px = _middle(box.left, box.width, width, along_u_px)
-        v_px = _middle(box.top, box.height, height, along_v_px)
-        starts.append((u_px, v_px, math.log(calibration.source_radius_m / math.sin(min(angle_rad, 1.5)))))
-    return starts
-
-
-def _middle(first: int, lit: int, all_px: int, half_px: float) -> float:
-    """Return the middle of so many lit pixels along an axis; where one end of it is cut, by the other."""
-    ends = first - 0.5, first + lit - 0.5
-    if first == 0 and first + lit < all_px:
-        return ends[1] - half_px
-    if first + lit == all_px and first > 0:
-        return ends[0] + half_px
-    return 0.5 * (ends[0] + ends[1])
 
 
 def _window_box(members: Sequence[Candidate], prepared: PreparedFrame) -> PixelBox:

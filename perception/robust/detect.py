@@ -12,8 +12,9 @@ from perception.model.bearing import bearing_body
 from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
 from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
-from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
-from perception.robust.measure import MeasuredFlare, measure
+from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended, is_large
+from perception.robust.flare import MeasuredFlare
+from perception.robust.measure import measure
 from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.hills import prominent, summit
@@ -230,7 +231,9 @@ def _off_hill(
     clips = part.pixels & prepared.clipped_in(part.box)
     around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
     # Its brightest pixel may be the flank of another, larger one.
-    flare = part if around.max() > part.peak_e else summit(part, clips, reach_px)
+    # What is clipped is as bright as its hill for all that is known; but a hill is too large to be fitted.
+    left_alone = np.zeros_like(clips) if is_large(part) else clips
+    flare = part if around.max() > part.peak_e else summit(part, left_alone, reach_px)
     if flare is not part or part.area_px < _LARGE_HILL * (reach_px + 1) ** 2 or clips.any():
         return [flare]
     return prominent(part, component, noise_e, reach_px, prepared.shape) or [part]

@@ -38,7 +38,7 @@ from perception.robust.overlap.deblend import (
 )
 from perception.robust.overlap.eclipse import eclipses
 from perception.robust.overlap.limb import may_be_other_shape
-from perception.robust.overlap.oval import gain_over_oval
+from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import weighed
 from perception.robust.overlap.unparted import doubted
@@ -378,7 +378,7 @@ def _is_oval(one: Solution, several: Solution, camera: Camera) -> bool:
         or not float(several.image_radius_px.max()) > LEAST_RADIUS_PX
     ):
         return False
-    return gain_over_oval(several, camera) < LEAST_GAIN
+    return fit_oval(several, camera).chi2_more < LEAST_GAIN
 
 
 def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:

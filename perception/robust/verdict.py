@@ -6,21 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.bearing import pixel_turn
 from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.window import Camera
-from perception.robust.clusters import LEAST_RANGE_M, Candidate
 from perception.robust.goodness import MODEL_ERROR, noise_e2
 from perception.robust.overlap.deblend import of_free_width
-from perception.robust.search.prepare import PreparedFrame
+from perception.robust.overlap.oval import fit_oval
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
 
 REACH_PX, REACHED_SHARE = 2, 0.02
-_DISC_FILLS = (0.88, 1.12)
-_MOST_ASPECT = 1.5
-_MOST_BRIGHTNESS_FACTOR = 2.0
 _LEAST_PX, _LEAST_SHARE = 1.0, 0.15
 _FLANK_PX, _FLANK_SHARE = 3.0, 0.25
 _FLANK_PEAKS, _FLANK_PEAKS_ON_EDGES = 0.5, 1.0
@@ -28,6 +23,12 @@ _LEAST_SEEN, _MOST_OFF = 2.0 / 3.0, 0.5
 _CLIPPED_DIM, _MOST_CLIPPED_DIM = 0.5, 0.1
 _MOST_OF_CLIPPED = 2  # flares more than blobs
 _LIMB_RADIUS_PX, _MOST_LEFT_OF_LIMB = 2.0, 0.1
+_MOST_LIMB_ASPECT, _MOST_LIMB_BRIGHTNESS, _OF_TIE = (
+    1.08,
+    1.15,
+    4.0,
+)  # of sources that are not quite round or known
+_LEAST_GAIN_OF_OVAL = 30.0  # 2 Δ ln L: real sources give it 10 at most, lamps 50 to 325
 
 
 def is_one_pixel(solution: Solution) -> bool:
@@ -193,17 +194,23 @@ def is_any_outline(solution: Solution, blobs: int) -> bool:
 
 
 def is_other_limb(solution: Solution, camera: Camera) -> bool:
-    """Tell whether what is seen of the limb of a clipped disc is not that of a source.
+    """Tell whether what is seen of the limb of a clipped disc that fits badly is not that of a source.
 
-    How bright it is within nobody sees; but the limb of a lamp that is dimmer than sources are, or not round,
-    lies elsewhere: lamps of 0.35 to 0.75 of their brightness leave 11 to 24 % of the light there. Sources
-    leave less than a tenth, fitted with the point spread's width free where it is not the calibration's.
+    How bright it is within nobody sees; but the limb of a lamp that is dimmer or brighter than sources are,
+    or not round, lies elsewhere. Where a disc of such a kind explains far more than a source does, also
+    through a point spread that is not the calibration's, it is none; nor is what leaves a tenth of the light.
     """
-    is_disc = solution.count == 1 and float(solution.radius_at_rest_px[0]) >= _LIMB_RADIUS_PX
-    if not is_disc or solution.left_over.share < _MOST_LEFT_OF_LIMB:
+    if solution.count > 1 or float(solution.radius_at_rest_px[0]) < _LIMB_RADIUS_PX:
         return False
     (wider,) = of_free_width([solution], camera)
-    return wider is None or wider.left_over.share > _MOST_LEFT_OF_LIMB
+    if wider is None or wider.left_over.share > _MOST_LEFT_OF_LIMB:
+        return solution.left_over.share > _MOST_LEFT_OF_LIMB
+    if wider.left_over.is_good:
+        return False
+    oval = fit_oval(wider, camera)
+    log_brightness = abs(math.log(oval.brightness)) - 2.0 * _OF_TIE * camera.tie_spread
+    is_other = oval.aspect > _MOST_LIMB_ASPECT or log_brightness > math.log(_MOST_LIMB_BRIGHTNESS)
+    return is_other and oval.chi2_more < -_LEAST_GAIN_OF_OVAL
 
 
 def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) -> bool:
@@ -222,32 +229,3 @@ def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) 
         return False
     tied_px, free_px = float(solution.image_radius_px[0]), float(free.image_radius_px[0])
     return abs(free_px - tied_px) > max(_LEAST_PX, (_LEAST_SHARE + 4.0 * tie_spread) * tied_px)
-
-
-def is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
-    """Tell whether a blob too large to be fitted is no source: by its outline, its brightness, its range.
-
-    The image of a sphere is an ellipse, hardly longer than wide but as the lens stretches it, and as bright
-    at any range: its flux at one metre over the solid angle that it fills there, times that of a pixel.
-    """
-    box, calibration = member.blob.box, prepared.calibration
-    rows, columns = prepared.shape
-    cut = box.top == 0 or box.left == 0 or box.top + box.height == rows or box.left + box.width == columns
-    (turn,) = pixel_turn([[member.u_px, member.v_px]], calibration)
-    long_rad, short_rad = map(float, np.linalg.svd(turn, compute_uv=False))
-    most_aspect = _MOST_ASPECT * long_rad / short_rad
-    fill = member.blob.area_px / (0.25 * math.pi * box.height * box.width)
-    aspect = max(box.height, box.width) / min(box.height, box.width)
-    # What the frame's edge cuts off a disc leaves no rectangle.
-    if fill > _DISC_FILLS[1] or (not cut and (fill < _DISC_FILLS[0] or aspect > most_aspect)):
-        return True
-    radius_px = 0.5 * math.sqrt(box.height * box.width)
-    if calibration.fx_px * calibration.source_radius_m / radius_px < LEAST_RANGE_M:
-        return True
-    if not member.at_one_metre_e > 0.0:
-        return False
-    disc_e = member.at_one_metre_e * long_rad * short_rad / (math.pi * calibration.source_radius_m**2)
-    seen_e = float(np.median(prepared.excess_e[box.slices][member.blob.pixels]))
-    if disc_e > seen_e:
-        return not member.is_clipped and disc_e > _MOST_BRIGHTNESS_FACTOR * seen_e
-    return seen_e > _MOST_BRIGHTNESS_FACTOR * disc_e

@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import dblquad, quad
 
 from nir_render import expected_electrons, render
-from perception.robust.aperture import aperture_flux
+from perception.robust.large.aperture import aperture_flux
 from tests.physics.conftest import SceneMaker, source_at
 
 pytestmark = pytest.mark.mitsuba

@@ -18,6 +18,9 @@ from perception.robust.solve import Solution, solve
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
 
+_FEWEST_OF_FLANKS = 8
+"""Pixels of a flare that must be seen beside columns that are left out: 18 of a point clipped 20 times."""
+
 _WIDTHS_OF_DISC = (0.5, 1.0)
 """Of what is clipped, first guesses: a disc is as wide, the image of a point is so by its point spread."""
 
@@ -53,7 +56,7 @@ def retry_without_spill(
     """Fit badly fitted clipped flares without the columns of clipped pixels, where charge may spill."""
     alone = [None if index in parted else one for index, one in enumerate(best)]
     for index, again in without_spill(alone, prepared, camera).items():
-        if again.left_over.share < MOST_LEFT:
+        if explains_flanks(again):
             best[index] = again
 
 
@@ -81,9 +84,14 @@ def by_flanks(
     likeliest: dict[int, Solution] = {}
     for index, one in zip(tried, solve(problems, camera), strict=True):
         clips = one is not None and float(one.expected_e.max()) > one.window.clip_e
-        if one is not None and clips and one.left_over.share < MOST_LEFT:
+        if one is not None and clips and explains_flanks(one):
             likeliest[index] = min(likeliest.get(index, one), one, key=lambda fit: fit.deviance)
     return likeliest
+
+
+def explains_flanks(one: Solution) -> bool:
+    """Tell whether a flare explains what is seen of it beside columns that are left out, and enough is."""
+    return one.left_over.share < MOST_LEFT and one.left_over.pixels >= _FEWEST_OF_FLANKS
 
 
 def without_spill(

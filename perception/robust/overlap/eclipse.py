@@ -22,7 +22,7 @@ from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.climb import Climb, good_ones
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
 from perception.robust.overlap.hidden import expectation_of_two
-from perception.robust.overlap.oval import gain_over_oval
+from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
     OTHER_SIGMAS,
     are_apart,
@@ -114,7 +114,9 @@ def eclipses(
         of_one_robot = is_of_a_layout(likeliest, camera)
         least_gain = _LEAST_OF_A_LAYOUT if of_one_robot else LEAST_GAIN
         # An oval explains no more than one of several flares.
-        is_believed = of_one_robot if likeliest.count > 2 else gain_over_oval(likeliest, camera) >= least_gain
+        is_believed = (
+            of_one_robot if likeliest.count > 2 else fit_oval(likeliest, camera).chi2_more >= least_gain
+        )
         if is_believed:
             pairs[index] = replace(rivals.pop(index), is_eclipse=not _may_be_other(likeliest, camera))
     return pairs, rivals

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.sensor import gain_dn_per_e, noise_floor_e2
+from perception.model.sensor import gain_dn_per_e, noise_floor_e2, saturation_dn
 from perception.types import Calibration, RawFrame
 
 CELL_PX = 64
@@ -22,6 +22,7 @@ LEAST_RATIO_AROUND = 1.05
 """As much the mean over 5 × 5 parts must have: chance gives it to one even frame in a hundred or so."""
 
 _SAMPLES_PER_AXIS = 24
+_LEAST_FREE = 0.125  # of a cell, that is not clipped
 _SCATTER_SAMPLES_PER_AXIS = 16
 
 
@@ -29,9 +30,9 @@ def background_mesh_e(frame: RawFrame, calibration: Calibration) -> NDArray[np.f
     """Background in electrons per pixel on a mesh of cells of about 64 px.
 
     In each cell the mean of what lies within 3 σ of the median, σ from the noise model at that median; the
-    median of what is kept decides the next round. Then a median over 3 × 3 cells removes cells that a large
-    flare fills. A cell is sampled at 24 × 24 of its pixels: the error is σ/24, of which a detection notices
-    nothing.
+    median of what is kept decides the next round. Clipped pixels are no background: a cell that they fill is
+    as those around it. Then a median over 3 × 3 cells removes cells that a large flare fills. A cell is
+    sampled at 24 × 24 of its pixels: the error is σ/24, of which a detection notices nothing.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def background_mesh_e(frame: RawFrame, calibration: Calibration) -> NDArray[np.f
     """
     import cv2
 
-    gain = gain_dn_per_e(frame, calibration)
+    gain, clipped_dn = gain_dn_per_e(frame, calibration), saturation_dn(calibration, frame.gain)
     rows, columns = (_sample_places(length, _SAMPLES_PER_AXIS) for length in frame.data_dn.shape)
     mean_dn = cell_means(
         frame.data_dn,
@@ -55,9 +56,24 @@ def background_mesh_e(frame: RawFrame, calibration: Calibration) -> NDArray[np.f
         float(frame.black_level_dn),
         gain,
         noise_floor_e2(calibration, frame.gain),
+        clipped_dn,
     )
-    mesh = ((mean_dn - frame.black_level_dn) / gain).astype(np.float32)
+    mesh = ((_filled(mean_dn, clipped_dn) - frame.black_level_dn) / gain).astype(np.float32)
     return np.asarray(cv2.medianBlur(mesh, 3), dtype=np.float32).reshape(mesh.shape)
+
+
+def _filled(mesh: NDArray[np.float64], if_none: float) -> NDArray[np.float64]:
+    """Give cells without a value the mean of those beside them, from the border of the rest inwards."""
+    if np.isnan(mesh).all():
+        return np.full_like(mesh, if_none)
+    filled = mesh
+    while np.isnan(filled).any():
+        around = np.pad(filled, 1, constant_values=np.nan)
+        beside = np.stack([around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]])
+        known = np.isfinite(beside)
+        mean = np.where(known, beside, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        filled = np.where(np.isnan(filled) & known.any(axis=0), mean, filled)
+    return filled
 
 
 def spread_mesh(mesh: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
@@ -93,14 +109,17 @@ def scatter_places(shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[n
     return rows, columns
 
 
-def scatter_ratio(samples: NDArray[np.float32], noise_mesh_e: NDArray[np.float32]) -> NDArray[np.float32]:
+def scatter_ratio(
+    samples: NDArray[np.float32], noise_mesh_e: NDArray[np.float32], clipped_mesh_e: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Scatter of a filtered image in each cell relative to that of noise; 1 where it is no larger.
 
-    `samples` are those of all cells' rows and columns, one after another's, shape (rows, columns).
+    `samples` are those of all cells' rows and columns, one after another's, shape (rows, columns). What is
+    clipped, above `clipped_mesh_e`, is no part of a background.
     """
     import cv2
 
-    ratio = cell_scatter(samples, noise_mesh_e)
+    ratio = cell_scatter(samples, noise_mesh_e, clipped_mesh_e)
     smooth = np.asarray(cv2.medianBlur(ratio, 3), dtype=np.float32).reshape(ratio.shape)
     # A cell's ratio is known to 6 % only: those around must have some structure too.
     around = np.asarray(cv2.blur(ratio, (5, 5)), dtype=np.float32).reshape(ratio.shape)
@@ -111,12 +130,12 @@ def scatter_ratio(samples: NDArray[np.float32], noise_mesh_e: NDArray[np.float32
 @compiled
 def cell_means(
     data_dn: NDArray[np.uint16], rows: NDArray[np.int64], columns: NDArray[np.int64],
-    black_dn: float, gain_dn_per_e: float, floor_e2: float,
+    black_dn: float, gain_dn_per_e: float, floor_e2: float, clipped_dn: int,
 ) -> NDArray[np.float64]:  # fmt: skip
     """Return the mean count of each cell within 3 σ of the median, σ from the noise model at that median.
 
     By a histogram of counts: counts that many pixels share are looked at once. `rows` and `columns` say
-    which pixels of each cell are looked at, shape (cells, samples).
+    which pixels of each cell are looked at, shape (cells, samples). NaN where nearly all are clipped.
     """
     means = np.empty((len(rows), len(columns)))
     count_of = np.zeros((len(columns), 1 << 16), dtype=np.uint16)
@@ -133,10 +152,15 @@ def cell_means(
                     least, most = min(least, count), max(most, count)
                 lowest[across], highest[across] = least, most
         for across in range(len(columns)):
-            means[down, across] = _clipped_mean(
-                count_of[across], lowest[across], highest[across], rows.shape[1] * columns.shape[1],
-                black_dn, gain_dn_per_e, floor_e2,
-            )  # fmt: skip
+            seen, free = rows.shape[1] * columns.shape[1], min(highest[across], clipped_dn - 1)
+            kept = seen
+            for count in range(free + 1, highest[across] + 1):
+                kept -= int(count_of[across, count])
+            means[down, across] = math.nan
+            if kept > _LEAST_FREE * seen:
+                means[down, across] = _clipped_mean(
+                    count_of[across], lowest[across], free, kept, black_dn, gain_dn_per_e, floor_e2
+                )
             count_of[across, lowest[across] : highest[across] + 1] = 0
     return means
 
@@ -169,26 +193,35 @@ def _clipped_mean(
 
 
 @compiled
-def cell_scatter(samples: NDArray[np.float32], noise_mesh: NDArray[np.float32]) -> NDArray[np.float32]:
+def cell_scatter(
+    samples: NDArray[np.float32], noise_mesh: NDArray[np.float32], most_mesh: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Return an image's scatter in each cell over its noise, blind to its outer thirds, where flares are.
 
-    By a histogram, to less than a hundredth of the noise; where it scatters too far for that, by sorting.
-    `samples` has as many rows and columns for each cell, one cell's after another's.
+    Of samples below `most_mesh` alone; 0 where there are next to none. By a histogram, to less than a
+    hundredth of the noise; where it scatters too far for that, by sorting. `samples` has as many rows and
+    columns for each cell, one cell's after another's.
     """
     scatter = np.empty(noise_mesh.shape, dtype=np.float32)
     tall, wide = samples.shape[0] // len(noise_mesh), samples.shape[1] // noise_mesh.shape[1]
-    low, high = round(0.1587 * (tall * wide - 1)), round(0.8413 * (tall * wide - 1))
     last = 2 * STEPS_PER_NOISE * MOST_NOISES + 1
     count_of = np.empty(last + 1, dtype=np.int32)
     for down in range(len(noise_mesh)):
         for across in range(noise_mesh.shape[1]):
             cell = samples[down * tall : (down + 1) * tall, across * wide : (across + 1) * wide]
             count_of[:] = 0
-            per_unit = np.float32(STEPS_PER_NOISE) / noise_mesh[down, across]
+            per_unit, kept = np.float32(STEPS_PER_NOISE) / noise_mesh[down, across], 0
             for row in range(tall):
                 for column in range(wide):
+                    if cell[row, column] >= most_mesh[down, across]:
+                        continue
+                    kept += 1
                     place = cell[row, column] * per_unit + np.float32(0.5 * last)
                     count_of[int(min(max(np.float32(0.0), place), np.float32(last)))] += 1
+            if not kept > _LEAST_FREE * tall * wide:
+                scatter[down, across] = 0.0
+                continue
+            low, high = round(0.1587 * (kept - 1)), round(0.8413 * (kept - 1))
             step, up_to = 0, count_of[0]
             while up_to <= low:
                 step += 1
@@ -200,6 +233,6 @@ def cell_scatter(samples: NDArray[np.float32], noise_mesh: NDArray[np.float32]) 
             if first > 0 and step < last:
                 scatter[down, across] = 0.5 * (step - first) / STEPS_PER_NOISE
             else:
-                ordered = np.sort(cell.copy().ravel())
+                ordered = np.sort(cell.copy().ravel())  # what is left out is the end of it
                 scatter[down, across] = 0.5 * (ordered[high] - ordered[low]) / noise_mesh[down, across]
     return scatter

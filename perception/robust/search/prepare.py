@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
 from perception.model.layout import Structure
-from perception.model.sensor import electrons, gain_dn_per_e, noise_floor_e2, saturation_dn
+from perception.model.sensor import clip_level_e, electrons, gain_dn_per_e, noise_floor_e2, saturation_dn
 from perception.robust.search.background import (
     as_wide,
     background_mesh_e,
@@ -38,6 +38,10 @@ MOST_STRUCTURED_PX = 129
 """Larger windows are fitted on an even background."""
 
 _BAD_SIGMAS = 5.0
+_CLIPPED_FILTERED, _CLIPPED_NOISES = (
+    0.9,
+    8.0,
+)  # of what clips, above the background; by that it must stand out
 _SMOOTHING_REACH = 4
 
 
@@ -208,7 +212,11 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     sample_of = np.full(calibration.height_px, -1)
     sample_of[rows.ravel()] = np.arange(rows.size)
     lit_at, lit_e, samples = exceeding(pixels, narrow, limit_e, sample_of, columns.ravel())
-    ratio = scatter_ratio(samples, noise_mesh_e)
+    clipped_mesh_e = _CLIPPED_FILTERED * (
+        clip_level_e(calibration, frame.black_level_dn, frame.gain) - mesh_e
+    )
+    clipped_mesh_e[~(clipped_mesh_e > _CLIPPED_NOISES * noise_mesh_e)] = np.inf
+    ratio = scatter_ratio(samples, noise_mesh_e, clipped_mesh_e)
     structured = bool((ratio > 1.0).any())
     if structured:
         limit_e = as_wide(limit_mesh_e * ratio, calibration)
@@ -330,7 +338,8 @@ def _local_contrast(
     rows, columns = (each[part] for each, part in zip(scatter_places(prepared.shape), cells, strict=True))
     samples = contrast_e[np.ix_(rows.ravel() - top, columns.ravel() - left)]
     more = np.ones_like(ratio)
-    more[tuple(cells)] = scatter_ratio(samples, noise_mesh_e[tuple(cells)] * share)
+    noise_e = noise_mesh_e[tuple(cells)] * share
+    more[tuple(cells)] = scatter_ratio(samples, noise_e, np.full_like(noise_e, np.inf))
     # Cells of even ground have no limit here.
     limit_e = np.where(structured, limit_mesh_e * share * more, np.float32(1e9))
     within = np.arange(top, bottom)[:, None] * calibration.width_px + np.arange(left, right)

@@ -79,7 +79,9 @@ def expected_e(
         radius_rad = np.arcsin(camera.source_radius_m / range_m)
         radius_px = camera.fx_px * np.tan(radius_rad) / cos_theta**2
         fine = 32 if radius_px < 3 else 16
-        half = int(np.ceil(radius_px + 6 * camera.psf_sigma_px + 1))
+        theta_rad = np.arccos(cos_theta)  # outwards the image reaches farthest
+        reach_px = camera.fx_px * (np.tan(theta_rad + radius_rad) - np.tan(theta_rad))
+        half = int(np.ceil(reach_px + 6 * camera.psf_sigma_px + 1))
         left, top = round(u) - half, round(v) - half
         size = 2 * half + 1
         grid = (np.arange(size * fine) + 0.5) / fine - 0.5

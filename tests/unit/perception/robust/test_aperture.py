@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from perception.model.flare import PixelBox, flare_image
-from perception.robust.aperture import aperture_flux
+from perception.robust.large.aperture import aperture_flux
 from tests.unit.perception.simulation import calibration, random
 
 TRIALS = 400

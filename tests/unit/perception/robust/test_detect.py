@@ -90,13 +90,13 @@ def test_clipped_flares_are_recovered_from_their_wings(range_m: float) -> None:
     assert hit.range_sigma_m < 0.05 * range_m
 
 
-def test_a_flare_clipped_beyond_recovery_gives_an_upper_bound() -> None:
-    """A disc of 32 px, overexposed: too large to fit, so its clipped flux bounds the range from above."""
+def test_a_large_clipped_disc_is_ranged_by_its_limb() -> None:
+    """A disc of 32 px, overexposed: its limb, of 200 px, says where it is and how large within thousandths."""
     (hit,) = detect_robust(take([(99.3, 79.8, 0.15)], 1.35e-3, 55), SMALL)
     assert hit.saturated
-    assert hit.range_m > 0.15
-    assert math.isnan(hit.range_sigma_m)
-    assert math.hypot(hit.u_px - 99.3, hit.v_px - 79.8) < 0.5
+    assert abs(hit.range_m - 0.15) < 4.0 * hit.range_sigma_m < 0.15e-2
+    assert abs(hit.u_px - 99.3) < 4.0 * hit.u_sigma_px < 0.01
+    assert abs(hit.v_px - 79.8) < 4.0 * hit.v_sigma_px < 0.01
 
 
 @pytest.mark.parametrize(

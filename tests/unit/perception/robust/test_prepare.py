@@ -153,7 +153,9 @@ def test_scatter_of_cells_against_sorting() -> None:
     """Narrow, as noise, and 20 times as wide, beyond the histogram: within its step of the sorted samples'."""
     for width in (1.0, 20.0):
         samples = random(27, int(width)).normal(0.0, 3.0 * width, (64, 80)).astype(np.float32)
-        found = cell_scatter(samples, np.full((1, 2), 3.0, dtype=np.float32))
+        found = cell_scatter(
+            samples, np.full((1, 2), 3.0, dtype=np.float32), np.full((1, 2), np.inf, dtype=np.float32)
+        )
         for cell, part in enumerate((samples[:, :40], samples[:, 40:])):
             ordered = np.sort(part.ravel())
             low, high = round(0.1587 * (ordered.size - 1)), round(0.8413 * (ordered.size - 1))
@@ -170,7 +172,7 @@ def test_means_of_cells_against_sorting() -> None:
     for _ in range(3):
         median = kept[(kept.size - 1) // 2]
         kept = seen[abs(seen - median) <= 3.0 * np.sqrt(max(median - 64.0, 0.0) + 4.0)]
-    assert cell_means(counts, at, at, 64.0, 1.0, 4.0)[0, 0] == pytest.approx(kept.mean(), rel=1e-12)
+    assert cell_means(counts, at, at, 64.0, 1.0, 4.0, 65535)[0, 0] == pytest.approx(kept.mean(), rel=1e-12)
 
 
 def test_filter_keeps_the_place_and_is_quiet_at_the_border() -> None:

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.robust.clusters import Candidate
-from perception.robust.search.blobs import Blob
+from perception.model.ranging import range_from_flux
+from perception.model.sensor import gain_dn_per_e
+from perception.robust.clusters import Candidate, Cluster
+from perception.robust.flare import MeasuredFlare
+from perception.robust.search.blobs import Blob, dilated
 from perception.robust.search.prepare import PreparedFrame
 
 
@@ -104,4 +107,53 @@ def centroid_sigmas(member: Candidate, flux_e: float, prepared: PreparedFrame) -
     return (
         math.sqrt(float(np.sum((blob.box.left + columns - member.u_px) ** 2 * variance))) / flux_e,
         math.sqrt(float(np.sum((blob.box.top + rows - member.v_px) ** 2 * variance))) / flux_e,
+    )
+
+
+def measure_by_aperture(member: Candidate, cluster: Cluster, prepared: PreparedFrame) -> MeasuredFlare:
+    """Sum what exceeds a ring around the blob, at its centroid.
+
+    Whether it is all of a source's light, and no other's, nothing tells: no σ of range is claimed, and none
+    of the place of what is large.
+    """
+    blob, window = member.blob, cluster.window
+    frame, calibration = prepared.frame, prepared.calibration
+    reach_px = 0.5 * math.hypot(blob.box.height, blob.box.width) + 2.0
+    own = mask_in(window.box.top, window.box.left, window.usable.shape, blob)
+    lit = prepared.lit_in(window.box) & ~own
+    aperture = aperture_flux(
+        window.image_e,
+        member.u_px - window.box.left,
+        member.v_px - window.box.top,
+        reach_px,
+        reach_px,
+        reach_px + 4.0,
+        window.usable & ~dilated(lit, 2),
+    )
+    gain = gain_dn_per_e(frame, calibration)
+    ranged = range_from_flux(
+        aperture.flux * gain,
+        aperture.flux_sigma * gain,
+        member.u_px,
+        member.v_px,
+        frame.exposure_s,
+        frame.gain,
+        calibration,
+        aperture.background * gain,
+    )
+    has_place = not (member.is_clipped or member.is_too_large)
+    u_sigma_px, v_sigma_px = centroid_sigmas(member, aperture.flux, prepared)
+    return MeasuredFlare(
+        u_px=member.u_px,
+        v_px=member.v_px,
+        u_sigma_px=u_sigma_px if has_place else math.nan,
+        v_sigma_px=v_sigma_px if has_place else math.nan,
+        flux_e=aperture.flux,
+        flux_sigma_e=aperture.flux_sigma,
+        flux_noise_e=aperture.flux_sigma,
+        background_e=aperture.background,
+        range_m=ranged.range_m,
+        range_sigma_m=math.nan,
+        saturated=member.is_clipped,
+        misfit=member.is_too_large and not member.is_clipped,
     )

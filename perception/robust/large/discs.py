@@ -1,0 +1,195 @@
+"""Near sources whose discs are too large to be looked at for what hides them: fitted whole, or bounded."""
+
+import math
+from collections.abc import Container, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from perception.model.bearing import direction_camera, pixel_turn
+from perception.model.lens import stretch
+from perception.model.window import Camera
+from perception.robust.around.uneven import MOST_LEFT
+from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, least_flux_e
+from perception.robust.flare import MeasuredFlare, measured_flare
+from perception.robust.forward_light import fit_beside_forward_light
+from perception.robust.large.aperture import measure_by_aperture
+from perception.robust.large.outline import outline_of
+from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_width
+from perception.robust.problem import Problem, Start
+from perception.robust.search.blobs import Blob
+from perception.robust.search.prepare import PreparedFrame
+from perception.robust.solve import Solution, solve
+from perception.robust.verdict import is_other_limb
+
+MOST_FITTED_RADIUS_PX = 130.0
+"""So far are images laid out exactly (`model.discs`)."""
+
+_MOST_OFF_SHARE = 0.03  # of a blob's outline from a circle, on the median: squares are 0.08 off
+_MOST_BRIGHTNESS_FACTOR = 2.0
+_ODD_SIGMAS = 3.0
+_TIMES_LAID_OUT = 2  # a pixel elsewhere the lens stretches them otherwise
+
+
+def measure_large(
+    found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera, apart: bool
+) -> tuple[list[tuple[Blob, MeasuredFlare]], list[Candidate]]:
+    """Measure clusters in which a blob is too large to be looked at closely, or has no range.
+
+    Parameters
+    ----------
+    found, prepared, camera
+        The clusters, the frame they are of, and its camera.
+    apart
+        That blobs side by side have been tried together before.
+
+    Returns
+    -------
+    A blob and its measurement for each flare; and what is small among them, where whole discs do not explain
+    a cluster: it is to be measured by itself.
+    """
+    measured: list[tuple[Blob, MeasuredFlare]] = []
+    again: list[Candidate] = []
+    for cluster, solution in zip(found, _whole_discs(found, prepared, camera), strict=True):
+        misfit = solution is not None and _is_misfit(solution)
+        if solution is not None and misfit and cluster.is_clipped and is_other_limb(solution, camera):
+            continue
+        fits = solution is not None and _is_whole_discs(solution)
+        small = [] if fits or apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
+        again += [cluster.members[k] for k in small]
+        measured += _by_disc(cluster, solution if fits else None, small, prepared)
+    return measured, again
+
+
+def _whole_discs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
+    """Fit whole discs to clusters of large ones; None where there are none, or the fit did not converge."""
+    solutions: list[Solution | None] = [None] * len(found)
+    tried: list[int] = []
+    problems = []
+    for index, cluster in enumerate(found):
+        starts = _guess_by_outline(cluster, prepared)
+        if starts is not None and _large_discs(cluster, prepared):
+            tried.append(index)
+            problems.append(Problem(cluster.window, starts, cluster.background_e))
+    for _ in range(_TIMES_LAID_OUT):
+        for index, solution in zip(tried, solve(problems, camera), strict=True):
+            solutions[index] = solution
+        tried = [index for index in tried if solutions[index] is not None]
+        problems = [one.again() for one in solutions if one is not None]
+    fit_beside_forward_light(solutions, camera)
+    blurred = [index for index, one in enumerate(solutions) if one is not None and _is_misfit(one)]
+    wider = of_free_width([one for k in blurred if (one := solutions[k]) is not None], camera)
+    for index, free in zip(blurred, wider, strict=True):
+        held = solutions[index]
+        if free is not None and held is not None and free.cost < held.cost:
+            solutions[index] = free
+    return solutions
+
+
+def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> list[Start] | None:
+    """Return first guesses of large discs from what is seen of their outlines, which the frame may cut.
+
+    None where a member has no range, no outline of a sphere, or is larger than images are laid out for.
+    """
+    calibration = prepared.calibration
+    starts: list[Start] = []
+    for member in cluster.members:
+        if not (member.at_one_metre_e > 0.0 and calibration.source_radius_m > 0.0):
+            return None
+        if not member.is_too_large:
+            flux_e = max(member.flux_e, least_flux_e(prepared))
+            starts.append((member.u_px, member.v_px, member.log_range(flux_e)))
+            continue
+        outline = outline_of(member.blob, prepared)
+        if outline is None:
+            return None
+        middle_px = (outline.u_px, outline.v_px)
+        radius_px = outline.angle_rad * float(
+            stretch(direction_camera([middle_px], calibration), calibration)[0]
+        )
+        if not radius_px < MOST_FITTED_RADIUS_PX:
+            return None
+        starts.append((*middle_px, math.log(calibration.source_radius_m / math.sin(outline.angle_rad))))
+    return starts
+
+
+def _is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
+    """Tell whether a blob too large to be fitted is no source: by its outline, its brightness, its range.
+
+    The outline of a sphere is a circle in the sky, and it is as bright at any range: its flux at one metre
+    over the solid angle that it fills there, times that of a pixel.
+    """
+    calibration, outline = prepared.calibration, outline_of(member.blob, prepared)
+    if outline is None or outline.off_share > _MOST_OFF_SHARE:
+        return True
+    if calibration.source_radius_m / math.sin(outline.angle_rad) < LEAST_RANGE_M:
+        return True
+    if not member.at_one_metre_e > 0.0:
+        return False
+    (turn,) = pixel_turn([[member.u_px, member.v_px]], calibration)
+    long_rad, short_rad = map(float, np.linalg.svd(turn, compute_uv=False))
+    disc_e = member.at_one_metre_e * long_rad * short_rad / (math.pi * calibration.source_radius_m**2)
+    seen_e = float(np.median(prepared.excess_e[member.blob.box.slices][member.blob.pixels]))
+    if disc_e > seen_e:
+        return not member.is_clipped and disc_e > _MOST_BRIGHTNESS_FACTOR * seen_e
+    return seen_e > _MOST_BRIGHTNESS_FACTOR * disc_e
+
+
+def _large_discs(cluster: Cluster, prepared: PreparedFrame) -> list[int]:
+    """Return which wanted members of a cluster are no lamps by their outlines and their brightness."""
+    members = ((k, cluster.members[k]) for k in cluster.wanted)
+    return [k for k, one in members if not (one.is_too_large and _is_no_large_disc(one, prepared))]
+
+
+def _is_whole_discs(solution: Solution) -> bool:
+    """Tell whether whole discs leave so little that they are taken for sources."""
+    return solution.left_over.share <= MOST_LEFT and bool(solution.ranged.all())
+
+
+def _by_disc(
+    cluster: Cluster, solution: Solution | None, without: Container[int], prepared: PreparedFrame
+) -> list[tuple[Blob, MeasuredFlare]]:
+    """Turn a fit of whole large discs into measurements, or sum apertures where there is none that is one.
+
+    Some members, to be measured otherwise, are left out.
+
+    A disc that is not all there, or not alone, leaves light over: about twice as much its flux may lack, or
+    have too much, as the fit has taken a part of it up; by such a share of its radius it may be elsewhere.
+    """
+    wanted = [k for k in _large_discs(cluster, prepared) if k not in without]
+    if solution is None:
+        return [
+            (cluster.members[k].blob, measure_by_aperture(cluster.members[k], cluster, prepared))
+            for k in wanted
+        ]
+    misfit = _is_misfit(solution)
+    measured = []
+    for k in wanted:
+        blob = cluster.members[k].blob
+        one = measured_flare(solution, k, blob, misfit, prepared)
+        if misfit:
+            share = 2.0 * _odd_share(solution)
+            away_px = share * float(solution.image_radius_px[k])
+            one = replace(
+                one,
+                u_sigma_px=math.hypot(one.u_sigma_px, away_px),
+                v_sigma_px=math.hypot(one.v_sigma_px, away_px),
+                flux_sigma_e=math.hypot(one.flux_sigma_e, share * one.flux_e),
+                range_sigma_m=math.hypot(one.range_sigma_m, 0.5 * share * one.range_m),
+                log_range_doubt=math.hypot(one.log_range_doubt, 0.5 * share),
+            )
+        measured.append((blob, one))
+    return measured
+
+
+def _is_misfit(solution: Solution) -> bool:
+    """Tell whether what whole discs leave over is more than noise."""
+    left = solution.left_over
+    return not left.is_good or left.peak_sigmas > RESIDUAL_SIGMAS
+
+
+def _odd_share(solution: Solution) -> float:
+    """Return how much light more or less is seen than chance explains, relative to the flares' light."""
+    away_e = np.abs(solution.residual_e)
+    odd_e = away_e[away_e > _ODD_SIGMAS * np.sqrt(solution.variance_e2(0.0))]
+    return float(odd_e.sum() / max(float(solution.flares_e.sum()), 1e-300))
