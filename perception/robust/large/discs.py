@@ -25,7 +25,10 @@ from perception.robust.verdict import is_other_limb
 MOST_FITTED_RADIUS_PX = 130.0
 """So far are images laid out exactly (`model.discs`)."""
 
-_MOST_OFF_SHARE = 0.03  # of a blob's outline from a circle, on the median: squares are 0.08 off
+_LEAST_ROUND, _LEAST_ROUND_IF_CLIPPED = 0.3, 0.6
+"""Parts of an outline that must lie on a circle: of a square's 0.2 do. The rest may be what lies around, or
+missing; of a clipped disc the outline is all that is known."""
+
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _ODD_SIGMAS = 3.0
 _TIMES_LAID_OUT = 2  # a pixel elsewhere the lens stretches them otherwise
@@ -120,7 +123,7 @@ def _is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     over the solid angle that it fills there, times that of a pixel.
     """
     calibration, outline = prepared.calibration, outline_of(member.blob, prepared)
-    if outline is None or outline.off_share > _MOST_OFF_SHARE:
+    if outline is None or outline.share < (_LEAST_ROUND_IF_CLIPPED if member.is_clipped else _LEAST_ROUND):
         return True
     if calibration.source_radius_m / math.sin(outline.angle_rad) < LEAST_RANGE_M:
         return True

@@ -2,18 +2,24 @@
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.lens import project
 from perception.robust.search.blobs import Blob
 from perception.robust.search.prepare import PreparedFrame
+from perception.types import Calibration
+
+Array = NDArray[np.float64]
 
 _HALF = 0.5  # of its brightest, where an unclipped disc ends
 _WIDER_THAN_SPILL_PX = 5
 _FEWEST = 24  # pixels of an outline
-_ROUNDS, _OUTLYING = 3, 4.0
+_TRIED, _LEAST_VOLUME, _ROUNDS = 20, 1e-12, 3
+_ON_PX, _ON_SHARE = 0.75, 0.01  # so far from a circle, beside a share of its radius, an outline lies on it
 
 
 @dataclass(frozen=True)
@@ -26,14 +32,14 @@ class Outline:
         Its middle.
     angle_rad
         Its radius, of the image of a sphere r / d = sin of that.
-    off_share
-        How far, on the median, the outline lies off it, of its radius.
+    share
+        What part of the outline lies on it.
     """
 
     u_px: float
     v_px: float
     angle_rad: float
-    off_share: float
+    share: float
 
 
 def outline_of(blob: Blob, prepared: PreparedFrame) -> Outline | None:
@@ -46,29 +52,66 @@ def outline_of(blob: Blob, prepared: PreparedFrame) -> Outline | None:
     -------
     The circle; None where there is too little of an outline, or what is there is none of a sphere.
     """
-    from scipy.ndimage import binary_erosion, binary_opening
+    import cv2
 
     box, (rows, columns) = blob.box, prepared.shape
     clips = blob.pixels & prepared.clipped_in(box)
     lit = clips if clips.any() else blob.pixels & (blob.filtered_e > _HALF * blob.peak_e)
-    whole = binary_opening(np.pad(lit, 1), np.ones((1, _WIDER_THAN_SPILL_PX), dtype=np.bool_))
-    places = np.argwhere(whole & ~binary_erosion(whole)) - 1 + (box.top, box.left)
+    across_spill = np.ones((1, _WIDER_THAN_SPILL_PX), dtype=np.uint8)
+    whole = np.pad(lit, 1).astype(np.uint8)
+    whole = np.asarray(cv2.morphologyEx(whole, cv2.MORPH_OPEN, across_spill))
+    if not whole.any():
+        return None
+    # Discs are convex, whatever is missing within: where the mesh of the background took them for some.
+    corners = cv2.convexHull(np.argwhere(whole).astype(np.int32))[:, 0] - 1 + (box.top, box.left)
+    places = _along(corners.astype(np.float64))
     inside = ((places > 0) & (places < (rows - 1, columns - 1))).all(axis=1)
     limb = direction_camera(places[inside][:, ::-1], prepared.calibration)
     limb = limb[np.isfinite(limb).all(axis=1)]
     if len(limb) < _FEWEST:
         return None
-    kept = np.ones(len(limb), dtype=np.bool_)
+    axis, share = _likeliest_cone(limb, prepared.calibration)
+    if axis is None:
+        return None
+    length = float(np.linalg.norm(axis))
+    ((u_px, v_px),) = project(np.asarray(axis[None] / length), prepared.calibration).tolist()
+    return Outline(u_px, v_px, math.acos(1.0 / length), share) if math.isfinite(u_px) else None
+
+
+def _likeliest_cone(limb: Array, calibration: Calibration) -> tuple[Array | None, float]:
+    """Return the m of the cone on which most directions lie, shape (n, 3), and what share of them does.
+
+    Of cones through any three of some, refined by those that lie on it (Fischler and Bolles, Comm. ACM 24,
+    381, 1981): half of an outline may be another's.
+    """
+    some = limb[np.linspace(0, len(limb), _TRIED, endpoint=False).astype(np.int64)]
+    three = some[np.array(list(combinations(range(_TRIED), 3)))]
+    three = three[abs(np.linalg.det(three)) > _LEAST_VOLUME]
+    if len(three) == 0:
+        return None, 0.0
+    cones = np.linalg.solve(three, np.ones((len(three), 3, 1)))[..., 0]
+    pixel_rad = 1.0 / min(calibration.fx_px, calibration.fy_px)
+
+    def on_cone(axes: Array) -> NDArray[np.bool_]:
+        lengths = np.linalg.norm(axes, axis=-1, keepdims=True)
+        angle_rad = np.arccos(np.minimum(1.0 / lengths, 1.0))
+        off_rad = abs(np.arccos(np.clip(axes / lengths @ limb.T, -1.0, 1.0)) - angle_rad)
+        return np.asarray((off_rad < _ON_PX * pixel_rad + _ON_SHARE * angle_rad) & (lengths > 1.0))
+
+    axis = cones[int(np.argmax(on_cone(cones).sum(axis=1)))]
     for _ in range(_ROUNDS):
+        kept = on_cone(axis[None])[0]
+        if np.count_nonzero(kept) < 3:
+            return None, 0.0
         axis = np.linalg.lstsq(limb[kept], np.ones(np.count_nonzero(kept)), rcond=None)[0]
-        length = float(np.linalg.norm(axis))
-        if not length > 1.0:
-            return None
-        angle_rad = math.acos(1.0 / length)
-        off_rad = abs(np.arccos(np.clip(limb @ axis / length, -1.0, 1.0)) - angle_rad)
-        median_rad = float(np.median(off_rad))
-        kept = off_rad <= _OUTLYING * median_rad
-    ((u_px, v_px),) = project(
-        np.asarray(axis[None] / length, dtype=np.float64), prepared.calibration
-    ).tolist()
-    return Outline(u_px, v_px, angle_rad, median_rad / angle_rad)
+    share = float(on_cone(axis[None])[0].mean())
+    return (axis, share) if float(np.linalg.norm(axis)) > 1.0 else (None, 0.0)
+
+
+def _along(corners: Array) -> Array:
+    """Return places a pixel apart along a closed line through corners, shape (corners, 2)."""
+    ends = np.roll(corners, -1, axis=0)
+    counts = np.ceil(np.hypot(*(ends - corners).T)).astype(np.int64)
+    step = np.concatenate([np.arange(count) / count for count in counts if count])
+    along = step[:, None] * np.repeat(ends - corners, counts, axis=0)
+    return np.asarray(np.repeat(corners, counts, axis=0) + along)
