@@ -72,7 +72,7 @@ class LeftOver:
 
     def may_be_good(self, less_chi2: float) -> bool:
         """Tell whether chance alone may leave so much were χ² less by that."""
-        return self.pixels == 0 or _is_likely(self.pixels, self.chi2 - less_chi2)
+        return self.pixels == 0 or is_likely(self.pixels, self.chi2 - less_chi2)
 
     @property
     def share(self) -> float:
@@ -85,12 +85,12 @@ class LeftOver:
 
         By χ² of the pixels that the flares do not reach: noise passes once in a million.
         """
-        if self.around_pixels < FEWEST_PIXELS or _is_likely(self.around_pixels, self.around_chi2):
+        if self.around_pixels < FEWEST_PIXELS or is_likely(self.around_pixels, self.around_chi2):
             return 0.0
         return math.sqrt(max(self.around_excess_e2, 0.0))
 
 
-def _is_likely(degrees: int, chi2: float) -> bool:
+def is_likely(degrees: int, chi2: float) -> bool:
     """Tell whether χ² is at least as large by chance more often than `MISFIT_PROBABILITY`."""
     # Three standard deviations are passed more often than that by any χ².
     if chi2 < degrees + 3.0 * math.sqrt(2.0 * degrees):

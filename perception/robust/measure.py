@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from perception.model.window import Camera
-from perception.robust.around.uneven import MOST_LEFT, explains_flanks
+from perception.robust.around.uneven import FEWEST_SEEN, MOST_LEFT, explains_flanks
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters
 from perception.robust.explain import best
 from perception.robust.flare import MeasuredFlare, measured_flare
@@ -21,6 +22,7 @@ from perception.robust.verdict import (
     is_hardly_seen,
     is_on_flank,
     is_other_limb,
+    is_other_oval,
     is_other_size,
 )
 
@@ -121,6 +123,8 @@ def _judged(
     """Turn a solution into measurements, if it is one of sources."""
     left = solution.left_over
     misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
+    # Where nothing is seen but what is clipped, nothing is explained.
+    misfit |= cluster.is_clipped and left.pixels < FEWEST_SEEN
     # An edge is long, too: what is drawn out on edges must leave hardly any of them.
     drawn_out = solution.motion_px is not None and solution.window.on_edges
     doubted = misfit or cluster.is_clipped or drawn_out
@@ -132,10 +136,13 @@ def _judged(
         return []
     if cluster.is_clipped and is_any_outline(solution, len(cluster.members)):
         return []
-    is_by_flanks = bool((solution.window.state != cluster.window.state).any())
-    if (is_by_flanks and not explains_flanks(solution)) or (misfit and is_clipped_elsewhere(solution)):
+    if misfit and is_clipped_elsewhere(solution):
         return []
     is_at_once = prepared.frame.line_time_s == 0.0  # else flares that move are not fitted as such
+    if (solution.window.state != cluster.window.state).any():  # by the flanks of what is clipped alone
+        whole = replace(solution, window=cluster.window)
+        if not explains_flanks(solution, cluster.window) or (is_at_once and is_other_oval(whole, camera)):
+            return []
     if misfit and cluster.is_clipped and is_at_once and is_other_limb(solution, camera):
         return []
     blobs: list[Blob | None] = [member.blob for member in cluster.members]

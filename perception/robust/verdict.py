@@ -10,7 +10,7 @@ from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR, noise_e2
 from perception.robust.overlap.deblend import of_free_width
-from perception.robust.overlap.oval import fit_oval
+from perception.robust.overlap.oval import Oval, fit_oval
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
@@ -208,9 +208,26 @@ def is_other_limb(solution: Solution, camera: Camera) -> bool:
     if wider.left_over.is_good:
         return False
     oval = fit_oval(wider, camera)
+    return _is_unlike(oval, camera) and oval.chi2_more < -_LEAST_GAIN_OF_OVAL
+
+
+def is_other_oval(solution: Solution, camera: Camera) -> bool:
+    """Tell whether one oval that no source is explains all of a clipped flare, and a source does not.
+
+    The flare is one that explains a part of it, beside the columns that charge spilled along; a source may be
+    seen through any point spread.
+    """
+    (wider,) = of_free_width([solution], camera)
+    if wider is not None and wider.left_over.is_good:
+        return False
+    oval = fit_oval(wider or solution, camera)
+    return oval.is_good and _is_unlike(oval, camera)
+
+
+def _is_unlike(oval: Oval, camera: Camera) -> bool:
+    """Tell whether an oval is longer or brighter than sources are, or dimmer."""
     log_brightness = abs(math.log(oval.brightness)) - 2.0 * _OF_TIE * camera.tie_spread
-    is_other = oval.aspect > _MOST_LIMB_ASPECT or log_brightness > math.log(_MOST_LIMB_BRIGHTNESS)
-    return is_other and oval.chi2_more < -_LEAST_GAIN_OF_OVAL
+    return oval.aspect > _MOST_LIMB_ASPECT or log_brightness > math.log(_MOST_LIMB_BRIGHTNESS)
 
 
 def is_other_size(solution: Solution, free: Solution | None, tie_spread: float) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.layout import UNUSABLE
+from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster
 from perception.robust.problem import Problem, Window
@@ -18,8 +18,11 @@ from perception.robust.solve import Solution, solve
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
 
-_FEWEST_OF_FLANKS = 8
-"""Pixels of a flare that must be seen beside columns that are left out: 18 of a point clipped 20 times."""
+FEWEST_SEEN = 8
+"""Pixels of a clipped flare that must be seen, without those that clip: 18 of a point clipped 20 times."""
+
+_LEAST_ACROSS = 0.8  # of the columns that are clipped
+_SPILLS_ASIDE_PX = 2  # at most, and so far a point spread that is not the calibration's reaches
 
 _WIDTHS_OF_DISC = (0.5, 1.0)
 """Of what is clipped, first guesses: a disc is as wide, the image of a point is so by its point spread."""
@@ -56,7 +59,7 @@ def retry_without_spill(
     """Fit badly fitted clipped flares without the columns of clipped pixels, where charge may spill."""
     alone = [None if index in parted else one for index, one in enumerate(best)]
     for index, again in without_spill(alone, prepared, camera).items():
-        if explains_flanks(again):
+        if (whole := alone[index]) is not None and explains_flanks(again, whole.window):
             best[index] = again
 
 
@@ -84,14 +87,31 @@ def by_flanks(
     likeliest: dict[int, Solution] = {}
     for index, one in zip(tried, solve(problems, camera), strict=True):
         clips = one is not None and float(one.expected_e.max()) > one.window.clip_e
-        if one is not None and clips and explains_flanks(one):
+        if one is not None and clips and explains_flanks(one, found[index].window):
             likeliest[index] = min(likeliest.get(index, one), one, key=lambda fit: fit.deviance)
     return likeliest
 
 
-def explains_flanks(one: Solution) -> bool:
-    """Tell whether a flare explains what is seen of it beside columns that are left out, and enough is."""
-    return one.left_over.share < MOST_LEFT and one.left_over.pixels >= _FEWEST_OF_FLANKS
+def explains_flanks(one: Solution, window: Window) -> bool:
+    """Tell whether a flare explains what is seen beside columns that are left out.
+
+    Enough of it must be seen; and it must be as wide as what is clipped, but for a stuck pixel, as charge
+    spills along columns alone.
+
+    Parameters
+    ----------
+    one
+        The flare, in a window that leaves out columns.
+    window
+        The same with all columns.
+    """
+    # How far one moves along columns that are left out nothing tells.
+    along = one.motion_px is not None and bool((abs(one.motion_px[:, 1]) > abs(one.motion_px[:, 0])).any())
+    if along or not one.left_over.share < MOST_LEFT or one.left_over.pixels < FEWEST_SEEN:
+        return False
+    clipped, own = ((window.state == CLIPPED).any(axis=0), (one.expected_e > window.clip_e).any(axis=0))
+    beside = np.convolve(own, np.ones(2 * _SPILLS_ASIDE_PX + 1), mode="same") > 0.5
+    return int(beside[clipped].sum()) >= _LEAST_ACROSS * int(clipped.sum())
 
 
 def without_spill(

@@ -5,22 +5,25 @@ from collections.abc import Container, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera, pixel_turn
+from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.lens import stretch
 from perception.model.window import Camera
 from perception.robust.around.uneven import MOST_LEFT
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, least_flux_e
 from perception.robust.flare import MeasuredFlare, measured_flare
 from perception.robust.forward_light import fit_beside_forward_light
-from perception.robust.large.aperture import measure_by_aperture
+from perception.robust.large.aperture import mask_in, measure_by_aperture
 from perception.robust.large.outline import outline_of
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_width
-from perception.robust.problem import Problem, Start
+from perception.robust.problem import Problem, Start, Window
 from perception.robust.search.blobs import Blob
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
 from perception.robust.verdict import is_other_limb
+from perception.types import Calibration
 
 MOST_FITTED_RADIUS_PX = 130.0
 """So far are images laid out exactly (`model.discs`)."""
@@ -31,6 +34,7 @@ missing; of a clipped disc the outline is all that is known."""
 
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _ODD_SIGMAS = 3.0
+_BEYOND_PX = 0.5  # of the outline of what is clipped, where nothing that clips is a disc's own
 _TIMES_LAID_OUT = 2  # a pixel elsewhere the lens stretches them otherwise
 
 
@@ -70,10 +74,10 @@ def _whole_discs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Came
     tried: list[int] = []
     problems = []
     for index, cluster in enumerate(found):
-        starts = _guess_by_outline(cluster, prepared)
-        if starts is not None and _large_discs(cluster, prepared):
+        problem = _guess_by_outline(cluster, prepared)
+        if problem is not None and _large_discs(cluster, prepared):
             tried.append(index)
-            problems.append(Problem(cluster.window, starts, cluster.background_e))
+            problems.append(problem)
     for _ in range(_TIMES_LAID_OUT):
         for index, solution in zip(tried, solve(problems, camera), strict=True):
             solutions[index] = solution
@@ -89,31 +93,47 @@ def _whole_discs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Came
     return solutions
 
 
-def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> list[Start] | None:
-    """Return first guesses of large discs from what is seen of their outlines, which the frame may cut.
+def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> Problem | None:
+    """Return the problem of large discs, from what is seen of their outlines, which the frame may cut.
 
-    None where a member has no range, no outline of a sphere, or is larger than images are laid out for.
+    What is clipped outside of them is left out: charge spills along columns. None where a member has no
+    range, no outline of a sphere, or is larger than images are laid out for.
     """
     calibration = prepared.calibration
     starts: list[Start] = []
+    within = np.zeros(cluster.window.state.shape, dtype=np.bool_)
     for member in cluster.members:
         if not (member.at_one_metre_e > 0.0 and calibration.source_radius_m > 0.0):
             return None
         if not member.is_too_large:
             flux_e = max(member.flux_e, least_flux_e(prepared))
             starts.append((member.u_px, member.v_px, member.log_range(flux_e)))
+            within |= mask_in(cluster.window.box.top, cluster.window.box.left, within.shape, member.blob)
             continue
         outline = outline_of(member.blob, prepared)
         if outline is None:
             return None
         middle_px = (outline.u_px, outline.v_px)
-        radius_px = outline.angle_rad * float(
-            stretch(direction_camera([middle_px], calibration), calibration)[0]
-        )
-        if not radius_px < MOST_FITTED_RADIUS_PX:
+        direction = direction_camera([middle_px], calibration)
+        px_per_rad = float(stretch(direction, calibration)[0])
+        if not outline.angle_rad * px_per_rad < MOST_FITTED_RADIUS_PX:
             return None
         starts.append((*middle_px, math.log(calibration.source_radius_m / math.sin(outline.angle_rad))))
-    return starts
+        within |= _within(
+            outline.angle_rad + _BEYOND_PX / px_per_rad, direction[0], cluster.window, calibration
+        )
+    state = np.where((cluster.window.state == CLIPPED) & ~within, UNUSABLE, cluster.window.state)
+    return Problem(replace(cluster.window, state=state.astype(np.uint8)), starts, cluster.background_e)
+
+
+def _within(
+    angle_rad: float, axis: NDArray[np.float64], window: Window, calibration: Calibration
+) -> NDArray[np.bool_]:
+    """Mark the pixels of a window within an angle of a direction."""
+    box = window.box
+    rows, columns = np.mgrid[box.top : box.top + box.height, box.left : box.left + box.width]
+    directions = direction_camera(np.column_stack([columns.ravel(), rows.ravel()]), calibration)
+    return np.asarray((directions @ axis > math.cos(angle_rad)).reshape(window.state.shape))
 
 
 def _is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from perception.model.layout import CLIPPED, SEEN, Sources
 from perception.model.spread import spread_nodes
 from perception.model.window import Camera, lay_out
-from perception.robust.goodness import MODEL_ERROR, residual_e
+from perception.robust.goodness import MODEL_ERROR, is_likely, residual_e
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
@@ -31,6 +31,8 @@ class Oval:
 
     Attributes
     ----------
+    is_good
+        Whether chance alone may leave so much where it shines.
     chi2_more
         By how much it is worse than the flares that it is held against, as 2 Δ ln L with an imperfect model.
     brightness
@@ -39,6 +41,7 @@ class Oval:
         How many times as long as wide it is, what the lens stretches taken off.
     """
 
+    is_good: bool
     chi2_more: float
     brightness: float
     aspect: float
@@ -91,9 +94,11 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
             break
     _, _, log_flux, log_size, a, b, _ = values.tolist()
     axes = math.hypot(a, b)
+    shines = (weight > 0.0) & (_image(values, flares, camera)[0] ** 2 > variance.ravel())
     laid = _largest(flares, camera)
     log_source = float(laid.log_flux_at_1_m[0]) - 2.0 * float(laid.log_range_at[0])
     return Oval(
+        is_good=is_likely(int(shines.sum()), float(np.sum(weight[shines] * left[shines] ** 2))),
         chi2_more=chi2 - float(np.sum(flares.residual_e**2 / variance)),
         brightness=math.exp(log_flux - 2.0 * log_size - log_source) / (1.0 - axes**2),
         aspect=(1.0 + axes) / (1.0 - axes),
