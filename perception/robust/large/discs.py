@@ -34,6 +34,7 @@ missing; of a clipped disc the outline is all that is known."""
 
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _ODD_SIGMAS = 3.0
+_SPILLS_ON_PX = 3
 _BEYOND_PX = 0.5  # of the outline of what is clipped, where nothing that clips is a disc's own
 _TIMES_LAID_OUT = 2  # a pixel elsewhere the lens stretches them otherwise
 
@@ -99,6 +100,8 @@ def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> Problem | No
     What is clipped outside of them is left out: charge spills along columns. None where a member has no
     range, no outline of a sphere, or is larger than images are laid out for.
     """
+    from scipy.ndimage import binary_dilation
+
     calibration = prepared.calibration
     starts: list[Start] = []
     within = np.zeros(cluster.window.state.shape, dtype=np.bool_)
@@ -122,7 +125,10 @@ def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> Problem | No
         within |= _within(
             outline.angle_rad + _BEYOND_PX / px_per_rad, direction[0], cluster.window, calibration
         )
-    state = np.where((cluster.window.state == CLIPPED) & ~within, UNUSABLE, cluster.window.state)
+    spilled = (cluster.window.state == CLIPPED) & ~within
+    # Charge that ends on a disc's own limb cannot be told from the limb.
+    spilled = binary_dilation(spilled, np.ones((2 * _SPILLS_ON_PX + 1, 1), dtype=np.bool_))
+    state = np.where(spilled, UNUSABLE, cluster.window.state)
     return Problem(replace(cluster.window, state=state.astype(np.uint8)), starts, cluster.background_e)
 
 

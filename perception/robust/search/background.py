@@ -22,7 +22,7 @@ LEAST_RATIO_AROUND = 1.05
 """As much the mean over 5 × 5 parts must have: chance gives it to one even frame in a hundred or so."""
 
 _SAMPLES_PER_AXIS = 24
-_LEAST_FREE = 0.125  # of a cell, that is not clipped
+_LEAST_FREE, _LEAST_FREE_OF_SCATTER = 0.125, 0.5  # of a cell, that is not clipped
 _SCATTER_SAMPLES_PER_AXIS = 16
 
 
@@ -198,7 +198,7 @@ def cell_scatter(
 ) -> NDArray[np.float32]:
     """Return an image's scatter in each cell over its noise, blind to its outer thirds, where flares are.
 
-    Of samples below `most_mesh` alone; 0 where there are next to none. By a histogram, to less than a
+    Of samples below `most_mesh` alone; 0 where these are less than half, beside something bright. By a histogram, to less than a
     hundredth of the noise; where it scatters too far for that, by sorting. `samples` has as many rows and
     columns for each cell, one cell's after another's.
     """
@@ -218,7 +218,7 @@ def cell_scatter(
                     kept += 1
                     place = cell[row, column] * per_unit + np.float32(0.5 * last)
                     count_of[int(min(max(np.float32(0.0), place), np.float32(last)))] += 1
-            if not kept > _LEAST_FREE * tall * wide:
+            if not kept > _LEAST_FREE_OF_SCATTER * tall * wide:
                 scatter[down, across] = 0.0
                 continue
             low, high = round(0.1587 * (kept - 1)), round(0.8413 * (kept - 1))

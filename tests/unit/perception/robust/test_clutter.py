@@ -37,17 +37,44 @@ def test_the_edge_of_a_lit_patch_is_no_chain_of_flares() -> None:
     assert sum(patches(frames=1, first=frame)["false_alarms"] for frame in told) == 0
 
 
-@pytest.mark.parametrize("frame", [3, 6, 14])
+@pytest.mark.parametrize("frame", [pytest.param(8, marks=pytest.mark.verify), 43])
 def test_a_clipped_lamp_is_no_source(frame: int) -> None:
-    """Fits of an ellipse and a rectangle of some 25 px bound no flux (σ of 1e5 times it); two lamps, 2½ and 5
-    times as long as wide, are clipped where their fits are dim."""
+    """An oval of 44 px bounds no flux (σ of 1e13 times it); beside clipped columns one may move along them at will."""
     assert ROWS["lamps"](frames=1, first=frame)["reported"] == 0
 
 
-@pytest.mark.parametrize("frame", [6, pytest.param(2, marks=pytest.mark.verify)])
+@pytest.mark.parametrize(
+    "frame", [6, *(pytest.param(k, marks=pytest.mark.verify) for k in (0, 3, 4, 7, 10, 17))]
+)
 def test_the_limb_of_a_clipped_lamp_is_no_source_s(frame: int) -> None:
-    """Discs and ovals of 4 to 14 px, 0.4 and 0.6 times as bright as balls of 1 cm: told at .4 to 1.4 m."""
+    """Discs and ovals of 7 to 35 px, .5 to .87 times as bright as balls of 1 cm or up to a third longer than wide:
+    told at .3 to 1.9 m, some with σ of mm. In the fourth one of 28 px by 18, by its flanks as a ball of 12 px."""
     assert ROWS["lamps where sources are balls of 1 cm"](frames=1, first=frame)["reported"] == 0
+
+
+@pytest.mark.parametrize(
+    "frame", [7, *(pytest.param(k, marks=pytest.mark.verify) for k in (1, 4, 8, 13, 21))]
+)
+def test_sun_patches_that_clip_are_no_near_sources(frame: int) -> None:
+    """Nearly one a frame was told as a bound of range, of patches of 40 to 80 px, or by the pixels at its sides."""
+    assert ROWS["empty, sun patches that clip"](frames=1, first=frame)["false_alarms"] == 0
+
+
+@pytest.mark.parametrize("wall_e", [300.0, 1500.0])
+def test_clipped_balls_before_a_wall_s_lit_edge_are_ranged(wall_e: float) -> None:
+    """Balls of 6 to 10 px before the edge of a patch 100 px wide: both were one blob, too large to be fitted."""
+    camera = calibration(width_px=640, height_px=320, cx_px=319.5, cy_px=159.5)
+    places = [(110.3, 200.2, 0.8), (330.6, 200.7, 1.0), (520.1, 200.4, 1.3)]
+    image_e = expected_e(camera, places, 4e-3) + 20.0
+    for u, v, _ in places:
+        wall = np.zeros(image_e.shape)
+        wall[round(v) - 60 : round(v) + 2, round(u) - 50 : round(u) + 50] = wall_e
+        image_e += gaussian_filter(wall, camera.psf_sigma_px)
+    found = perception.detect(expose(image_e, camera, random(5, 116), 4e-3), camera)
+    assert len(found) == len(places)
+    for (u, v, range_m), told in zip(places, sorted(found, key=lambda one: one.u_px), strict=True):
+        assert math.hypot(told.u_px - u, told.v_px - v) < 0.05
+        assert abs(told.range_m - range_m) < 5.0 * told.range_sigma_m < 0.01 * range_m
 
 
 def test_clipped_sources_are_told_through_a_wider_point_spread() -> None:

@@ -9,6 +9,7 @@ from scipy.stats import norm, poisson
 from perception.robust.search.background import background_mesh_e, cell_means, cell_scatter, spread_mesh
 from perception.robust.search.frame import Pixels, above, exceeding, filtered, without
 from perception.robust.search.limit import FALSE_ALARMS_PER_PIXEL, detection_limit_e, in_threes, point_kernel
+from perception.robust.search.prepare import prepare
 from perception.types import Calibration
 from tests.unit.perception.simulation import calibration, expose, random
 
@@ -184,3 +185,15 @@ def test_filter_keeps_the_place_and_is_quiet_at_the_border() -> None:
     assert response.max() == pytest.approx(kernel.max() ** 2, rel=1e-6)
     ones = filtered(Pixels(np.full((20, 30), 1000, np.uint16), 0.0, 1e-3, ground), kernel, none, box)
     assert ones[0, 0] < 0.7 < ones[10, 10] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_clipped_pixels_are_no_background() -> None:
+    """A patch of 200 px clips: beneath it the ground is that around it, and all of it is lit."""
+    camera = calibration(width_px=640, height_px=480, cx_px=319.5, cy_px=239.5)
+    mean = np.full((480, 640), 30.0)
+    mean[150:350, 220:420] = 1e5
+    frame = expose(mean, camera, random(29))
+    mesh = background_mesh_e(frame, camera)
+    assert abs(mesh - 30.0).max() < 1.0
+    prepared = prepare(frame, camera)
+    assert np.bincount(prepared.lit_at // 640, minlength=480)[160:340].min() >= 200
