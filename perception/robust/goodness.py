@@ -263,24 +263,19 @@ def drawn_out(
                 chi2 += parts[7, count] ** 2
             count += 1
     most_gain = chi2 - stands_out + 3.0 * math.sqrt(2.0 * stands_out)
-    shown = np.zeros(7)
+    shown, free = np.zeros(7), parts[:, :count].copy()
     for one in range(7):
-        power = 0.0
-        for pixel in range(count):
-            power += parts[one, pixel] ** 2
+        power = dot(free[one], free[one])
         if not power > 0.0:
             return 0.0, 0.0, 0.0, most_gain
         for other in range(one + 1, 8):
-            share = 0.0
-            for pixel in range(count):
-                share += parts[one, pixel] * parts[other, pixel]
-            share /= power
+            share = dot(free[one], free[other]) / power
             if other == 7:
                 shown[one] = share * math.sqrt(power)
             if one == 5 and other == 6:
                 mixed = share
             for pixel in range(count):
-                parts[other, pixel] -= share * parts[one, pixel]
+                free[other, pixel] -= share * free[one, pixel]
         if one == 5:
             power_5 = power
     across = shown[6] / math.sqrt(power)

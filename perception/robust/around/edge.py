@@ -24,6 +24,7 @@ MOST_EDGES = 2
 """So many edges one window has at most: a bar has two."""
 
 _ANGLES, _STEP_PX = 18, 1.0
+_PER_WIDTH, _REACH = 8, 32  # steps across an edge: of its width, and to where it is all
 _LEAST_KEPT = 0.02  # of an edge's power, beside what flares and an even background may take of it
 _SEEMS_SIGMAS, _SEEMS_GAIN = 3.0, 12.0
 _LEAST_SHARE, _LEAST_SHARE_OF_ONE = 0.1, 0.2
@@ -154,30 +155,44 @@ def _likeliest_edge(
     """
     parts, weights, at = free_of_flares(image_e, state, expected_e, flares_e, floor_e2, prnu)
     count = len(weights)
-    # The normal distribution at steps of a sixteenth, within 1 %: the logistic function of 1.702 times that.
-    rise = np.empty(129)
-    for step in range(129):
-        rise[step] = 1.0 / (1.0 + math.exp(-1.702 * (step / 16.0 - 4.0)))
+    # The normal distribution at steps of an eighth, within 1 %: the logistic function of 1.702 times that.
+    rise = np.empty(2 * _REACH + 1)
+    for step in range(len(rise)):
+        rise[step] = 1.0 / (1.0 + math.exp(-1.702 * (step - _REACH) / _PER_WIDTH))
     most, height_e, offset_px, angle_rad = least_gain, 0.0, 0.0, 0.0
     rows, columns = image_e.shape
     reach_px = math.hypot(0.5 * (columns - 1), 0.5 * (rows - 1))
+    per_px, far = _PER_WIDTH / width_px, int(reach_px * _PER_WIDTH / width_px) + 1
+    between = max(int(_STEP_PX * per_px), 1)
+    # Along an angle, what lies at each distance from the middle, and what lies at it or beyond.
+    there, beyond = np.empty((2 * far + 1, 7)), np.empty(7)
+    sums = np.empty(7)
     for turn in range(_ANGLES):
         angle = math.pi * turn / _ANGLES
-        cosine, sine = 16.0 * math.cos(angle) / width_px, 16.0 * math.sin(angle) / width_px
-        for step in range(int(2.0 * reach_px / _STEP_PX) + 1):
-            offset = -reach_px + step * _STEP_PX
-            whole, score, by_0, by_1, by_2, by_3, by_4 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for pixel in range(count):
-                across = at[0, pixel] * cosine + at[1, pixel] * sine - 16.0 * offset / width_px
-                profile = weights[pixel] * rise[int(min(max(across + 64.5, 0.0), 128.0))]
-                whole += profile**2
-                score += profile * parts[5, pixel]
-                by_0 += profile * parts[0, pixel]
-                by_1 += profile * parts[1, pixel]
-                by_2 += profile * parts[2, pixel]
-                by_3 += profile * parts[3, pixel]
-                by_4 += profile * parts[4, pixel]
-            power = whole - by_0**2 - by_1**2 - by_2**2 - by_3**2 - by_4**2
-            if power > _LEAST_KEPT * whole and score**2 > most * power:
-                most, height_e, offset_px, angle_rad = score**2 / power, score / power, offset, angle
+        cosine, sine = math.cos(angle) * per_px, math.sin(angle) * per_px
+        there[:] = 0.0
+        for pixel in range(count):
+            place = math.floor(at[0, pixel] * cosine + at[1, pixel] * sine + 0.5) + far
+            weight = weights[pixel]
+            there[place, 6] += weight * weight
+            for part in range(6):
+                there[place, part] += weight * parts[part, pixel]
+        beyond[:] = 0.0
+        end = 2 * far + 1
+        for offset in range(far, -far - 1, -between):
+            first, last = max(offset + far - _REACH, 0), min(offset + far + _REACH + 1, 2 * far + 1)
+            while end > last:
+                end -= 1
+                for part in range(7):
+                    beyond[part] += there[end, part]
+            sums[:] = beyond
+            for place in range(first, last):
+                profile = rise[place - offset - far + _REACH]
+                for part in range(6):
+                    sums[part] += profile * there[place, part]
+                sums[6] += profile * profile * there[place, 6]
+            power = sums[6] - (sums[:5] ** 2).sum()
+            if power > _LEAST_KEPT * sums[6] and sums[5] ** 2 > most * power:
+                most, height_e = sums[5] ** 2 / power, sums[5] / power
+                offset_px, angle_rad = offset / per_px, angle
     return height_e, offset_px, angle_rad

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import SEEN
+from perception.model.pixels import dot
 from perception.model.window import Camera
 from perception.robust.around.edge import gain_around, leaves_something
 from perception.robust.around.turns import (
     Feature,
     fit_in_turns,
     free_of_flares,
-    offsets_px,
     places_px,
     sharp_px,
 )
@@ -196,18 +196,45 @@ def seems_highlit(one: Solution, held: Solution | None) -> bool:
 def _gain_if_wider(one: Solution, index: int) -> float:
     """Return what a wider image of a faint flare would bring, in 2 Δ ln L, beside errors of all others."""
     window, width_px = one.window, math.hypot(sharp_px(one), 0.5 * float(one.image_radius_px[index]))
-    seen = window.state == SEEN
-    weight = 1.0 / np.sqrt(one.variance_e2(MODEL_ERROR)[seen])
-    x_px, y_px = offsets_px(window.image_e.shape)
-    right, down = (each[seen] for each in (x_px - places_px(one)[0][index], y_px - places_px(one)[1][index]))
-    image = np.exp(-0.5 * (right**2 + down**2) / width_px**2)
-    wider = image * ((right**2 + down**2) / width_px**2 - 2.0)
-    others = np.stack([np.ones_like(image), one.flares_e[seen], image, image * right, image * down]) * weight
-    left = np.stack([wider, one.residual_e[seen]]) * weight
-    overlaps = np.linalg.lstsq(others @ others.T, others @ left.T, rcond=None)[0]
-    left -= overlaps.T @ others
-    score, power = float(left[0] @ left[1]), float(left[0] @ left[0])
-    return score**2 / power if score > 0.0 and power > 0.0 else 0.0
+    place = float(one.u_px[index]) - window.box.left, float(one.v_px[index]) - window.box.top
+    return _gained_if_wider(
+        one.residual_e, window.state, one.flares_e, one.variance_e2(MODEL_ERROR), place, width_px
+    )
+
+
+@compiled
+def _gained_if_wider(
+    residual_e: Array, state: NDArray[np.uint8], flares_e: Array, variance_e2: Array,
+    place: tuple[float, float], width_px: float,
+) -> float:  # fmt: skip
+    """Return χ² that more width of a normal distribution at (column, row) takes of a residual.
+
+    Beside what an even ground, more light of all flares, and the same of this one there and beside, take.
+    """
+    parts, count = np.empty((7, state.size)), 0
+    for row in range(state.shape[0]):
+        for column in range(state.shape[1]):
+            if state[row, column] != SEEN:
+                continue
+            weight = 1.0 / math.sqrt(variance_e2[row, column])
+            right, down = column - place[0], row - place[1]
+            squared = (right * right + down * down) / (width_px * width_px)
+            image = weight * math.exp(-0.5 * squared)
+            parts[0, count], parts[1, count] = weight, weight * flares_e[row, column]
+            parts[2, count], parts[3, count], parts[4, count] = image, image * right, image * down
+            parts[5, count], parts[6, count] = image * (squared - 2.0), weight * residual_e[row, column]
+            count += 1
+    free = np.ascontiguousarray(parts[:, :count])
+    for one in range(6):
+        power = dot(free[one], free[one])
+        if one == 5:
+            score = dot(free[5], free[6])
+            return score * score / power if score > 0.0 and power > 0.0 else 0.0
+        for other in range(one + 1, 7):
+            share = dot(free[one], free[other]) / power if power > 0.0 else 0.0
+            for pixel in range(count):
+                free[other, pixel] -= share * free[one, pixel]
+    return 0.0
 
 
 def likelier_beside_highlights(
@@ -256,21 +283,24 @@ def _likeliest_highlight(
     """
     parts, weights, at = free_of_flares(image_e, state, expected_e, flares_e, floor_e2, prnu)
     most, height_e, x_px, y_px, wide_px = 0.0, 0.0, 0.0, 0.0, 0.0
-    shares = np.empty(6)
+    shares, of_pixel = np.empty(6), parts.T.copy()
     for width_px in widths_px:
-        steps, far_px = int(_STEPS * reach_px / width_px), math.sqrt(_FARTHEST - 1.0) * width_px
+        steps, far2_px2 = int(_STEPS * reach_px / width_px), (_FARTHEST - 1.0) * width_px**2
+        far_px, per_px2 = math.sqrt(far2_px2), 1.0 / width_px**2
         for down in range(-steps, steps + 1):
+            y = middle[1] + down * width_px / _STEPS
+            first, end = np.searchsorted(at[1], np.array([y - far_px, y + far_px]))  # rows after rows
             for right in range(-steps, steps + 1):
-                x, y = middle[0] + right * width_px / _STEPS, middle[1] + down * width_px / _STEPS
+                x = middle[0] + right * width_px / _STEPS
                 whole, shares[:] = 0.0, 0.0
-                first, end = np.searchsorted(at[1], np.array([y - far_px, y + far_px]))  # rows after rows
                 for pixel in range(first, end):
-                    spread = 1.0 + ((at[0, pixel] - x) ** 2 + (at[1, pixel] - y) ** 2) / width_px**2
-                    if spread < _FARTHEST:
+                    squared = (at[0, pixel] - x) ** 2 + (at[1, pixel] - y) ** 2
+                    if squared < far2_px2:
+                        spread = 1.0 + squared * per_px2
                         profile = weights[pixel] / (spread * spread)
                         whole += profile**2
                         for part in range(6):
-                            shares[part] += profile * parts[part, pixel]
+                            shares[part] += profile * of_pixel[pixel, part]
                 power = whole - (shares[:5] ** 2).sum()
                 if power > _LEAST_KEPT * whole and shares[5] > 0.0 and shares[5] ** 2 > most * power:
                     most, height_e = shares[5] ** 2 / power, shares[5] / power

@@ -198,9 +198,9 @@ def cell_scatter(
 ) -> NDArray[np.float32]:
     """Return an image's scatter in each cell over its noise, blind to its outer thirds, where flares are.
 
-    Of samples below `most_mesh` alone; 0 where these are less than half, beside something bright. By a histogram, to less than a
-    hundredth of the noise; where it scatters too far for that, by sorting. `samples` has as many rows and
-    columns for each cell, one cell's after another's.
+    Of samples below `most_mesh` alone; 0 where these are less than half, beside something bright. By a
+    histogram, to less than a hundredth of the noise; where it scatters too far for that, by sorting.
+    `samples` has as many rows and columns for each cell, one cell's after another's.
     """
     scatter = np.empty(noise_mesh.shape, dtype=np.float32)
     tall, wide = samples.shape[0] // len(noise_mesh), samples.shape[1] // noise_mesh.shape[1]
