@@ -58,8 +58,8 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         search, and with the `reason` if there are none. `area_px` and `mean_dn` are those of the pixels above
         the detection limit, and above what lies beside a flare that stands on a hill of light.
         `saturated`: a pixel is clipped, which counts as censored. Where that does not determine the range
-        `range_sigma_m` is NaN; of a clipped disc of more than 28 px radius the flux is a lower bound, too,
-        and the range an upper one; of one not clipped, `merged`, no whole disc explains it. Flares that
+        `range_sigma_m` is NaN, the flux a lower bound and the range an upper one; of a disc of more than 28
+        px radius also where none explains it whole: of one not clipped that is `merged`. Flares that
         overlap are fitted together (`deblend`), and their sigmas know of it; behind a rolling shutter a blob
         stays one. One that moves is drawn out (`motion`): its place is that in the middle of the exposure.
         `merged`: what is seen does not look like one source, nor like several that can be told apart; its

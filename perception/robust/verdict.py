@@ -217,6 +217,8 @@ def is_other_oval(solution: Solution, camera: Camera) -> bool:
     The flare is one that explains a part of it, beside the columns that charge spilled along; a source may be
     seen through any point spread.
     """
+    if solution.count > 1 or float(solution.radius_at_rest_px[0]) < _LIMB_RADIUS_PX:
+        return False
     (wider,) = of_free_width([solution], camera)
     if wider is not None and wider.left_over.is_good:
         return False

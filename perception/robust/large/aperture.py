@@ -87,10 +87,14 @@ def aperture_flux(
 
 
 def mask_in(top: int, left: int, shape: tuple[int, ...], blob: Blob) -> NDArray[np.bool_]:
-    """Mark the blob's pixels in a mask over a window that holds it."""
+    """Mark the blob's pixels in a mask over a window, as far as it holds them."""
     mask = np.zeros(shape, dtype=bool)
     row, column = blob.box.top - top, blob.box.left - left
-    mask[row : row + blob.box.height, column : column + blob.box.width] = blob.pixels
+    down = slice(max(-row, 0), max(min(shape[0] - row, blob.box.height), 0))
+    across = slice(max(-column, 0), max(min(shape[1] - column, blob.box.width), 0))
+    held = blob.pixels[down, across]
+    first_row, first = max(row, 0), max(column, 0)
+    mask[first_row : first_row + held.shape[0], first : first + held.shape[1]] = held
     return mask
 
 

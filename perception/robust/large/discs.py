@@ -1,7 +1,7 @@
 """Near sources whose discs are too large to be looked at for what hides them: fitted whole, or bounded."""
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +16,12 @@ from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, least_
 from perception.robust.flare import MeasuredFlare, measured_flare
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.large.aperture import mask_in, measure_by_aperture
-from perception.robust.large.outline import outline_of
+from perception.robust.large.outline import Outline, outline_of
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_width
 from perception.robust.problem import Problem, Start, Window
 from perception.robust.search.blobs import Blob
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
-from perception.robust.verdict import is_other_limb
 from perception.types import Calibration
 
 MOST_FITTED_RADIUS_PX = 130.0
@@ -58,25 +57,35 @@ def measure_large(
     """
     measured: list[tuple[Blob, MeasuredFlare]] = []
     again: list[Candidate] = []
-    for cluster, solution in zip(found, _whole_discs(found, prepared, camera), strict=True):
-        misfit = solution is not None and _is_misfit(solution)
-        if solution is not None and misfit and cluster.is_clipped and is_other_limb(solution, camera):
-            continue
-        fits = solution is not None and _is_whole_discs(solution)
+    outlines = [_outlines(cluster, prepared) for cluster in found]
+    rows = zip(found, outlines, _whole_discs(found, outlines, prepared, camera), strict=True)
+    for cluster, circles, solution in rows:
+        fits = solution is not None and _is_whole_discs(solution, cluster)
         small = [] if fits or apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
         again += [cluster.members[k] for k in small]
-        measured += _by_disc(cluster, solution if fits else None, small, prepared)
+        wanted = [k for k in _large_discs(cluster, circles, prepared) if k not in small]
+        measured += _by_disc(cluster, solution if fits else None, wanted, prepared)
     return measured, again
 
 
-def _whole_discs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
+def _outlines(cluster: Cluster, prepared: PreparedFrame) -> list[Outline | None]:
+    """Return the outlines of a cluster's members, None of those that are not too large."""
+    return [outline_of(one.blob, prepared) if one.is_too_large else None for one in cluster.members]
+
+
+def _whole_discs(
+    found: Sequence[Cluster],
+    outlines: Sequence[Sequence[Outline | None]],
+    prepared: PreparedFrame,
+    camera: Camera,
+) -> list[Solution | None]:
     """Fit whole discs to clusters of large ones; None where there are none, or the fit did not converge."""
     solutions: list[Solution | None] = [None] * len(found)
     tried: list[int] = []
     problems = []
-    for index, cluster in enumerate(found):
-        problem = _guess_by_outline(cluster, prepared)
-        if problem is not None and _large_discs(cluster, prepared):
+    for index, (cluster, circles) in enumerate(zip(found, outlines, strict=True)):
+        problem = _guess_by_outline(cluster, circles, prepared)
+        if problem is not None and _large_discs(cluster, circles, prepared):
             tried.append(index)
             problems.append(problem)
     for _ in range(_TIMES_LAID_OUT):
@@ -94,7 +103,9 @@ def _whole_discs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Came
     return solutions
 
 
-def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> Problem | None:
+def _guess_by_outline(
+    cluster: Cluster, outlines: Sequence[Outline | None], prepared: PreparedFrame
+) -> Problem | None:
     """Return the problem of large discs, from what is seen of their outlines, which the frame may cut.
 
     What is clipped outside of them is left out: charge spills along columns. None where a member has no
@@ -105,7 +116,7 @@ def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> Problem | No
     calibration = prepared.calibration
     starts: list[Start] = []
     within = np.zeros(cluster.window.state.shape, dtype=np.bool_)
-    for member in cluster.members:
+    for member, outline in zip(cluster.members, outlines, strict=True):
         if not (member.at_one_metre_e > 0.0 and calibration.source_radius_m > 0.0):
             return None
         if not member.is_too_large:
@@ -113,7 +124,6 @@ def _guess_by_outline(cluster: Cluster, prepared: PreparedFrame) -> Problem | No
             starts.append((member.u_px, member.v_px, member.log_range(flux_e)))
             within |= mask_in(cluster.window.box.top, cluster.window.box.left, within.shape, member.blob)
             continue
-        outline = outline_of(member.blob, prepared)
         if outline is None:
             return None
         middle_px = (outline.u_px, outline.v_px)
@@ -142,13 +152,13 @@ def _within(
     return np.asarray((directions @ axis > math.cos(angle_rad)).reshape(window.state.shape))
 
 
-def _is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
+def _is_no_large_disc(member: Candidate, outline: Outline | None, prepared: PreparedFrame) -> bool:
     """Tell whether a blob too large to be fitted is no source: by its outline, its brightness, its range.
 
     The outline of a sphere is a circle in the sky, and it is as bright at any range: its flux at one metre
     over the solid angle that it fills there, times that of a pixel.
     """
-    calibration, outline = prepared.calibration, outline_of(member.blob, prepared)
+    calibration = prepared.calibration
     if outline is None or outline.share < (_LEAST_ROUND_IF_CLIPPED if member.is_clipped else _LEAST_ROUND):
         return True
     if calibration.source_radius_m / math.sin(outline.angle_rad) < LEAST_RANGE_M:
@@ -164,33 +174,32 @@ def _is_no_large_disc(member: Candidate, prepared: PreparedFrame) -> bool:
     return seen_e > _MOST_BRIGHTNESS_FACTOR * disc_e
 
 
-def _large_discs(cluster: Cluster, prepared: PreparedFrame) -> list[int]:
+def _large_discs(cluster: Cluster, outlines: Sequence[Outline | None], prepared: PreparedFrame) -> list[int]:
     """Return which wanted members of a cluster are no lamps by their outlines and their brightness."""
     members = ((k, cluster.members[k]) for k in cluster.wanted)
-    return [k for k, one in members if not (one.is_too_large and _is_no_large_disc(one, prepared))]
+    return [
+        k for k, one in members if not (one.is_too_large and _is_no_large_disc(one, outlines[k], prepared))
+    ]
 
 
-def _is_whole_discs(solution: Solution) -> bool:
-    """Tell whether whole discs leave so little that they are taken for sources."""
+def _is_whole_discs(solution: Solution, cluster: Cluster) -> bool:
+    """Tell whether whole discs leave so little that they are taken for sources: of what clips no misfit."""
+    if cluster.is_clipped and _is_misfit(solution):
+        return False
     return solution.left_over.share <= MOST_LEFT and bool(solution.ranged.all())
 
 
 def _by_disc(
-    cluster: Cluster, solution: Solution | None, without: Container[int], prepared: PreparedFrame
+    cluster: Cluster, solution: Solution | None, wanted: Sequence[int], prepared: PreparedFrame
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a fit of whole large discs into measurements, or sum apertures where there is none that is one.
-
-    Some members, to be measured otherwise, are left out.
 
     A disc that is not all there, or not alone, leaves light over: about twice as much its flux may lack, or
     have too much, as the fit has taken a part of it up; by such a share of its radius it may be elsewhere.
     """
-    wanted = [k for k in _large_discs(cluster, prepared) if k not in without]
     if solution is None:
-        return [
-            (cluster.members[k].blob, measure_by_aperture(cluster.members[k], cluster, prepared))
-            for k in wanted
-        ]
+        members = [cluster.members[k] for k in wanted]
+        return [(one.blob, measure_by_aperture(one, cluster, prepared)) for one in members]
     misfit = _is_misfit(solution)
     measured = []
     for k in wanted:

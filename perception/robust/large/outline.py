@@ -19,6 +19,7 @@ _HALF = 0.5  # of its brightest, where an unclipped disc ends
 _WIDER_THAN_SPILL_PX = 5
 _FEWEST = 24  # pixels of an outline
 _TRIED, _LEAST_VOLUME, _ROUNDS = 20, 1e-12, 3
+_MOST_ANGLE_RAD = 0.6  # nearly straight lines are no limbs
 _ON_PX, _ON_SHARE = 0.75, 0.01  # so far from a circle, beside a share of its radius, an outline lies on it
 
 
@@ -96,7 +97,8 @@ def _likeliest_cone(limb: Array, calibration: Calibration) -> tuple[Array | None
         lengths = np.linalg.norm(axes, axis=-1, keepdims=True)
         angle_rad = np.arccos(np.minimum(1.0 / lengths, 1.0))
         off_rad = abs(np.arccos(np.clip(axes / lengths @ limb.T, -1.0, 1.0)) - angle_rad)
-        return np.asarray((off_rad < _ON_PX * pixel_rad + _ON_SHARE * angle_rad) & (lengths > 1.0))
+        is_near = off_rad < _ON_PX * pixel_rad + _ON_SHARE * angle_rad
+        return np.asarray(is_near & (lengths > 1.0) & (angle_rad < _MOST_ANGLE_RAD))
 
     axis = cones[int(np.argmax(on_cone(cones).sum(axis=1)))]
     for _ in range(_ROUNDS):

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 _MOST_STEPS = 40
 _SETTLED = 0.1  # in χ²
 _MOST_LOG_STEP = 0.2  # of size and axes
+_MOST_AXES = 0.6  # each part of them: nine times as long as wide
 _LEAST_SPREAD_PX2 = 0.05
 
 
@@ -83,12 +84,14 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
         step = np.linalg.lstsq(information, (slopes * weight) @ left, rcond=None)[0]
         step[:2] = np.clip(step[:2], -1.0, 1.0)
         step[2:6] = np.clip(step[2:6], -_MOST_LOG_STEP, _MOST_LOG_STEP)
-        there = fitted(values + step)
+        trial = values + step
+        trial[4:6] = np.clip(trial[4:6], -_MOST_AXES, _MOST_AXES)
+        there = fitted(trial)
         if not there[0] < chi2:
             damping *= 10.0
             continue
         is_settled = chi2 - there[0] < _SETTLED
-        values, damping = values + step, 0.1 * damping
+        values, damping = trial, 0.1 * damping
         chi2, left, weight, slopes = there
         if is_settled:
             break
