@@ -13,7 +13,7 @@ from perception.model.lens import stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
 from perception.model.sensor import clip_level_e
 from perception.robust.problem import Start, Window
-from perception.robust.search.blobs import Blob, near_groups
+from perception.robust.search.blobs import MAX_IMAGE_RADIUS_PX, Blob, is_large, near_groups
 from perception.robust.search.cutout import cut, light_of
 from perception.robust.search.frame import excess_at
 from perception.robust.search.prepare import MOST_STRUCTURED_PX, PreparedFrame
@@ -33,9 +33,6 @@ _KEPT_PX = 2
 
 LEAST_RANGE_M = 0.03
 """Nothing is taken for a source that would stand nearer to the lens."""
-
-MAX_IMAGE_RADIUS_PX = 28.0
-"""Sources that look larger are fitted as they are, or not at all: looking for what may hide them is dear."""
 
 # Few sizes of windows, as what texture looks like is reckoned once for each.
 _SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX)
@@ -92,11 +89,6 @@ class Candidate:
         """Logarithm of the range of a source of that flux; where no range can be had, of flux 1 at 1 m."""
         at_one_metre_e = self.at_one_metre_e if self.at_one_metre_e > 0.0 else 1.0
         return 0.5 * math.log(at_one_metre_e / flux_e)
-
-
-def is_large(blob: Blob) -> bool:
-    """Tell whether a blob is longer than what is fitted."""
-    return max(blob.box.height, blob.box.width) > 3.0 * MAX_IMAGE_RADIUS_PX
 
 
 def candidates(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[Candidate]:

@@ -12,10 +12,10 @@ from perception.model.bearing import bearing_body
 from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
 from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
-from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended, is_large
+from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.flare import MeasuredFlare
 from perception.robust.measure import measure
-from perception.robust.search.blobs import Blob, blobs_at, split_at_peaks
+from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.hills import prominent, summit
 from perception.robust.search.prepare import PreparedFrame, prepare
@@ -210,9 +210,10 @@ def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Bl
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
     reach_px = math.ceil(_SUMMIT_REACH * math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0))
     least_px = _LARGE_HILL * (reach_px + 1) ** 2
+    clips = component.pixels & prepared.clipped_in(component.box) if is_large(component) else None
     return [
         flare
-        for part in split_at_peaks(component, noise_e)
+        for part in split_at_peaks(component, noise_e, clips=clips)
         for flare in (
             _off_hill(part, component, noise_e, reach_px, prepared)
             if part.area_px >= least_px or prepared.is_structured(part.box)

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.flare import PixelBox
 
+MAX_IMAGE_RADIUS_PX = 28.0
+"""Sources that look larger are fitted as they are, or not at all: looking for what may hide them is dear."""
+
 MOST_PEAKS = 16
 """Of one blob so many maxima are told apart at most."""
 
@@ -39,6 +42,11 @@ class Blob:
         """Return its pixels as indices in a frame of so many columns, in order."""
         rows, columns = np.nonzero(self.pixels)
         return np.asarray((self.box.top + rows) * width + self.box.left + columns)
+
+
+def is_large(blob: Blob) -> bool:
+    """Tell whether a blob is longer than what is fitted: three radii."""
+    return max(blob.box.height, blob.box.width) > 3.0 * MAX_IMAGE_RADIUS_PX
 
 
 def components(mask: NDArray[np.bool_], min_area_px: int = 1) -> list[Blob]:
@@ -124,12 +132,15 @@ def _join(leader: NDArray[np.int64], one: int, other: int) -> None:
     leader[max(one, other)] = min(one, other)
 
 
-def split_at_peaks(blob: Blob, noise: NDArray[np.float32], dip: float = 0.05) -> list[Blob]:
+def split_at_peaks(
+    blob: Blob, noise: NDArray[np.float32], dip: float = 0.05, clips: NDArray[np.bool_] | None = None
+) -> list[Blob]:
     """Divide a blob among its distinct local maxima.
 
     Two maxima are distinct if the lowest saddle between them lies below the fainter one by more than 5 σ of
     noise and a fraction `dip` of its brightness: the plateau of a resolved or clipped disc has many maxima
-    but no such saddle. Each pixel goes to the nearest maximum.
+    but no such saddle. Each pixel goes to the nearest maximum, or to what is clipped in one piece with it, as
+    the maximum may be anywhere on that.
 
     Parameters
     ----------
@@ -139,6 +150,8 @@ def split_at_peaks(blob: Blob, noise: NDArray[np.float32], dip: float = 0.05) ->
         Standard deviation of its filtered image, shape (box.height, box.width).
     dip
         Least relative depth of a saddle.
+    clips
+        Which of its pixels are clipped, if that counts.
 
     Returns
     -------
@@ -150,9 +163,23 @@ def split_at_peaks(blob: Blob, noise: NDArray[np.float32], dip: float = 0.05) ->
         return [blob]
     peaks = peaks[np.argsort(-brightness[peaks[:, 0], peaks[:, 1]], kind="stable")][:MOST_PEAKS]
     rows, columns = np.indices(blob.pixels.shape)
-    distance2 = (rows - peaks[:, :1, None]) ** 2 + (columns - peaks[:, 1:, None]) ** 2
+    distance2 = ((rows - peaks[:, :1, None]) ** 2 + (columns - peaks[:, 1:, None]) ** 2).astype(np.float64)
+    if clips is not None:
+        pieces = [one_piece(clips, *peak) if clips[tuple(peak)] else None for peak in peaks]
+        for index, piece in enumerate(pieces):
+            # Not where charge that spilled joins several.
+            if piece is not None and np.count_nonzero(piece[tuple(peaks.T)]) == 1:
+                distance2[index] = _distance_px(piece) ** 2
     nearest = distance2.argmin(axis=0)
     return [trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
+
+
+def _distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return how far each pixel lies from a mask."""
+    import cv2
+
+    outside = np.asarray(~mask, dtype=np.uint8)
+    return np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), dtype=np.float64)
 
 
 def one_piece(mask: NDArray[np.bool_], row: int, column: int) -> NDArray[np.bool_]:

@@ -77,6 +77,20 @@ def test_clipped_balls_before_a_wall_s_lit_edge_are_ranged(wall_e: float) -> Non
         assert abs(told.range_m - range_m) < 5.0 * told.range_sigma_m < 0.01 * range_m
 
 
+@pytest.mark.parametrize("apart_px", [6.0, 8.0])
+def test_a_source_beside_what_clips_is_told_and_nothing_else(apart_px: float) -> None:
+    """Above it half of the frame is clipped, or left of it a lamp of 100 px by 80: both are one blob with it, whose
+    pixels went to the nearest maximum, which is anywhere on what is clipped."""
+    camera = calibration(width_px=320, height_px=240, cx_px=159.5, cy_px=119.5)
+    half, lamp = np.full((240, 320), 20.0), np.full((240, 320), 20.0)
+    half[:120], lamp[80:160, 50:150] = 1e5, 3e4
+    for light, place in ((half, (200.3, 119.7 + apart_px, 3.0)), (lamp, (149.7 + apart_px, 120.2, 2.0))):
+        mean_e = gaussian_filter(light, camera.psf_sigma_px) + expected_e(camera, [place], 1.5e-3)
+        (told,) = perception.detect(expose(mean_e, camera, random(5, 117), 1.5e-3), camera)
+        assert math.hypot(told.u_px - place[0], told.v_px - place[1]) < 0.1
+        assert abs(told.range_m - place[2]) < 5.0 * told.range_sigma_m < 0.05 * place[2]
+
+
 def test_clipped_sources_are_told_through_a_wider_point_spread() -> None:
     """24 balls of 1 to 14 px, clipped 13 times, their limbs a seventh wider than the calibration says: 22 are told."""
     camera = calibration()
