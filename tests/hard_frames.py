@@ -300,12 +300,19 @@ def textured(
 def lamps(
     frames: int = 4, estimator: str = "robust", first: int = 0, source_radius_m: float = 1e-6
 ) -> dict[str, Any]:
-    """Evenly bright rectangles and discs of 6 to 60 px, a third of them clipped, and nothing else."""
+    """Evenly bright rectangles and ovals of 6 to 50 px, a third of them clipped, and nothing else.
+
+    Counted apart are those that are as bright as a source within a quarter, and as round within a fifth.
+    """
     camera = replace(POINT, bit_depth=12, saturation_dn=4095, source_radius_m=source_radius_m)
     parts = 8
     within = (np.arange(parts * CELL_PX) + 0.5) / parts - 0.5 * CELL_PX  # from a cell's middle
-    alarms = count = 0
+    alarms = count = like_sources = 0
+    ball_e = math.inf
+    if source_radius_m > 1e-3:
+        ball_e = FLUX_PER_S_AT_1_M * EXPOSURE_S / (math.pi * (camera.fx_px * source_radius_m) ** 2)
     for index in range(first, first + frames):
+        alike: list[tuple[float, float]] = []
         generator = random(12, index)
         mean_e = np.full((camera.height_px, camera.width_px), BACKGROUND_E)
         for u, v in cell_centres(1):
@@ -313,14 +320,25 @@ def lamps(
             level_e = 10.0 ** generator.uniform(2.0, 4.2)
             du, dv = generator.uniform(-0.5, 0.5, 2)
             x, y = (within - du) / half_u, (within[:, None] - dv) / half_v
-            inside = np.hypot(x, y) < 1.0 if generator.random() < 0.5 else np.maximum(abs(x), abs(y)) < 1.0
+            is_oval = generator.random() < 0.5
+            inside = np.hypot(x, y) < 1.0 if is_oval else np.maximum(abs(x), abs(y)) < 1.0
             covered = inside.reshape(CELL_PX, parts, CELL_PX, parts).mean(axis=(1, 3))  # no stairs
             top, left = round(v + 0.5) - CELL_PX // 2, round(u + 0.5) - CELL_PX // 2
             mean_e[top : top + CELL_PX, left : left + CELL_PX] += level_e * covered
             count += 1
+            cosine2 = 1.0 / (1.0 + ((u - camera.cx_px) ** 2 + (v - camera.cy_px) ** 2) / camera.fx_px**2)
+            of_ball, round_as = level_e / (ball_e * cosine2**2), half_u / half_v
+            if is_oval and 1.0 / 1.25 < of_ball < 1.25 and 1.0 / 1.2 < round_as < 1.2:
+                alike.append((u, v))
         frame = expose(gaussian_filter(mean_e, camera.psf_sigma_px), camera, random(13, index), EXPOSURE_S)
-        alarms += len(perception.detect(frame, camera, estimator))
-    return {"frames": frames, "lamps": count, "reported": alarms, "reported_share": alarms / count}
+        found = perception.detect(frame, camera, estimator)
+        near = [any(math.hypot(one.u_px - u, one.v_px - v) < 2.0 for u, v in alike) for one in found]
+        like_sources += sum(near)
+        alarms += len(found) - sum(near)
+    return {
+        "frames": frames, "lamps": count, "reported": alarms, "reported_share": alarms / count,
+        "reported_as_round_and_bright_as_sources": like_sources,
+    }  # fmt: skip
 
 
 def _covered(inside_px: Array) -> Array:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from perception.model.window import Camera
-from perception.robust.around.uneven import FEWEST_SEEN, MOST_LEFT, explains_flanks
+from perception.robust.around.uneven import MOST_LEFT, explains_flanks
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters
 from perception.robust.explain import best
 from perception.robust.flare import MeasuredFlare, measured_flare
@@ -124,7 +124,7 @@ def _judged(
     left = solution.left_over
     misfit = not left.is_good or (solution.count == 1 and left.peak_sigmas > RESIDUAL_SIGMAS)
     # Where nothing is seen but what is clipped, nothing is explained.
-    misfit |= cluster.is_clipped and left.pixels < FEWEST_SEEN
+    misfit |= cluster.is_clipped and left.pixels == 0
     # An edge is long, too: what is drawn out on edges must leave hardly any of them.
     drawn_out = solution.motion_px is not None and solution.window.on_edges
     doubted = misfit or cluster.is_clipped or drawn_out

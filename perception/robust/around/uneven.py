@@ -18,9 +18,10 @@ from perception.robust.solve import Solution, solve
 MOST_LEFT = 0.25
 """What a fit may leave over, relative to the flares' light, of what is still called a source."""
 
-FEWEST_SEEN = 8
-"""Pixels of a clipped flare that must be seen, without those that clip: 18 of a point clipped 20 times."""
+_FEWEST_SEEN = 8
+"""Pixels of a flare that must be seen beside columns, where what is clipped is no column itself."""
 
+_SPILT_ASPECT = 2  # of what is clipped, from which on charge has spilled for sure
 _LEAST_ACROSS = 0.8  # of the columns that are clipped
 _SPILLS_ASIDE_PX = 2  # at most, and so far a point spread that is not the calibration's reaches
 
@@ -107,9 +108,12 @@ def explains_flanks(one: Solution, window: Window) -> bool:
     """
     # How far one moves along columns that are left out nothing tells.
     along = one.motion_px is not None and bool((abs(one.motion_px[:, 1]) > abs(one.motion_px[:, 0])).any())
-    if along or not one.left_over.share < MOST_LEFT or one.left_over.pixels < FEWEST_SEEN:
+    clips = window.state == CLIPPED
+    wide, tall = int(clips.any(axis=0).sum()), int(clips.any(axis=1).sum())
+    least = 1 if tall >= _SPILT_ASPECT * wide else _FEWEST_SEEN
+    if along or not one.left_over.share < MOST_LEFT or one.left_over.pixels < least:
         return False
-    clipped, own = ((window.state == CLIPPED).any(axis=0), (one.expected_e > window.clip_e).any(axis=0))
+    clipped, own = clips.any(axis=0), (one.expected_e > window.clip_e).any(axis=0)
     beside = np.convolve(own, np.ones(2 * _SPILLS_ASIDE_PX + 1), mode="same") > 0.5
     return int(beside[clipped].sum()) >= _LEAST_ACROSS * int(clipped.sum())
 
