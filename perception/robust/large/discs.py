@@ -32,6 +32,7 @@ _LEAST_ROUND, _LEAST_ROUND_IF_CLIPPED = 0.3, 0.6
 missing; of a clipped disc the outline is all that is known."""
 
 _MOST_BRIGHTNESS_FACTOR = 2.0
+_LEAST_OF_BLOB = 0.25
 _ODD_SIGMAS = 3.0
 _SPILLS_ON_PX = 3
 _BEYOND_PX = 0.5  # of the outline of what is clipped, where nothing that clips is a disc's own
@@ -64,6 +65,8 @@ def measure_large(
         small = [] if fits or apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
         again += [cluster.members[k] for k in small]
         wanted = [k for k in _large_discs(cluster, circles, prepared) if k not in small]
+        if not fits:
+            wanted = [k for k in wanted if _is_most_of_blob(cluster.members[k], circles[k], prepared)]
         measured += _by_disc(cluster, solution if fits else None, wanted, prepared)
     return measured, again
 
@@ -71,6 +74,22 @@ def measure_large(
 def _outlines(cluster: Cluster, prepared: PreparedFrame) -> list[Outline | None]:
     """Return the outlines of a cluster's members, None of those that are not too large."""
     return [outline_of(one.blob, prepared) if one.is_too_large else None for one in cluster.members]
+
+
+def _is_most_of_blob(member: Candidate, outline: Outline | None, prepared: PreparedFrame) -> bool:
+    """Tell whether a large clipped blob is the disc of its outline, so that its light bounds a range.
+
+    Not the sliver of a disc beyond the frame's border, nor a clipped spot on a lit patch.
+    """
+    if outline is None or not member.is_clipped:
+        return True
+    box = member.blob.box
+    inside_u = box.left <= outline.u_px < box.left + box.width
+    inside_v = box.top <= outline.v_px < box.top + box.height
+    (turn,) = pixel_turn([[outline.u_px, outline.v_px]], prepared.calibration)
+    pixel_sr = float(np.prod(np.linalg.svd(turn, compute_uv=False)))
+    disc_px2 = math.pi * outline.angle_rad**2 / pixel_sr
+    return inside_u and inside_v and disc_px2 > _LEAST_OF_BLOB * member.blob.area_px
 
 
 def _whole_discs(
