@@ -231,9 +231,9 @@ def _off_hill(
     down, across = part.box.top - component.box.top + row, part.box.left - component.box.left + column
     clips = part.pixels & prepared.clipped_in(part.box)
     around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
-    # Its brightest pixel may be the flank of another, larger one.
-    # What is clipped is as bright as its hill for all that is known; but a hill is too large to be fitted.
+    # What is clipped is left alone, but where it is too large to be fitted with its hill.
     left_alone = np.zeros_like(clips) if is_large(part) else clips
+    # Its brightest pixel may be the flank of another, larger one.
     flare = part if around.max() > part.peak_e else summit(part, left_alone, reach_px)
     if flare is not part or part.area_px < _LARGE_HILL * (reach_px + 1) ** 2 or clips.any():
         return [flare]

@@ -23,11 +23,8 @@ _LEAST_SEEN, _MOST_OFF = 2.0 / 3.0, 0.5
 _CLIPPED_DIM, _MOST_CLIPPED_DIM = 0.5, 0.1
 _MOST_OF_CLIPPED = 2  # flares more than blobs
 _LIMB_RADIUS_PX, _MOST_LEFT_OF_LIMB = 2.0, 0.1
-_MOST_LIMB_ASPECT, _MOST_LIMB_BRIGHTNESS, _OF_TIE = (
-    1.08,
-    1.15,
-    4.0,
-)  # of sources that are not quite round or known
+_MOST_LIMB_ASPECT, _MOST_LIMB_BRIGHTNESS = 1.08, 1.15  # of sources that are not quite round or known
+_OF_TIE = 4.0  # σ
 _LEAST_GAIN_OF_OVAL = 30.0  # 2 Δ ln L: real sources give it 10 at most, lamps 50 to 325
 
 

@@ -109,13 +109,14 @@ def explains_flanks(one: Solution, window: Window) -> bool:
     # How far one moves along columns that are left out nothing tells.
     along = one.motion_px is not None and bool((abs(one.motion_px[:, 1]) > abs(one.motion_px[:, 0])).any())
     clips = window.state == CLIPPED
-    wide, tall = int(clips.any(axis=0).sum()), int(clips.any(axis=1).sum())
+    clipped = clips.any(axis=0)
+    wide, tall = int(clipped.sum()), int(clips.any(axis=1).sum())
     least = 1 if tall >= _SPILT_ASPECT * wide else _FEWEST_SEEN
     if along or not one.left_over.share < MOST_LEFT or one.left_over.pixels < least:
         return False
-    clipped, own = clips.any(axis=0), (one.expected_e > window.clip_e).any(axis=0)
+    own = (one.expected_e > window.clip_e).any(axis=0)
     beside = np.convolve(own, np.ones(2 * _SPILLS_ASIDE_PX + 1), mode="same") > 0.5
-    return int(beside[clipped].sum()) >= _LEAST_ACROSS * int(clipped.sum())
+    return int(beside[clipped].sum()) >= _LEAST_ACROSS * wide
 
 
 def without_spill(

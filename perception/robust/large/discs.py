@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import direction_camera, pixel_turn
+from perception.model.bearing import direction_camera
 from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.lens import stretch
+from perception.model.ranging import covered_px_at_1_m
 from perception.model.window import Camera
 from perception.robust.around.uneven import MOST_LEFT
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, least_flux_e
@@ -32,7 +33,7 @@ _LEAST_ROUND, _LEAST_ROUND_IF_CLIPPED = 0.3, 0.6
 missing; of a clipped disc the outline is all that is known."""
 
 _MOST_BRIGHTNESS_FACTOR = 2.0
-_LEAST_OF_BLOB = 0.25
+_LEAST_OF_BLOB = 0.25  # that the disc of its outline is, where its light is to bound a range
 _ODD_SIGMAS = 3.0
 _SPILLS_ON_PX = 3
 _BEYOND_PX = 0.5  # of the outline of what is clipped, where nothing that clips is a disc's own
@@ -59,15 +60,22 @@ def measure_large(
     measured: list[tuple[Blob, MeasuredFlare]] = []
     again: list[Candidate] = []
     outlines = [_outlines(cluster, prepared) for cluster in found]
-    rows = zip(found, outlines, _whole_discs(found, outlines, prepared, camera), strict=True)
-    for cluster, circles, solution in rows:
-        fits = solution is not None and _is_whole_discs(solution, cluster)
-        small = [] if fits or apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
+    discs = [_discs(cluster, of_it, prepared) for cluster, of_it in zip(found, outlines, strict=True)]
+    problems = [
+        _guess_by_outline(cluster, of_it, prepared) if any_disc else None
+        for cluster, of_it, any_disc in zip(found, outlines, discs, strict=True)
+    ]
+    rows = zip(found, outlines, discs, _whole_discs(problems, camera), strict=True)
+    for cluster, of_it, wanted, solution in rows:
+        if solution is not None and _is_whole_discs(solution, cluster):
+            measured += _by_disc(cluster, solution, wanted, prepared)
+            continue
+        small = [] if apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
         again += [cluster.members[k] for k in small]
-        wanted = [k for k in _large_discs(cluster, circles, prepared) if k not in small]
-        if not fits:
-            wanted = [k for k in wanted if _is_most_of_blob(cluster.members[k], circles[k], prepared)]
-        measured += _by_disc(cluster, solution if fits else None, wanted, prepared)
+        for k in wanted:
+            member = cluster.members[k]
+            if k not in small and _is_most_of_blob(member, of_it[k], prepared):
+                measured.append((member.blob, measure_by_aperture(member, cluster, prepared)))
     return measured, again
 
 
@@ -86,27 +94,17 @@ def _is_most_of_blob(member: Candidate, outline: Outline | None, prepared: Prepa
     box = member.blob.box
     inside_u = box.left <= outline.u_px < box.left + box.width
     inside_v = box.top <= outline.v_px < box.top + box.height
-    (turn,) = pixel_turn([[outline.u_px, outline.v_px]], prepared.calibration)
-    pixel_sr = float(np.prod(np.linalg.svd(turn, compute_uv=False)))
-    disc_px2 = math.pi * outline.angle_rad**2 / pixel_sr
+    calibration = prepared.calibration
+    at_1_m_px2 = float(covered_px_at_1_m(np.array([[outline.u_px, outline.v_px]]), calibration)[0])
+    disc_px2 = at_1_m_px2 * (outline.angle_rad / calibration.source_radius_m) ** 2
     return inside_u and inside_v and disc_px2 > _LEAST_OF_BLOB * member.blob.area_px
 
 
-def _whole_discs(
-    found: Sequence[Cluster],
-    outlines: Sequence[Sequence[Outline | None]],
-    prepared: PreparedFrame,
-    camera: Camera,
-) -> list[Solution | None]:
-    """Fit whole discs to clusters of large ones; None where there are none, or the fit did not converge."""
-    solutions: list[Solution | None] = [None] * len(found)
-    tried: list[int] = []
-    problems = []
-    for index, (cluster, circles) in enumerate(zip(found, outlines, strict=True)):
-        problem = _guess_by_outline(cluster, circles, prepared)
-        if problem is not None and _large_discs(cluster, circles, prepared):
-            tried.append(index)
-            problems.append(problem)
+def _whole_discs(guesses: Sequence[Problem | None], camera: Camera) -> list[Solution | None]:
+    """Fit whole discs; None where there are no guesses of any, or the fit did not converge."""
+    solutions: list[Solution | None] = [None] * len(guesses)
+    tried = [index for index, guess in enumerate(guesses) if guess is not None]
+    problems = [guess for guess in guesses if guess is not None]
     for _ in range(_TIMES_LAID_OUT):
         for index, solution in zip(tried, solve(problems, camera), strict=True):
             solutions[index] = solution
@@ -184,16 +182,15 @@ def _is_no_large_disc(member: Candidate, outline: Outline | None, prepared: Prep
         return True
     if not member.at_one_metre_e > 0.0:
         return False
-    (turn,) = pixel_turn([[member.u_px, member.v_px]], calibration)
-    long_rad, short_rad = map(float, np.linalg.svd(turn, compute_uv=False))
-    disc_e = member.at_one_metre_e * long_rad * short_rad / (math.pi * calibration.source_radius_m**2)
+    at_1_m_px2 = float(covered_px_at_1_m(np.array([[member.u_px, member.v_px]]), calibration)[0])
+    disc_e = member.at_one_metre_e / at_1_m_px2
     seen_e = float(np.median(prepared.excess_e[member.blob.box.slices][member.blob.pixels]))
     if disc_e > seen_e:
         return not member.is_clipped and disc_e > _MOST_BRIGHTNESS_FACTOR * seen_e
     return seen_e > _MOST_BRIGHTNESS_FACTOR * disc_e
 
 
-def _large_discs(cluster: Cluster, outlines: Sequence[Outline | None], prepared: PreparedFrame) -> list[int]:
+def _discs(cluster: Cluster, outlines: Sequence[Outline | None], prepared: PreparedFrame) -> list[int]:
     """Return which wanted members of a cluster are no lamps by their outlines and their brightness."""
     members = ((k, cluster.members[k]) for k in cluster.wanted)
     return [
@@ -209,16 +206,13 @@ def _is_whole_discs(solution: Solution, cluster: Cluster) -> bool:
 
 
 def _by_disc(
-    cluster: Cluster, solution: Solution | None, wanted: Sequence[int], prepared: PreparedFrame
+    cluster: Cluster, solution: Solution, wanted: Sequence[int], prepared: PreparedFrame
 ) -> list[tuple[Blob, MeasuredFlare]]:
-    """Turn a fit of whole large discs into measurements, or sum apertures where there is none that is one.
+    """Turn a fit of whole large discs into measurements.
 
     A disc that is not all there, or not alone, leaves light over: about twice as much its flux may lack, or
     have too much, as the fit has taken a part of it up; by such a share of its radius it may be elsewhere.
     """
-    if solution is None:
-        members = [cluster.members[k] for k in wanted]
-        return [(one.blob, measure_by_aperture(one, cluster, prepared)) for one in members]
     misfit = _is_misfit(solution)
     measured = []
     for k in wanted:

@@ -61,11 +61,11 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
     window = flares.window
     around_e = flares.expected_e - flares.flares_e
     variance = flares.variance_e2(MODEL_ERROR)
-    values = _first_guess(flares)
+    values, laid = _first_guess(flares), _largest(flares, camera)
 
-    def fitted(values: Array) -> tuple[float, Array, Array, Array]:
-        """Return χ², what is left, the weight of each pixel, and the slopes."""
-        expected, slopes = _image(values, flares, camera)
+    def fitted(values: Array) -> tuple[float, Array, Array, Array, Array]:
+        """Return χ², what is left, the weight of each pixel, the oval's light, and its slopes."""
+        expected, slopes = _image(values, laid, flares)
         left = residual_e(window.image_e, window.state, around_e + expected.reshape(around_e.shape))
         # A pixel clips where it is expected to; one that should not pulls.
         counts = (window.state == SEEN) | ((window.state == CLIPPED) & (left != 0.0))
@@ -73,10 +73,11 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
             float(np.sum(left**2 / variance)),
             left.ravel(),
             np.where(counts, 1.0 / variance, 0.0).ravel(),
+            expected,
             slopes,
         )
 
-    chi2, left, weight, slopes = fitted(values)
+    chi2, left, weight, expected, slopes = fitted(values)
     damping = 1e-3
     for _ in range(_MOST_STEPS):
         information = (slopes * weight) @ slopes.T
@@ -92,13 +93,12 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
             continue
         is_settled = chi2 - there[0] < _SETTLED
         values, damping = trial, 0.1 * damping
-        chi2, left, weight, slopes = there
+        chi2, left, weight, expected, slopes = there
         if is_settled:
             break
     _, _, log_flux, log_size, a, b, _ = values.tolist()
     axes = math.hypot(a, b)
-    shines = (weight > 0.0) & (_image(values, flares, camera)[0] ** 2 > variance.ravel())
-    laid = _largest(flares, camera)
+    shines = (weight > 0.0) & (expected**2 > variance.ravel())
     log_source = float(laid.log_flux_at_1_m[0]) - 2.0 * float(laid.log_range_at[0])
     return Oval(
         is_good=is_likely(int(shines.sum()), float(np.sum(weight[shines] * left[shines] ** 2))),
@@ -133,13 +133,12 @@ def _first_guess(flares: Solution) -> Array:
     return np.array([box.left + u, box.top + v, np.log(flux), log_size, *stretched, 0.0])
 
 
-def _image(values: Array, flares: Solution, camera: Camera) -> tuple[Array, Array]:
+def _image(values: Array, laid: Sources, flares: Solution) -> tuple[Array, Array]:
     """Return the oval's light in each pixel, shape (pixels,), and its derivatives, (unknowns, pixels).
 
     Each node of a round disc is moved from o to s (1 + A) o, A = [[a, b], [b, -a]].
     """
     box, shape = flares.window.box, flares.window.image_e.shape
-    laid = _largest(flares, camera)
     u_px, v_px, log_flux, log_size, a, b, _ = values.tolist()
     size, out_u, out_v = float(np.exp(log_size)), laid.node_u_px, laid.node_v_px
     moved = laid._replace(

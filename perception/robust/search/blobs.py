@@ -163,13 +163,14 @@ def split_at_peaks(
         return [blob]
     peaks = peaks[np.argsort(-brightness[peaks[:, 0], peaks[:, 1]], kind="stable")][:MOST_PEAKS]
     rows, columns = np.indices(blob.pixels.shape)
-    distance2 = ((rows - peaks[:, :1, None]) ** 2 + (columns - peaks[:, 1:, None]) ** 2).astype(np.float64)
+    distance2 = (rows - peaks[:, :1, None]) ** 2 + (columns - peaks[:, 1:, None]) ** 2
     if clips is not None:
-        pieces = [one_piece(clips, *peak) if clips[tuple(peak)] else None for peak in peaks]
-        for index, piece in enumerate(pieces):
+        distance2, pieces = distance2.astype(np.float64), _pieces(clips)
+        own = pieces[tuple(peaks.T)]
+        for index, piece in enumerate(own):
             # Not where charge that spilled joins several.
-            if piece is not None and np.count_nonzero(piece[tuple(peaks.T)]) == 1:
-                distance2[index] = _distance_px(piece) ** 2
+            if piece >= 0 and np.count_nonzero(own == piece) == 1:
+                distance2[index] = _distance_px(pieces == piece) ** 2
     nearest = distance2.argmin(axis=0)
     return [trimmed(blob, blob.pixels & (nearest == peak)) for peak in range(len(peaks))]
 
@@ -184,11 +185,16 @@ def _distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 def one_piece(mask: NDArray[np.bool_], row: int, column: int) -> NDArray[np.bool_]:
     """Return what of a mask is in one piece with a place in it."""
+    pieces = _pieces(mask)
+    return np.asarray(pieces == pieces[row, column])
+
+
+def _pieces(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Give numbers to the connected components of a mask; -1 outside."""
     places, width = np.flatnonzero(mask), mask.shape[1]
-    labels, _ = _labelled(places, width)
-    piece = np.zeros(mask.size, dtype=bool)
-    piece[places[labels == labels[np.searchsorted(places, row * width + column)]]] = True
-    return piece.reshape(mask.shape)
+    pieces = np.full(mask.size, -1, dtype=np.int64)
+    pieces[places] = _labelled(places, width)[0]
+    return pieces.reshape(mask.shape)
 
 
 def dilated(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:

@@ -38,10 +38,8 @@ MOST_STRUCTURED_PX = 129
 """Larger windows are fitted on an even background."""
 
 _BAD_SIGMAS = 5.0
-_CLIPPED_FILTERED, _CLIPPED_NOISES = (
-    0.9,
-    8.0,
-)  # of what clips, above the background; by that it must stand out
+_CLIPPED_FILTERED = 0.9  # of what clips, above the background
+_CLIPPED_NOISES = 8.0  # by so many σ it must stand out
 _SMOOTHING_REACH = 4
 
 

@@ -60,6 +60,18 @@ def test_discs_of_36_to_71_px_are_ranged_anywhere(place: Place, exposure_s: floa
     assert told.range_sigma_m < 2e-3 * told.range_m
 
 
+def test_a_clipped_disc_that_no_disc_explains_is_bounded() -> None:
+    """One of 40 px that moves 2 px while exposed: its clipped flux bounds the range from above."""
+    places = [(150.3 + along_px, 120.2, 0.12) for along_px in np.linspace(-1.0, 1.0, 9)]
+    camera = calibration(width_px=320, height_px=240, cx_px=159.5, cy_px=119.5)
+    mean_e = np.mean([expected_e(camera, [place], 2e-3) for place in places], axis=0) + 20.0
+    (told,) = detect(expose(mean_e, camera, random(86), 2e-3), camera)
+    assert told.saturated
+    assert told.range_m > 0.12
+    assert math.isnan(told.range_sigma_m)
+    assert math.hypot(told.u_px - 150.3, told.v_px - 120.2) < 0.5
+
+
 def test_charge_that_spills_over_whole_columns_is_left_out() -> None:
     """Of balls of 3 to 14 px the middle column is clipped from the frame's top to its bottom: bounds of twice the
     range were told of five of twelve."""
