@@ -139,6 +139,16 @@ def covered_px_at_1_m(places_px: Array, calibration: Calibration) -> Array:
     return np.asarray(math.pi * radius_m**2 / np.linalg.norm(np.cross(along_u, along_v), axis=1))
 
 
+def brightness_e(places_px: Array, exposure_s: float, gain: float, calibration: Calibration) -> Array:
+    """Electrons of a pixel that the image of a source covers: the same at any range.
+
+    Of places of shape (n, 2) → (n,); infinite where sources are points, NaN where no range can be had.
+    """
+    exposed_s = exposure_towards(direction_camera(places_px, calibration), exposure_s, gain, calibration)
+    with np.errstate(divide="ignore"):
+        return flux_e_of(exposed_s, gain, calibration) / covered_px_at_1_m(places_px, calibration)
+
+
 def angular_radius_rad(range_m: ArrayLike, source_radius_m: float) -> Array:
     """Angular radius of a sphere, asin(r / d), d the distance of its centre, a number or an array.
 

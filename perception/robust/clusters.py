@@ -34,8 +34,10 @@ _KEPT_PX = 2
 LEAST_RANGE_M = 0.03
 """Nothing is taken for a source that would stand nearer to the lens."""
 
+_MOST_EVEN_PX = 193  # of a group's window on even ground
+
 # Few sizes of windows, as what texture looks like is reckoned once for each.
-_SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX)
+_SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX, 161, _MOST_EVEN_PX)
 _CLIPPED_FACTORS = (1.0, 4.0, 16.0, 64.0)
 _CUT_FACTORS = (1.0, 2.0, 4.0)
 _LEAST_DISC_PX2 = 50  # of what is clipped, from which on its outline tells a disc's size
@@ -182,10 +184,10 @@ def clusters(
     """
     blobs = [member.blob for member in members]
     chosen: list[tuple[list[int], list[int]]] = []
+    most_px = MOST_STRUCTURED_PX if prepared.texture_e is not None else _MOST_EVEN_PX
     for group in [[k] for k in range(len(blobs))] if apart else near_groups(blobs, NEAR_PX):
         if len(group) == 1 or (
-            len(group) <= MOST_BLOBS
-            and _window_box([members[k] for k in group], prepared).height <= _SIDES_PX[-1]
+            len(group) <= MOST_BLOBS and _window_box([members[k] for k in group], prepared).height <= most_px
         ):
             chosen.append((group, list(range(len(group)))))
             continue

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import bearing_body
 from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
-from perception.model.ranging import flux_at_one_metre_dn
+from perception.model.ranging import constant_spread, flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.flare import MeasuredFlare
@@ -32,6 +32,8 @@ _AT_ONCE = 8  # clusters between two looks at the clock
 _RING_PX = 4
 _SUMMIT_REACH = 4.0  # σ of the point spread: three of what it is filtered to, √2 times as wide
 _FEWEST_RING_PIXELS = 8
+_LEAST_DISC_PX2 = 30
+_MOSTLY_SEEN, _BRIGHTER = 0.7, 1.3  # of the brightness of sources: as much as their discs have, and no more
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
 
@@ -204,22 +206,41 @@ def _middles_e(blobs: Sequence[Blob], prepared: PreparedFrame) -> list[float]:
 def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Blob]:
     """Divide a component, on such a background, at maxima that differ by more than their noise.
 
-    Parts are cut off hills, where they are large or the background has structure.
+    Parts are cut off hills, where they are large or the background has structure; but not where they are
+    discs as bright as near sources, whose many maxima are noise, several or not.
     """
     expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
     reach_px = math.ceil(_SUMMIT_REACH * math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0))
     least_px = _LARGE_HILL * (reach_px + 1) ** 2
     clips = component.pixels & prepared.clipped_in(component.box) if is_large(component) else None
+    disc_e = _disc_level_e(component, prepared)
+    if disc_e < math.inf:
+        clips = component.filtered_e > disc_e
+    parts = split_at_peaks(component, noise_e, flat=clips, most_e=disc_e)
     return [
         flare
-        for part in split_at_peaks(component, noise_e, clips=clips)
+        for part in parts
         for flare in (
             _off_hill(part, component, noise_e, reach_px, prepared)
-            if part.area_px >= least_px or prepared.is_structured(part.box)
+            if part.peak_e < disc_e and (part.area_px >= least_px or prepared.is_structured(part.box))
             else [part]
         )
     ]
+
+
+def _disc_level_e(component: Blob, prepared: PreparedFrame) -> float:
+    """Return from which level on what is lit in a component belongs to near sources; infinite if to none."""
+    box = component.box
+    if component.area_px < _LEAST_DISC_PX2 or prepared.clipped_in(box).any():
+        return math.inf
+    of_source_e = prepared.brightness_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
+    most_e = _BRIGHTER * (1.0 + 4.0 * constant_spread(prepared.calibration)) * of_source_e
+    level_e = _MOSTLY_SEEN * of_source_e
+    if not level_e < component.peak_e < most_e:
+        return math.inf
+    is_disc = np.count_nonzero(component.filtered_e > level_e) >= _LEAST_DISC_PX2
+    return level_e if is_disc else math.inf
 
 
 def _off_hill(

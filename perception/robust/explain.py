@@ -36,7 +36,7 @@ from perception.robust.overlap.deblend import (
     deblend,
     of_free_width,
 )
-from perception.robust.overlap.eclipse import eclipses
+from perception.robust.overlap.eclipse import eclipses, pile_of
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
@@ -44,7 +44,7 @@ from perception.robust.overlap.rivals import weighed
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.solve import Solution, solve, start_costs
+from perception.robust.solve import Solution, likely_starts, solve
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 _ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
@@ -62,7 +62,9 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     -------
     What explains each best; None where nothing does.
     """
-    problems = _likely([_first_problems(cluster, prepared) for cluster in found], camera)
+    # The same window with each set of first guesses, from the faintest on.
+    first = [[Problem(c.window, starts, c.background_e) for starts in guesses(c, prepared)] for c in found]
+    problems = likely_starts(first, camera)
     chosen: list[Solution | None] = [None] * len(found)
     for (index, _), solution in zip(problems, solve([p for _, p in problems], camera), strict=True):
         held = chosen[index]
@@ -74,6 +76,41 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, fit in by_flanks(found, chosen, prepared, camera).items():
         chosen[index] = fit
     fit_beside_forward_light(chosen, camera)
+    piles = _piles(found, chosen, prepared, camera)
+    others = [index for index in range(len(found)) if index not in piles]
+    explained = _explained([found[k] for k in others], [chosen[k] for k in others], prepared, camera)
+    for index, one in zip(others, explained, strict=True):
+        chosen[index] = one
+    return [piles.get(index, one) for index, one in enumerate(chosen)]
+
+
+def _piles(
+    found: Sequence[Cluster], plain: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera
+) -> dict[int, Solution]:
+    """Explain windows by spheres that hide parts of each other, where a flare for each blob does not.
+
+    Not where one that moves explains what is seen as well: nothing else does.
+    """
+    piles = dict[int, Solution]()
+    if prepared.frame.line_time_s > 0.0:
+        return piles
+    for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
+        if one is None or may_be_other_shape(one, camera):
+            pile = pile_of(cluster, camera)
+            if pile is not None and pile.left_over.is_nothing:
+                piles[index] = pile
+    lone = [one if index in piles else None for index, one in enumerate(plain)]
+    for index, line in moving(lone, camera).items():
+        if line.motion_px is not None and line.left_over.is_good:
+            del piles[index]
+    return piles
+
+
+def _explained(
+    found: Sequence[Cluster], solved: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera
+) -> list[Solution | None]:
+    """Explain windows by more than a flare for each blob, where that explains them better."""
+    chosen = list(solved)
     lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
     on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}
     # What light fog throws forward goes by a flux that an edge no longer leads astray.
@@ -135,30 +172,6 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         one = chosen[index]
         if one is not None and asks_for_more(one):
             chosen[index] = replace(one, may_be_more=True)
-    return chosen
-
-
-def _first_problems(cluster: Cluster, prepared: PreparedFrame) -> list[Problem]:
-    """Return a cluster's problems: the same window with each set of first guesses, from the faintest on."""
-    return [Problem(cluster.window, starts, cluster.background_e) for starts in guesses(cluster, prepared)]
-
-
-def _likely(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple[int, Problem]]:
-    """Return by index of the cluster which problems to follow: those likelier than what lies beside them.
-
-    From one that is not the climb would lead to where a likelier one leads.
-    """
-    several = [each for of_one in problems if len(of_one) > 1 for each in of_one]
-    costs = iter(start_costs(several, camera))
-    chosen = []
-    for index, of_one in enumerate(problems):
-        if len(of_one) == 1:
-            chosen.append((index, of_one[0]))
-            continue
-        cost = [math.inf, *(next(costs) for _ in of_one), math.inf]
-        chosen += [
-            (index, each) for at, each in enumerate(of_one, 1) if cost[at] <= min(cost[at - 1], cost[at + 1])
-        ]
     return chosen
 
 

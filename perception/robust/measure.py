@@ -134,7 +134,7 @@ def _judged(
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
-    if cluster.is_clipped and is_any_outline(solution, len(cluster.members)):
+    if cluster.is_clipped and is_any_outline(solution, max(len(cluster.members), solution.by_outline)):
         return []
     if misfit and is_clipped_elsewhere(solution):
         return []

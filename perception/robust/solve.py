@@ -76,6 +76,8 @@ class Solution:
     is_eclipse
         Whether what one hides of another is left out of λ, where fluxes are of whole sources, and nothing
         else explains the window as well (`eclipse`).
+    by_outline
+        How many flares the outline of what is lit shows (`overlap.outlines`).
     """
 
     window: Window
@@ -105,6 +107,7 @@ class Solution:
     is_doubtful: bool = False
     may_be_more: bool = False
     is_eclipse: bool = False
+    by_outline: int = 0
 
     @property
     def cost(self) -> float:
@@ -227,6 +230,25 @@ def start_costs(problems: Sequence[Problem], camera: Camera) -> list[float]:
     ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
     parts = zip(fits, [0, *ends], ends, strict=False)
     return [f.unlikeliness(laid.part(a, b)) if imaged[a:b].all() else math.inf for f, a, b in parts]
+
+
+def likely_starts(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple[int, Problem]]:
+    """Return by index of the cluster which problems to follow: those likelier than what lies beside them.
+
+    From one that is not the climb would lead to where a likelier one leads.
+    """
+    several = [each for of_one in problems if len(of_one) > 1 for each in of_one]
+    costs = iter(start_costs(several, camera))
+    chosen = []
+    for index, of_one in enumerate(problems):
+        if len(of_one) == 1:
+            chosen.append((index, of_one[0]))
+            continue
+        cost = [math.inf, *(next(costs) for _ in of_one), math.inf]
+        chosen += [
+            (index, each) for at, each in enumerate(of_one, 1) if cost[at] <= min(cost[at - 1], cost[at + 1])
+        ]
+    return chosen
 
 
 def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:

@@ -19,10 +19,12 @@ from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.large.aperture import mask_in, measure_by_aperture
 from perception.robust.large.outline import Outline, outline_of
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_width
+from perception.robust.overlap.eclipse import pile_of
 from perception.robust.problem import Problem, Start, Window
-from perception.robust.search.blobs import Blob
+from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
+from perception.robust.verdict import is_border
 from perception.types import Calibration
 
 MOST_FITTED_RADIUS_PX = 130.0
@@ -57,7 +59,7 @@ def measure_large(
     A blob and its measurement for each flare; and what is small among them, where whole discs do not explain
     a cluster: it is to be measured by itself.
     """
-    measured: list[tuple[Blob, MeasuredFlare]] = []
+    measured, found = _piles(found, prepared, camera)
     again: list[Candidate] = []
     outlines = [_outlines(cluster, prepared) for cluster in found]
     discs = [_discs(cluster, of_it, prepared) for cluster, of_it in zip(found, outlines, strict=True)]
@@ -77,6 +79,26 @@ def measure_large(
             if k not in small and _is_most_of_blob(member, of_it[k], prepared):
                 measured.append((member.blob, measure_by_aperture(member, cluster, prepared)))
     return measured, again
+
+
+def _piles(
+    found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera
+) -> tuple[list[tuple[Blob, MeasuredFlare]], list[Cluster]]:
+    """Measure what several spheres, some partly behind others, explain; and return the other clusters."""
+    measured: list[tuple[Blob, MeasuredFlare]] = []
+    others: list[Cluster] = []
+    for cluster in found:
+        pile = pile_of(cluster, camera)
+        if pile is None or not pile.ranged.all():
+            others.append(cluster)
+            continue
+        blobs = divide([member.blob for member in cluster.members], pile.u_px, pile.v_px)
+        measured += [
+            (blob, measured_flare(pile, k, blob, False, prepared))
+            for k, blob in enumerate(blobs)
+            if blob is not None and not is_border(pile, k, prepared.shape)
+        ]
+    return measured, others
 
 
 def _outlines(cluster: Cluster, prepared: PreparedFrame) -> list[Outline | None]:

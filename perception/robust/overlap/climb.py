@@ -59,7 +59,8 @@ def good_ones(
 class Climb(ABC):
     """The fit of a window's sources, a part of which is hidden, on its way.
 
-    Its unknowns are the fit's, and maybe others after them.
+    Its unknowns are the fit's, and maybe others after them. `to_gain` is about
+    how much likelier, as 2 Δ ln L, a maximum is than where it stands.
     """
 
     def __init__(self, fit: Fit, camera: Camera, values: Array, most_step: Array, prior: Array) -> None:
@@ -67,6 +68,7 @@ class Climb(ABC):
         self._values, self._most_step, self._prior = values, most_step, prior
         self._expected, self._jacobian = self._expectation(values)
         self.objective = self._objective(values, self._expected)
+        self.to_gain = math.inf
 
     @abstractmethod
     def _expectation(self, values: Array) -> tuple[Array, Array]:
@@ -82,15 +84,16 @@ class Climb(ABC):
         """Logarithms of the sources' ranges where it stands, as their fluxes say."""
         return self._fit.layout.of_sources(self._values[: self._fit.layout.size])[:, 2]
 
-    def _reach(self, to_beat: float = math.inf) -> bool:
+    def _reach(self, to_beat: float = math.inf, *, may_be_bad: bool = False) -> bool:
         """Go on to the greatest likelihood, and write it into the fit; tell whether it is reached.
 
-        It is not where what is ahead is no good explanation, or has a greater cost than `to_beat`.
+        It is not where what is ahead has a greater cost than `to_beat`, or is no good explanation. One that
+        `may_be_bad` need not be, and is taken as far as it has come.
         """
         layout, size = self._fit.layout, len(self._values)
         gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
         damped = np.empty((size, size))
-        damping, is_new = FIRST_DAMPING, True
+        damping, is_new, is_there = FIRST_DAMPING, True, True
         for done in range(_MOST_STEPS):
             if is_new:
                 variance = self._variance(self._expected)
@@ -98,10 +101,11 @@ class Climb(ABC):
                 self._fit.log_information = inverted(fisher, inverse)
                 if math.isnan(self._fit.log_information):
                     return False
-                to_gain = float(gradient @ inverse @ gradient)
-                if to_gain < _SETTLED:
+                self.to_gain = float(gradient @ inverse @ gradient)
+                if self.to_gain < _SETTLED:
                     break
-                if done >= _JUDGED_AFTER and not self._is_promising(inverse, to_gain, to_beat):
+                is_judged = done >= _JUDGED_AFTER and not may_be_bad
+                if is_judged and not self._is_promising(inverse, self.to_gain, to_beat):
                     return False
                 before = self._objective(self._values, self._expected, variance)
             np.copyto(damped, fisher)
@@ -120,8 +124,11 @@ class Climb(ABC):
             else:
                 damping *= 10.0
                 if not damping < MOST_DAMPING:
-                    return False
+                    is_there = False
+                    break
         else:
+            is_there = False
+        if not (is_there or may_be_bad):
             return False
         # A trial that was none may have been laid out last.
         self._expected, self._jacobian = self._expectation(self._values)

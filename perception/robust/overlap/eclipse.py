@@ -1,13 +1,14 @@
-"""Two resolved spheres, one partly behind the other: the nearer is whole, of the farther what stands out.
+"""Resolved spheres, some of them partly behind others: of the farther ones what stands out.
 
 Deblending adds discs up, which shine through each other; where two overlap neither is then where and as large
 as it seems. Here each quadrature node of the farther counts by how much of it stands out from behind the
-nearer, so that the expected image and its derivatives, by places and sizes of both, are of what is seen.
+nearer, so that the expected image and its derivatives, by places and sizes of all, are of what is seen.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +21,22 @@ from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.climb import Climb, good_ones
-from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
-from perception.robust.overlap.hidden import expectation_of_two
+from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
+from perception.robust.overlap.hidden import expectation_behind
+from perception.robust.overlap.outlines import discs_by_outline
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
+    LEAST_RADIUS_PX,
     OTHER_SIGMAS,
+    alone,
     are_apart,
+    groups_of,
     is_near,
     is_of_a_layout,
     knows_layouts,
     least_radius_px,
     longer_chi2,
-    nearest_two,
-    pair_of,
+    meeting,
 )
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution, solutions_of
@@ -44,11 +48,18 @@ _DRAWN_OUT_CHI2 = 14.0  # of two degrees of freedom: by chance once in a thousan
 _FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
+_BESIDE_PX = 2.0
+_NEARLY = 1.0  # of 2 Δ ln L: of what is hardly seen the nodes come and go
+_MOST_MORE = 2  # flares than outline and blobs show
+_GAP_PX = 2.0  # between images: of what is hidden none is seen
+_LEAST_HIDDEN = 0.2  # of a disc: of which more is seen is as large as it seems
+_MEET = 1.1  # times the sum of their radii two may be apart, and one hide a little of the other
 _DIMMEST, _BRIGHTEST = (
     0.5,
     1.5,
 )  # of what is lit, over the brightness of sources: where clipped it seems dimmer
 
+_BULGE_SEEN, _TIMES_RIVAL = 1.0 / 3.0, 20.0  # place and size take up most of it
 _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
 
@@ -60,7 +71,7 @@ def eclipses(
     may_be: Sequence[bool],
     camera: Camera,
 ) -> tuple[dict[int, Solution], dict[int, Solution]]:
-    """Explain windows by two resolved spheres, one partly behind the other.
+    """Explain windows by resolved spheres, some partly behind others.
 
     Where robots are known to carry several sources, smaller ones too, others may be beside them, and two that
     stand as far apart as a robot's are believed where one that is not quite round would explain as much.
@@ -81,70 +92,143 @@ def eclipses(
     By index what explains a window well, nothing where nothing does; and likewise what does, but for which a
     globe that is not round would as well, or which is too small to be told.
     """
-    pairs, rivals = dict[int, Solution](), dict[int, Solution]()
-    least_px, of_layouts = least_radius_px(camera), knows_layouts(camera)
+    piles, rivals = dict[int, Solution](), dict[int, Solution]()
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd:
             continue
-        guesses: list[list[Start]] = []
-        if of_layouts and one is not None and one.count > 1 and asks_for_more(one):
-            guesses = _guesses_beside(cluster, one, camera)
-        is_long = of_layouts and one is not None and one.count == 1 and longer_chi2(one) > _DRAWN_OUT_CHI2
-        if one is None or is_long or (one.count == 1 and may_be[index]):
-            guesses = _guesses(cluster, camera)
-        of_two = [
-            each.starts
-            for each in (one, parted.get(index))
-            if each is not None and (of_layouts or each.count == 2) and is_near(each, least_px)
-        ]
-        fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
-        fits.sort(key=lambda fit: fit.objective)
-        fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
-        good = good_ones(
-            (fit.solution() for fit in fits),
-            lambda pair: pair.left_over.is_good and are_apart(pair, camera),
-            _TRIED,
-        )
+        good = _by_both_ends(cluster, one, parted.get(index), camera, may_be=may_be[index])
         if not good:
             continue
-        rivals[index] = likeliest = min(good, key=lambda pair: pair.cost)
-        if not is_near(likeliest, least_px):
-            continue
-        # Where robots are known to carry sources so far apart, globes that are not round are the odder guess.
-        of_one_robot = is_of_a_layout(likeliest, camera)
-        least_gain = _LEAST_OF_A_LAYOUT if of_one_robot else LEAST_GAIN
-        # An oval explains no more than one of several flares.
-        is_believed = (
-            of_one_robot if likeliest.count > 2 else fit_oval(likeliest, camera).chi2_more >= least_gain
+        likeliest = min(good, key=lambda pile: pile.cost)
+        believed = _believed(likeliest, camera)
+        if believed is None:
+            rivals[index] = likeliest
+        else:
+            piles[index] = believed
+    return piles, rivals
+
+
+def pile_of(cluster: Cluster, camera: Camera) -> Solution | None:
+    """Explain a window by the spheres that its outline shows, some partly behind others; None if they do not.
+
+    Blobs that lie beside these are flares of their own.
+    """
+    if cluster.is_in_crowd:
+        return None
+    starts = discs_by_outline(cluster, camera)
+    reach_px = [
+        float(image_radius_px(u, v, math.asin(camera.radius_m * math.exp(-log_range)), camera.calibration))
+        for u, v, log_range in starts
+    ]
+    starts += [
+        (member.u_px, member.v_px, member.log_range(member.flux_e))
+        for member in cluster.members
+        if member.flux_e > 0.0
+        if all(
+            math.hypot(member.u_px - u, member.v_px - v) > radius_px + _BESIDE_PX
+            for (u, v, _), radius_px in zip(starts, reach_px, strict=False)
         )
-        if is_believed:
-            pairs[index] = replace(rivals.pop(index), is_eclipse=not _may_be_other(likeliest, camera))
-    return pairs, rivals
+    ]
+    if not reach_px:
+        return None
+    for _ in range(1 + _MOST_MORE):
+        climb = _Eclipse(Problem(cluster.window, starts, cluster.background_e), camera)
+        pile = climb.solution(may_be_bad=True)
+        if pile is None:
+            return None
+        if pile.count > 1 and climb.to_gain < _NEARLY and _is_good(pile, camera):
+            return _believed(replace(pile, by_outline=len(reach_px)), camera)
+        if not pile.left_over.peak_sigmas > RESIDUAL_SIGMAS:
+            return None
+        # What no outline shows is small, or little of it is seen.
+        starts = with_one_more(pile)[0]
+    return None
 
 
-def _may_be_other(pair: Solution, camera: Camera) -> bool:
-    """Tell whether the farther may as well be nearer than it seems, and more of it hidden.
+def _believed(pile: Solution, camera: Camera) -> Solution | None:
+    """Return spheres that explain a window, unless globes that are not round would as well."""
+    # Where robots are known to carry sources so far apart, these are the odder guess.
+    least_gain = _LEAST_OF_A_LAYOUT if is_of_a_layout(pile, camera) else LEAST_GAIN
+    meet = [group for group in groups_of(pile) if len(group) > 1]
+    if not is_near(pile, least_radius_px(camera)) or any(
+        fit_oval(alone(pile, group), camera).chi2_more < least_gain for group in meet
+    ):
+        return None
+    unsure = (two for two in meeting(pile) if not _shows_its_size(pile, *two))
+    may_be_others = any(_may_be_other(pile, *two, camera) for two in unsure)
+    return replace(pile, is_eclipse=not may_be_others)
+
+
+def _by_both_ends(
+    cluster: Cluster, one: Solution | None, more: Solution | None, camera: Camera, *, may_be: bool
+) -> list[Solution]:
+    """Explain a window by two discs at both ends of what is lit, or where two flares were before."""
+    of_layouts = knows_layouts(camera)
+    guesses: list[list[Start]] = []
+    if of_layouts and one is not None and one.count > 1 and asks_for_more(one):
+        guesses = _guesses_beside(cluster, one, camera)
+    is_long = of_layouts and one is not None and one.count == 1 and longer_chi2(one) > _DRAWN_OUT_CHI2
+    if one is None or is_long or (one.count == 1 and may_be):
+        guesses = _guesses(cluster, camera)
+    of_two = [
+        each.starts
+        for each in (one, more)
+        if each is not None and (of_layouts or each.count == 2) and is_near(each, least_radius_px(camera))
+    ]
+    fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
+    fits.sort(key=lambda fit: fit.objective)
+    fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
+    return good_ones((fit.solution() for fit in fits), partial(_is_good, camera=camera), _TRIED)
+
+
+def _is_good(pile: Solution, camera: Camera) -> bool:
+    return pile.left_over.is_good and are_apart(pile, camera)
+
+
+def _shows_its_size(pile: Solution, near: int, far: int) -> bool:
+    """Tell whether so much is seen of the farther one's limb that it can be no larger one, most of it hidden.
+
+    Beyond the chord at which it is cut off one as large as the nearer bulges by less: χ² of that, of pixels
+    along the limb, as bright as it is.
+    """
+    near_px, far_px = pile.radius_at_rest_px[[near, far]].tolist()
+    apart_px = math.hypot(pile.u_px[near] - pile.u_px[far], pile.v_px[near] - pile.v_px[far])
+    if apart_px > near_px + far_px + _GAP_PX:
+        return True
+    if far_px < LEAST_RADIUS_PX:
+        return False
+    if hidden_share(pile, near, far) < _LEAST_HIDDEN:
+        return True
+    height_px = min(apart_px + far_px - near_px, 2.0 * far_px)
+    if not height_px > 0.0 or not near_px > far_px:
+        return False
+    half_px = far_px if height_px > far_px else math.sqrt(height_px * (2.0 * far_px - height_px))
+    bulge_px = height_px - (near_px - math.sqrt(near_px**2 - half_px**2))
+    chi2 = 4.0 * half_px * float(pile.flares_e.max()) * (_BULGE_SEEN * bulge_px) ** 2
+    return bool(chi2 > _TIMES_RIVAL * _RIVAL)
+
+
+def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
+    """Tell whether the farther of two may as well be nearer than it seems, and more of it hidden.
 
     Tried with its outer edge held where it is seen, at the range of the nearer, and half way there.
     """
-    near, far = sorted(pair_of(pair), key=lambda k: -float(pair.image_radius_px[k]))
-    starts = pair.starts
-    (near_u, near_v, near_log), (far_u, far_v, far_log) = starts[near], starts[far]
+    (near_u, near_v, near_log), (far_u, far_v, far_log) = pile.starts[near], pile.starts[far]
     apart_px = max(math.hypot(far_u - near_u, far_v - near_v), 1e-9)
     for share in (0.5, 1.0):
-        log_range = far_log + share * (near_log - far_log)
-        inwards = float(pair.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
+        starts, log_range = pile.starts, far_log + share * (near_log - far_log)
+        inwards = float(pile.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
         starts[far] = (*place, log_range)
-        climb = _Eclipse(Problem(pair.window, starts, pair.background_e), camera)
+        climb = _Eclipse(Problem(pile.window, starts, pile.background_e), camera)
         other = climb.solution()
         # One that goes on without an end is not excluded where it has come as far as the pair.
-        above = climb.so_far - pair.deviance if other is None else other.cost - pair.cost
+        above = climb.so_far - pile.deviance if other is None else other.cost - pile.cost
         if above > _RIVAL:
             continue
         log_ranges = climb.log_ranges if other is None else other.log_range
-        farthest = abs(log_ranges[[near, far]].max() - pair.log_range[far])
-        if farthest > OTHER_SIGMAS * float(pair.log_range_sigma[far]):
+        farthest = abs(log_ranges[[near, far]].max() - pile.log_range[far])
+        if farthest > OTHER_SIGMAS * float(pile.log_range_sigma[far]):
             return True
     return False
 
@@ -226,16 +310,15 @@ def is_as_bright(
 
 
 class _Eclipse(Climb):
-    """The fit of two spheres to a window, on its way from first guesses."""
+    """The fit of spheres to a window, of which nearer ones hide parts of farther ones, from first guesses."""
 
     def __init__(self, problem: Problem, camera: Camera) -> None:
         fit, self._finer = Fit(problem, camera), finer(camera)
-        self._pair = nearest_two(np.array(problem.starts)[:, :2])
         super().__init__(fit, camera, fit.values.copy(), fit.layout.most_step, fit.prior)
 
-    def solution(self) -> Solution | None:
-        """Return what is likeliest; None where no maximum is reached."""
-        if not self._reach():
+    def solution(self, *, may_be_bad: bool = False) -> Solution | None:
+        """Return what is likeliest; None where there is no maximum, or no good one unless it `may_be_bad`."""
+        if not self._reach(may_be_bad=may_be_bad):
             return None
         return solutions_of([self._fit], self._camera)[0]
 
@@ -244,29 +327,41 @@ class _Eclipse(Climb):
         fit, camera, layout = self._fit, self._camera, self._fit.layout
         own = layout.of_sources(values)
         by_size = log_range_by_size(own, fit)
-        near, far = sorted(self._pair, key=lambda k: float(by_size[k]))
         hidden_px = camera.hidden_px_at_1_m(own[:, :2])
         hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
-        fineness = np.where(np.arange(layout.sources) == far, self._finer, 1.0)
+        radius_rad = np.arcsin(np.minimum(camera.radius_m * np.exp(-by_size), 1.0))
+        axis = direction_camera(own[:, :2], camera.calibration)
+        hides = _hides(axis, radius_rad)
+        fineness = np.ones(layout.sources)
+        fineness[hides[:, 1]] = self._finer
         laid, imaged = lay_out(
             camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=fineness, in_points=True
         )
         fit.log_flux_at_1_m, fit.image_radius_px = laid.log_flux_at_1_m, laid.reach_px
         flux = np.exp(laid.log_flux_at_1_m - 2.0 * own[:, 2])
         flux[~imaged] = math.nan  # nowhere to go on to
-        middle_px, first, end = own[near : near + 1, :2], *laid.first_node[far : far + 2]
-        offset = np.column_stack([laid.node_u_px[first:end], laid.node_v_px[first:end]])
-        away = direction_camera(own[far, :2] + offset, camera.calibration)
-        away -= direction_camera(middle_px, camera.calibration)
-        turn = pixel_turn(middle_px, camera.calibration)[0]
-        radius_rad = math.asin(min(camera.radius_m * math.exp(-float(by_size[near])), 1.0))
+        away = [np.empty((0, 3))]
+        for near, far in hides:
+            nodes = slice(*laid.first_node[far : far + 2])
+            offset = np.column_stack([laid.node_u_px[nodes], laid.node_v_px[nodes]])
+            away.append(direction_camera(own[far, :2] + offset, camera.calibration) - axis[near])
         expected = np.empty(self._view.image_e.size)
         jacobian = np.zeros((layout.size, len(expected)))
-        expectation_of_two(
-            values, near, far, flux, away, turn, radius_rad, self._view, laid, fit.structure, fit.known,
-            expected, jacobian,
+        expectation_behind(
+            values, hides, flux, np.concatenate(away), pixel_turn(own[:, :2], camera.calibration), radius_rad,
+            self._view, laid, fit.structure, fit.known, expected, jacobian,
         )  # fmt: skip
         return expected, jacobian
+
+
+def _hides(axis: Array, radius_rad: Array) -> NDArray[np.int64]:
+    """Return which sphere may hide a part of which farther one, shape (pairs, 2): where their images meet."""
+    apart_rad = np.arccos(np.clip(axis @ axis.T, -1.0, 1.0))
+    meet = apart_rad < _MEET * (radius_rad[:, None] + radius_rad)
+    order = np.argsort(-radius_rad, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return np.argwhere(meet & (rank[:, None] < rank)).astype(np.int64)
 
 
 def finer(camera: Camera) -> float:
@@ -288,11 +383,23 @@ def hidden_log_range(solution: Solution, index: int) -> float:
         return 0.0
     apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
     others_px = solution.radius_at_rest_px
-    own_px = float(others_px[index])
-    farther = solution.log_range[index] - solution.log_range[apart_px < 2.0 * others_px]
-    # Of two discs of unlike size the chord of the smaller one: what a half plane at the mean edge cuts off.
-    into = (others_px + own_px - apart_px) / (2.0 * max(own_px, 1e-9))
-    into[index] = 0.0
-    depth = np.clip(into, 0.0, 1.0)
-    cut = (np.arccos(1.0 - 2.0 * depth) - (1.0 - 2.0 * depth) * 2.0 * np.sqrt(depth - depth**2)) / np.pi
-    return max(float(farther.max(initial=0.0)), 0.5 * float(cut.sum()))
+    nearer = [
+        k
+        for k in np.flatnonzero(apart_px < 2.0 * others_px).tolist()
+        if k != index and not _shows_its_size(solution, k, index)
+    ]
+    farther = solution.log_range[index] - solution.log_range[nearer]
+    hidden = sum(hidden_share(solution, k, index) for k in range(solution.count) if k != index)
+    return max(float(farther.max(initial=0.0)), 0.5 * hidden)
+
+
+def hidden_share(solution: Solution, near: int, far: int) -> float:
+    """Return about how much of a flare's disc another one covers: what a half plane at their mean edge does.
+
+    Of two discs of unlike size the chord of the smaller one is meant.
+    """
+    apart_px = math.hypot(solution.u_px[near] - solution.u_px[far], solution.v_px[near] - solution.v_px[far])
+    near_px, far_px = solution.radius_at_rest_px[[near, far]]
+    depth = min(max(float(near_px + far_px - apart_px) / (2.0 * max(float(far_px), 1e-9)), 0.0), 1.0)
+    middle = 1.0 - 2.0 * depth
+    return (math.acos(middle) - middle * 2.0 * math.sqrt(depth - depth**2)) / math.pi

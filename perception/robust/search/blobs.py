@@ -1,5 +1,6 @@
 """From a mask to blobs: connected components, and where one of them holds several flares."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -133,13 +134,17 @@ def _join(leader: NDArray[np.int64], one: int, other: int) -> None:
 
 
 def split_at_peaks(
-    blob: Blob, noise: NDArray[np.float32], dip: float = 0.05, clips: NDArray[np.bool_] | None = None
+    blob: Blob,
+    noise: NDArray[np.float32],
+    dip: float = 0.05,
+    flat: NDArray[np.bool_] | None = None,
+    most_e: float = math.inf,
 ) -> list[Blob]:
     """Divide a blob among its distinct local maxima.
 
     Two maxima are distinct if the lowest saddle between them lies below the fainter one by more than 5 σ of
     noise and a fraction `dip` of its brightness: the plateau of a resolved or clipped disc has many maxima
-    but no such saddle. Each pixel goes to the nearest maximum, or to what is clipped in one piece with it, as
+    but no such saddle. Each pixel goes to the nearest maximum, or to what is flat in one piece with it, as
     the maximum may be anywhere on that.
 
     Parameters
@@ -150,22 +155,26 @@ def split_at_peaks(
         Standard deviation of its filtered image, shape (box.height, box.width).
     dip
         Least relative depth of a saddle.
-    clips
-        Which of its pixels are clipped, if that counts.
+    flat
+        Which of its pixels are clipped, or as bright as each other, if that counts.
+    most_e
+        What exceeds this counts as high as that.
 
     Returns
     -------
     The blob itself, or one blob for each maximum, brightest first.
     """
     brightness = blob.filtered_e
+    if blob.peak_e > most_e:
+        brightness = np.minimum(brightness, np.float32(most_e))
     peaks = _peaks(blob.pixels, brightness, noise, dip)
     if len(peaks) == 1:
         return [blob]
     peaks = peaks[np.argsort(-brightness[peaks[:, 0], peaks[:, 1]], kind="stable")][:MOST_PEAKS]
     rows, columns = np.indices(blob.pixels.shape)
     distance2 = (rows - peaks[:, :1, None]) ** 2 + (columns - peaks[:, 1:, None]) ** 2
-    if clips is not None:
-        distance2, pieces = distance2.astype(np.float64), _pieces(clips)
+    if flat is not None:
+        distance2, pieces = distance2.astype(np.float64), _pieces(flat)
         own = pieces[tuple(peaks.T)]
         for index, piece in enumerate(own):
             # Not where charge that spilled joins several.

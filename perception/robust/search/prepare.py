@@ -31,6 +31,7 @@ from perception.robust.search.frame import (
     without,
 )
 from perception.robust.search.limit import limit_mesh_of, point_filter
+from perception.robust.search.near import brightness_mesh_e, near_sources
 from perception.robust.search.structure import autocorrelation, structure_of
 from perception.types import Calibration, RawFrame
 
@@ -151,6 +152,16 @@ class PreparedFrame:
         rows, columns = self.shape
         return min(max(round(v_px), 0), rows - 1), min(max(round(u_px), 0), columns - 1)
 
+    @cached_property
+    def _brightness_mesh_e(self) -> NDArray[np.float64]:
+        return brightness_mesh_e(self.frame, self.calibration, self.mesh_e.shape)
+
+    def brightness_e(self, u_px: float, v_px: float) -> float:
+        """Return how bright about a place pixels are that the image of a source covers."""
+        (row, column), (rows, columns) = self._nearest(u_px, v_px), self.shape
+        mesh_e = self._brightness_mesh_e
+        return float(mesh_e[row * len(mesh_e) // rows, column * mesh_e.shape[1] // columns])
+
     def clipped_in(self, box: PixelBox) -> NDArray[np.bool_]:
         """Mark the pixels of a box inside the frame that light has clipped: bad ones do not count."""
         clipped = self.pixels.data_dn[box.slices] >= self.clipped_dn
@@ -215,6 +226,16 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     )
     clipped_mesh_e[~(clipped_mesh_e > _CLIPPED_NOISES * noise_mesh_e)] = np.inf
     ratio = scatter_ratio(samples, noise_mesh_e, clipped_mesh_e)
+    of_sources = None
+    if (ratio > 1.0).any():
+        clips_e = clip_level_e(calibration, frame.black_level_dn, frame.gain) - mesh_e
+        brightest_e = np.fmin(brightness_mesh_e(frame, calibration, mesh_e.shape), clips_e)
+        found = near_sources(lit_at, lit_e, brightest_e, _CLIPPED_NOISES * noise_mesh_e, calibration)
+        if found is not None:
+            of_sources, many = found
+            is_left_out = of_sources[np.ix_(rows.ravel(), columns.ravel())]
+            samples = np.where(is_left_out, np.float32(np.inf), samples)
+            ratio = np.where(many, scatter_ratio(samples, noise_mesh_e, clipped_mesh_e), ratio)
     structured = bool((ratio > 1.0).any())
     if structured:
         limit_e = as_wide(limit_mesh_e * ratio, calibration)
@@ -237,7 +258,7 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     )
     if not structured:
         return prepared
-    more_at, more_e = _local_contrast(prepared, limit_mesh_e, noise_mesh_e, ratio)
+    more_at, more_e = _local_contrast(prepared, limit_mesh_e, noise_mesh_e, ratio, of_sources)
     lit_at, first = np.unique(np.concatenate([lit_at, more_at]), return_index=True)
     sigma_mesh_e = noise_mesh_e * np.sqrt(ratio**2 - np.float32(1.0))
     return replace(
@@ -303,6 +324,7 @@ def _local_contrast(
     limit_mesh_e: NDArray[np.float32],
     noise_mesh_e: NDArray[np.float32],
     ratio: NDArray[np.float32],
+    of_sources: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Find what stands out of its close surroundings where the background has structure.
 
@@ -335,6 +357,8 @@ def _local_contrast(
     share = np.float32(of_noise / of_point)
     rows, columns = (each[part] for each, part in zip(scatter_places(prepared.shape), cells, strict=True))
     samples = contrast_e[np.ix_(rows.ravel() - top, columns.ravel() - left)]
+    if of_sources is not None:
+        samples[of_sources[np.ix_(rows.ravel(), columns.ravel())]] = np.inf
     more = np.ones_like(ratio)
     noise_e = noise_mesh_e[tuple(cells)] * share
     more[tuple(cells)] = scatter_ratio(samples, noise_e, np.full_like(noise_e, np.inf))

@@ -16,7 +16,6 @@ from perception.model.window import Camera
 from perception.robust.clusters import Cluster
 from perception.robust.overlap import eclipse
 from perception.robust.problem import Problem
-from perception.robust.solve import Solution
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expose, random
 
@@ -147,28 +146,29 @@ def test_sigmas_are_the_bound_s() -> None:
     np.testing.assert_allclose(np.ravel(claimed), bound, rtol=0.06)
 
 
-def test_slopes_are_those_of_what_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By differences, of each unknown, with nodes so dense and steps so small that hardly one at the edge comes or goes: to 2 %."""
-    places = _behind(1.5, 2.0, 0.5, 0.7)
+@pytest.mark.parametrize("more", [[], [(38.4, 22.3, 1.1)]])
+def test_slopes_are_those_of_what_is_expected(more: list[Place], monkeypatch: pytest.MonkeyPatch) -> None:
+    """By differences, of each unknown, of two spheres and of three, one of which hides parts of both others, with nodes
+    so dense and steps so small that hardly one at the edge comes or goes: to 2 %."""
+    places = [*_behind(1.5, 2.0, 0.5, 0.7), *more]
     starts = [(u, v, math.log(range_m)) for u, v, range_m in places]
     seen: list[Cluster] = []
 
-    def look(found: list[Cluster], *_: object) -> tuple[dict[int, Solution], dict[int, Solution]]:
-        seen.extend(found)
-        return {}, {}
+    def look(cluster: Cluster, _: object) -> None:
+        seen.append(cluster)
 
     mean_e_per_s = union_e_per_s(places)
     exposure_s = 0.6 * 4000.0 / 0.74 / float(mean_e_per_s.max())
     frame = expose(mean_e_per_s * exposure_s + BACKGROUND_E, CAMERA, random(77, 5), exposure_s)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("perception.robust.explain.eclipses", look)
+        patch.setattr("perception.robust.explain.pile_of", look)
         detect(frame, CAMERA)
     monkeypatch.setattr(eclipse, "_FINER", 8.0)
     known = replace(CAMERA, sigma={"range_constant_dn_m2_per_s": 0.1 * CAMERA.range_constant_dn_m2_per_s})
     fit = eclipse._Eclipse(Problem(seen[0].window, starts, BACKGROUND_E), Camera(known, exposure_s, 1.0))
     values = fit._fit.values.copy()
     _, jacobian = fit._expectation(values)
-    for unknown in range(8):
+    for unknown in range(4 * len(places)):
         step = np.zeros(len(values))
         step[unknown] = (0.0005, 0.0005, 0.0001, 0.001)[unknown % 4]
         above, below = fit._expectation(values + step)[0], fit._expectation(values - step)[0]

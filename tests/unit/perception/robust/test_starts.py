@@ -37,7 +37,7 @@ def test_the_likeliest_guesses_lead_where_all_lead(key: int, monkeypatch: pytest
         followed = len(chosen)
         return chosen
 
-    monkeypatch.setattr(explain, "_likely", all_of)
+    monkeypatch.setattr(explain, "likely_starts", all_of)
     every = _told(key)
     assert followed > 1.5 * len(every)
     assert len(few) == len(every) >= 10
