@@ -12,7 +12,9 @@ from perception.robust.search.frame import Pixels
 from perception.robust.search.limit import point_kernel
 from perception.robust.search.prepare import bad_pixels
 from perception.robust.search.structure import autocorrelation, structure_of
-from tests.hard_frames import BACKGROUND_E, POINT, ROWS, Flare, cell_centres, frame_of, textured
+from tests.hard_frames.flares import textured
+from tests.hard_frames.rows import ROWS
+from tests.hard_frames.scores import BACKGROUND_E, POINT, Flare, cell_centres, frame_of
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 EMPTY = (

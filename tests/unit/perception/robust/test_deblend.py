@@ -10,7 +10,7 @@ import perception
 from perception.model.flare import PixelBox, flare_image
 from perception.robust.overlap import deblend
 from perception.robust.search.blobs import Blob, divide, near_groups
-from tests.hard_frames import (
+from tests.hard_frames.scores import (
     BACKGROUND_E,
     BRIGHT_E,
     POINT,
