@@ -33,7 +33,11 @@ def bad_pixels(
 
 
 def lamps(
-    frames: int = 4, estimator: str = "robust", first: int = 0, source_radius_m: float = 1e-6
+    frames: int = 4,
+    estimator: str = "robust",
+    first: int = 0,
+    source_radius_m: float = 1e-6,
+    per_frame: int = 49,
 ) -> dict[str, Any]:
     """Evenly bright rectangles and ovals of 6 to 50 px, a third of them clipped, and nothing else.
 
@@ -50,12 +54,14 @@ def lamps(
         alike: list[tuple[float, float]] = []
         generator = random(12, index)
         mean_e = np.full((camera.height_px, camera.width_px), BACKGROUND_E)
-        for u, v in cell_centres(1):
+        for cell, (u, v) in enumerate(cell_centres(1)):
             half_u, half_v = 0.5 * 10.0 ** generator.uniform(0.8, 1.7, 2)
             level_e = 10.0 ** generator.uniform(2.0, 4.2)
             du, dv = generator.uniform(-0.5, 0.5, 2)
-            x, y = (within - du) / half_u, (within[:, None] - dv) / half_v
             is_oval = generator.random() < 0.5
+            if (cell - index) % (49 // per_frame):
+                continue
+            x, y = (within - du) / half_u, (within[:, None] - dv) / half_v
             inside = np.hypot(x, y) < 1.0 if is_oval else np.maximum(abs(x), abs(y)) < 1.0
             covered = inside.reshape(CELL_PX, parts, CELL_PX, parts).mean(axis=(1, 3))  # no stairs
             top, left = round(v + 0.5) - CELL_PX // 2, round(u + 0.5) - CELL_PX // 2

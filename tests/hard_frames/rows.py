@@ -25,6 +25,8 @@ ROWS: dict[str, Callable[..., dict[str, Any]]] = {
     **{f"texture of {px} px": lambda px=px, **more: textured(px, **more) for px in (4, 6, 15, 30)},
     "lamps": lamps,
     "lamps where sources are balls of 1 cm": lambda **more: lamps(source_radius_m=0.01, **more),
+    "seven lamps": lambda **more: lamps(per_frame=7, **more),
+    "seven lamps where sources are balls of 1 cm": lambda **more: lamps(source_radius_m=0.01, per_frame=7, **more),
     **{f"empty, {kind}": lambda kind=kind, **more: empty(kind, **more)
        for kind in ("texture", "sheen", "sun patches", "blinds")},
     "empty, sun patches that clip": lambda **more: empty("sun patches", times=5.0, **more),
