@@ -134,7 +134,9 @@ def _judged(
         return []
     if float(solution.log_range.min()) < math.log(LEAST_RANGE_M) and bool(solution.ranged.all()):
         return []
-    if cluster.is_clipped and is_any_outline(solution, max(len(cluster.members), solution.by_outline)):
+    blobs_seen = max(len(cluster.members), solution.by_outline)
+    # Where any clipped lamp has such an outline, lines side by side fill any patch.
+    if (cluster.is_clipped or solution.motion_px is not None) and is_any_outline(solution, blobs_seen):
         return []
     if misfit and is_clipped_elsewhere(solution):
         return []

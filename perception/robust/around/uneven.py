@@ -21,6 +21,7 @@ MOST_LEFT = 0.25
 _FEWEST_SEEN = 8
 """Pixels of a flare that must be seen beside columns, where what is clipped is no column itself."""
 
+_LEAST_SPILT_PX = 1
 _SPILT_ASPECT = 2  # of what is clipped, from which on charge has spilled for sure
 _LEAST_ACROSS = 0.8  # of the columns that are clipped
 _SPILLS_ASIDE_PX = 2  # at most, and so far a point spread that is not the calibration's reaches
@@ -96,8 +97,8 @@ def by_flanks(
 def explains_flanks(one: Solution, window: Window) -> bool:
     """Tell whether a flare explains what is seen beside columns that are left out.
 
-    Enough of it must be seen; and it must be as wide as what is clipped, but for a stuck pixel, as charge
-    spills along columns alone.
+    Enough of it must be seen; and it must be as wide as what is clipped, but for a stuck pixel, and shorter,
+    as charge spills along columns alone.
 
     Parameters
     ----------
@@ -114,7 +115,11 @@ def explains_flanks(one: Solution, window: Window) -> bool:
     least = 1 if tall >= _SPILT_ASPECT * wide else _FEWEST_SEEN
     if along or not one.left_over.share < MOST_LEFT or one.left_over.pixels < least:
         return False
-    own = (one.expected_e > window.clip_e).any(axis=0)
+    own_clips = one.expected_e > window.clip_e
+    own = own_clips.any(axis=0)
+    # No charge has spilled where what clips ends before the flare itself does.
+    if tall < int(own_clips.any(axis=1).sum()) + _LEAST_SPILT_PX:
+        return False
     beside = np.convolve(own, np.ones(2 * _SPILLS_ASIDE_PX + 1), mode="same") > 0.5
     return int(beside[clipped].sum()) >= _LEAST_ACROSS * wide
 

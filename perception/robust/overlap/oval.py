@@ -6,6 +6,7 @@ one disc of any axes and brightness does.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from perception.robust.goodness import MODEL_ERROR, is_likely, residual_e
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
+Fitted = tuple[float, Array, Array, Array, Array]
 
 _MOST_STEPS = 40
 _SETTLED = 0.1  # in χ²
@@ -61,9 +63,13 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
     window = flares.window
     around_e = flares.expected_e - flares.flares_e
     variance = flares.variance_e2(MODEL_ERROR)
-    values, laid = _first_guess(flares), _largest(flares, camera)
+    laid = _largest(flares, camera)
+    guesses = [_first_guess(flares, np.maximum(flares.flares_e, 0.0))]
+    clips = window.state == CLIPPED
+    if clips.any():  # a flare that is too round explains what clips as far as it has to
+        guesses.append(_first_guess(flares, clips.astype(np.float64)))
 
-    def fitted(values: Array) -> tuple[float, Array, Array, Array, Array]:
+    def fitted(values: Array) -> Fitted:
         """Return χ², what is left, the weight of each pixel, the oval's light, and its slopes."""
         expected, slopes = _image(values, laid, flares)
         left = residual_e(window.image_e, window.state, around_e + expected.reshape(around_e.shape))
@@ -77,6 +83,22 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
             slopes,
         )
 
+    found = [_climbed(guess, fitted) for guess in guesses]
+    values, (chi2, left, weight, expected, _) = min(found, key=lambda each: each[1][0])
+    _, _, log_flux, log_size, a, b, _ = values.tolist()
+    axes = math.hypot(a, b)
+    shines = (weight > 0.0) & (expected**2 > variance.ravel())
+    log_source = float(laid.log_flux_at_1_m[0]) - 2.0 * float(laid.log_range_at[0])
+    return Oval(
+        is_good=is_likely(int(shines.sum()), float(np.sum(weight[shines] * left[shines] ** 2))),
+        chi2_more=chi2 - float(np.sum(flares.residual_e**2 / variance)),
+        brightness=math.exp(log_flux - 2.0 * log_size - log_source) / (1.0 - axes**2),
+        aspect=(1.0 + axes) / (1.0 - axes),
+    )
+
+
+def _climbed(values: Array, fitted: Callable[[Array], Fitted]) -> tuple[Array, Fitted]:
+    """Return the values to which steps of least squares lead, damped, and what they come to."""
     chi2, left, weight, expected, slopes = fitted(values)
     damping = 1e-3
     for _ in range(_MOST_STEPS):
@@ -96,16 +118,7 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
         chi2, left, weight, expected, slopes = there
         if is_settled:
             break
-    _, _, log_flux, log_size, a, b, _ = values.tolist()
-    axes = math.hypot(a, b)
-    shines = (weight > 0.0) & (expected**2 > variance.ravel())
-    log_source = float(laid.log_flux_at_1_m[0]) - 2.0 * float(laid.log_range_at[0])
-    return Oval(
-        is_good=is_likely(int(shines.sum()), float(np.sum(weight[shines] * left[shines] ** 2))),
-        chi2_more=chi2 - float(np.sum(flares.residual_e**2 / variance)),
-        brightness=math.exp(log_flux - 2.0 * log_size - log_source) / (1.0 - axes**2),
-        aspect=(1.0 + axes) / (1.0 - axes),
-    )
+    return values, (chi2, left, weight, expected, slopes)
 
 
 def _largest(flares: Solution, camera: Camera) -> Sources:
@@ -114,13 +127,13 @@ def _largest(flares: Solution, camera: Camera) -> Sources:
     return lay_out(camera, flares.u_px[one], flares.v_px[one], flares.log_range[one], in_points=True)[0]
 
 
-def _first_guess(flares: Solution) -> Array:
-    """Return u, v, ln flux, ln size, both parts of the axes, background of what has the flares' moments.
+def _first_guess(flares: Solution, light: Array) -> Array:
+    """Return u, v, ln flux, ln size, both parts of the axes, background of what has an image's moments.
 
     The size is relative to the larger flare's; the image of a disc has a quarter of its radius squared as the
     variance of its light along each axis.
     """
-    box, light = flares.window.box, np.maximum(flares.flares_e, 0.0)
+    box = flares.window.box
     rows, columns = np.mgrid[: light.shape[0], : light.shape[1]]
     flux = float(light.sum())
     u, v = float((light * columns).sum()) / flux, float((light * rows).sum()) / flux
@@ -130,7 +143,8 @@ def _first_guess(flares: Solution) -> Array:
     mean = max(0.5 * (along_u + along_v), _LEAST_SPREAD_PX2)
     log_size = 0.5 * float(np.log(4.0 * mean / flares.radius_at_rest_px.max() ** 2))
     stretched = np.clip([0.25 * (along_u - along_v) / mean, 0.5 * across / mean], -0.3, 0.3)
-    return np.array([box.left + u, box.top + v, np.log(flux), log_size, *stretched, 0.0])
+    log_flux = math.log(max(float(flares.flares_e.sum()), 1e-300))
+    return np.array([box.left + u, box.top + v, log_flux, log_size, *stretched, 0.0])
 
 
 def _image(values: Array, laid: Sources, flares: Solution) -> tuple[Array, Array]:
