@@ -10,6 +10,7 @@ from perception.messages.pair import decode_pair
 from perception.messages.uart import encode, packet_levels
 from perception.model.fisher import flare_limit
 from perception.model.flare import PixelBox, flare_image
+from perception.model.ranging import brightness_e
 from perception.pairs import inseparable
 from perception.photometry import Expected, sample_at
 from perception.rig.measure_set import measure_set
@@ -35,6 +36,7 @@ def warm_up_frames() -> None:
     """Compile what measures single frames, and the limits."""
     frame, calibration = _sample()
     detect_robust(frame, calibration)
+    detect_robust(_near_sample(calibration), calibration)
     flare_limit(calibration, 40.3, 60.2, 4.0, 9e3, 20.0)
     flare_image(40.3, 60.2, 0.0025, PixelBox(50, 30, 21, 21), calibration)
     _measure_brightness(frame, calibration)
@@ -132,3 +134,17 @@ def _sample() -> tuple[RawFrame, Calibration]:
     counts = np.clip(np.rint(0.5 * electrons + 64.0), 0, 4095).astype(np.uint16)
     counts[20, 20] = 4095
     return RawFrame("warm-up", 0, 0.0, 1e-3, counts, 64.0), calibration
+
+
+def _near_sample(calibration: Calibration) -> RawFrame:
+    """Return a frame with two near sources, one partly behind the other."""
+    rows, columns = np.indices((_ROWS, _COLUMNS))
+    middle_u, middle_v, exposure_s = calibration.cx_px, calibration.cy_px, 1e-4
+    place = np.array([[middle_u, middle_v]])
+    light_e = np.full((_ROWS, _COLUMNS), 5.0)
+    for away_px, radius_px in ((0.0, 7.3), (7.0, 5.6)):
+        away = np.hypot(columns - middle_u - away_px, rows - middle_v - away_px)
+        covered = np.clip((radius_px - away) / calibration.psf_sigma_px + 0.5, 0.0, 1.0)
+        light_e = np.maximum(light_e, covered * float(brightness_e(place, exposure_s, 1.0, calibration)[0]))
+    counts = np.random.Generator(np.random.Philox(2)).poisson(light_e) * calibration.system_gain_dn_per_e
+    return RawFrame("warm-up", 0, 0.0, exposure_s, np.rint(counts + 64.0).astype(np.uint16), 64.0)

@@ -30,7 +30,6 @@ from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.motion import moving
 from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import (
-    LEAST_GAIN,
     RESIDUAL_SIGMAS,
     asks_for_more,
     deblend,
@@ -38,7 +37,7 @@ from perception.robust.overlap.deblend import (
 )
 from perception.robust.overlap.eclipse import eclipses, pile_of
 from perception.robust.overlap.limb import may_be_other_shape
-from perception.robust.overlap.oval import fit_oval
+from perception.robust.overlap.oval import is_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import weighed
 from perception.robust.overlap.unparted import doubted
@@ -77,11 +76,13 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
         chosen[index] = fit
     fit_beside_forward_light(chosen, camera)
     piles = _piles(found, chosen, prepared, camera)
-    others = [index for index in range(len(found)) if index not in piles]
-    explained = _explained([found[k] for k in others], [chosen[k] for k in others], prepared, camera)
+    sure = {index: pile for index, pile in piles.items() if not pile.is_doubtful}
+    others = [index for index in range(len(found)) if index not in sure]
+    rivals = {at: piles[index] for at, index in enumerate(others) if index in piles}
+    explained = _explained([found[k] for k in others], [chosen[k] for k in others], rivals, prepared, camera)
     for index, one in zip(others, explained, strict=True):
         chosen[index] = one
-    return [piles.get(index, one) for index, one in enumerate(chosen)]
+    return [sure.get(index, one) for index, one in enumerate(chosen)]
 
 
 def _piles(
@@ -89,7 +90,8 @@ def _piles(
 ) -> dict[int, Solution]:
     """Explain windows by spheres that hide parts of each other, where a flare for each blob does not.
 
-    Not where one that moves explains what is seen as well: nothing else does.
+    Not where one that moves explains what is seen as well: nothing else does, but for one behind an edge,
+    which it takes more than the outline shows.
     """
     piles = dict[int, Solution]()
     if prepared.frame.line_time_s > 0.0:
@@ -107,9 +109,13 @@ def _piles(
 
 
 def _explained(
-    found: Sequence[Cluster], solved: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera
+    found: Sequence[Cluster],
+    solved: Sequence[Solution | None],
+    piles: Mapping[int, Solution],
+    prepared: PreparedFrame,
+    camera: Camera,
 ) -> list[Solution | None]:
-    """Explain windows by more than a flare for each blob, where that explains them better."""
+    """Explain windows by more than a flare for each blob, as by `piles`, where that explains them better."""
     chosen = list(solved)
     lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
     on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}
@@ -136,7 +142,8 @@ def _explained(
         halos = with_halo(dict(enumerate(plain)), camera)
         parted = _parted(divisible, halos, prepared.shape, camera, cut_short)
         pairs, rivals = eclipses(found, plain, parted, may_be, camera)
-        _take_up(pairs, parted, prepared.shape)
+        for several in (piles, pairs):
+            _take_up(several, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
         known = _take_lines(chosen, plain, halos, without_spill(plain, prepared, camera), camera)
         _drop_beside_lines(chosen, parted, halos, prepared.shape, camera, cut_short)
@@ -371,7 +378,7 @@ def _parted(
     more = deblend([one for _, one in tried], camera, beside)
     cut_short.update(index for (index, _), several in zip(tried, more, strict=True) if several.may_be_more)
     divided: list[Solution | None] = [
-        several if several.count > one.count and not _is_oval(one, several, camera) else None
+        several if several.count > one.count and not is_oval(one, several, camera) else None
         for (_, one), several in zip(tried, more, strict=True)
     ]
     # What was divided had the halo of the flares that were there before.
@@ -381,17 +388,6 @@ def _parted(
         for (index, _), several in zip(tried, divided, strict=True)
         if several is not None and several.most_motion_px <= MOST_MOTION_PX and _explains_all(several, shape)
     }
-
-
-def _is_oval(one: Solution, several: Solution, camera: Camera) -> bool:
-    """Tell whether a lone resolved source whose axes differ explains as well what takes several flares."""
-    if (
-        one.count > 1
-        or one.motion_px is not None
-        or not float(several.image_radius_px.max()) > LEAST_RADIUS_PX
-    ):
-        return False
-    return fit_oval(several, camera).chi2_more < LEAST_GAIN
 
 
 def _explains_all(several: Solution, shape: tuple[int, int]) -> bool:

@@ -84,12 +84,16 @@ def measure_large(
 def _piles(
     found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera
 ) -> tuple[list[tuple[Blob, MeasuredFlare]], list[Cluster]]:
-    """Measure what several spheres, some partly behind others, explain; and return the other clusters."""
+    """Measure what several spheres, some partly behind others, explain; and return the other clusters.
+
+    All of them by their outline.
+    """
     measured: list[tuple[Blob, MeasuredFlare]] = []
     others: list[Cluster] = []
     for cluster in found:
-        pile = pile_of(cluster, camera)
-        if pile is None or not pile.ranged.all():
+        at_once = prepared.frame.line_time_s == 0.0
+        pile = pile_of(cluster, camera, most_more=0) if at_once else None
+        if pile is None or not pile.left_over.is_nothing or not pile.ranged.all():
             others.append(cluster)
             continue
         blobs = divide([member.blob for member in cluster.members], pile.u_px, pile.v_px)

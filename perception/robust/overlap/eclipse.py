@@ -21,12 +21,12 @@ from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.climb import Climb, good_ones
+from perception.robust.overlap.covered import shows_its_size
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
 from perception.robust.overlap.hidden import expectation_behind
 from perception.robust.overlap.outlines import discs_by_outline
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
-    LEAST_RADIUS_PX,
     OTHER_SIGMAS,
     alone,
     are_apart,
@@ -51,15 +51,10 @@ _TRIED = 2
 _BESIDE_PX = 2.0
 _NEARLY = 1.0  # of 2 Δ ln L: of what is hardly seen the nodes come and go
 _MOST_MORE = 2  # flares than outline and blobs show
-_GAP_PX = 2.0  # between images: of what is hidden none is seen
-_LEAST_HIDDEN = 0.2  # of a disc: of which more is seen is as large as it seems
 _MEET = 1.1  # times the sum of their radii two may be apart, and one hide a little of the other
-_DIMMEST, _BRIGHTEST = (
-    0.5,
-    1.5,
-)  # of what is lit, over the brightness of sources: where clipped it seems dimmer
+# Of what is lit, over the brightness of sources: where clipped it seems dimmer.
+_DIMMEST, _BRIGHTEST = 0.5, 1.5
 
-_BULGE_SEEN, _TIMES_RIVAL = 1.0 / 3.0, 20.0  # place and size take up most of it
 _RIVAL = 16.0
 """Another explanation whose −2 ln of the evidence is at most so much more is not excluded."""
 
@@ -108,10 +103,11 @@ def eclipses(
     return piles, rivals
 
 
-def pile_of(cluster: Cluster, camera: Camera) -> Solution | None:
+def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> Solution | None:
     """Explain a window by the spheres that its outline shows, some partly behind others; None if they do not.
 
-    Blobs that lie beside these are flares of their own.
+    Blobs that lie beside these are flares of their own. Where something is left, it may be up to `most_more`
+    flares of which too little is seen for an outline: then who knows what it is.
     """
     if cluster.is_in_crowd:
         return None
@@ -129,18 +125,18 @@ def pile_of(cluster: Cluster, camera: Camera) -> Solution | None:
             for (u, v, _), radius_px in zip(starts, reach_px, strict=False)
         )
     ]
-    if not reach_px:
+    if not reach_px or len(starts) + most_more < 2:
         return None
-    for _ in range(1 + _MOST_MORE):
+    shown = len(starts)
+    for more in range(1 + most_more):
         climb = _Eclipse(Problem(cluster.window, starts, cluster.background_e), camera)
-        pile = climb.solution(may_be_bad=True)
+        pile = climb.solution(may_be_bad=more < most_more)
         if pile is None:
             return None
         if pile.count > 1 and climb.to_gain < _NEARLY and _is_good(pile, camera):
-            return _believed(replace(pile, by_outline=len(reach_px)), camera)
-        if not pile.left_over.peak_sigmas > RESIDUAL_SIGMAS:
+            return _believed(replace(pile, by_outline=shown), camera)
+        if more == most_more or not pile.left_over.peak_sigmas > RESIDUAL_SIGMAS:
             return None
-        # What no outline shows is small, or little of it is seen.
         starts = with_one_more(pile)[0]
     return None
 
@@ -154,7 +150,9 @@ def _believed(pile: Solution, camera: Camera) -> Solution | None:
         fit_oval(alone(pile, group), camera).chi2_more < least_gain for group in meet
     ):
         return None
-    unsure = (two for two in meeting(pile) if not _shows_its_size(pile, *two))
+    if pile.count > pile.by_outline > 0:
+        return replace(pile, is_doubtful=True)
+    unsure = (two for two in meeting(pile) if not shows_its_size(pile, *two))
     may_be_others = any(_may_be_other(pile, *two, camera) for two in unsure)
     return replace(pile, is_eclipse=not may_be_others)
 
@@ -183,29 +181,6 @@ def _by_both_ends(
 
 def _is_good(pile: Solution, camera: Camera) -> bool:
     return pile.left_over.is_good and are_apart(pile, camera)
-
-
-def _shows_its_size(pile: Solution, near: int, far: int) -> bool:
-    """Tell whether so much is seen of the farther one's limb that it can be no larger one, most of it hidden.
-
-    Beyond the chord at which it is cut off one as large as the nearer bulges by less: χ² of that, of pixels
-    along the limb, as bright as it is.
-    """
-    near_px, far_px = pile.radius_at_rest_px[[near, far]].tolist()
-    apart_px = math.hypot(pile.u_px[near] - pile.u_px[far], pile.v_px[near] - pile.v_px[far])
-    if apart_px > near_px + far_px + _GAP_PX:
-        return True
-    if far_px < LEAST_RADIUS_PX:
-        return False
-    if hidden_share(pile, near, far) < _LEAST_HIDDEN:
-        return True
-    height_px = min(apart_px + far_px - near_px, 2.0 * far_px)
-    if not height_px > 0.0 or not near_px > far_px:
-        return False
-    half_px = far_px if height_px > far_px else math.sqrt(height_px * (2.0 * far_px - height_px))
-    bulge_px = height_px - (near_px - math.sqrt(near_px**2 - half_px**2))
-    chi2 = 4.0 * half_px * float(pile.flares_e.max()) * (_BULGE_SEEN * bulge_px) ** 2
-    return bool(chi2 > _TIMES_RIVAL * _RIVAL)
 
 
 def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
@@ -370,36 +345,3 @@ def finer(camera: Camera) -> float:
     No finer than what a pixel alone smooths asks for.
     """
     return min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))
-
-
-def hidden_log_range(solution: Solution, index: int) -> float:
-    """Return how far a flare's ln range may be off because sources hide parts of each other.
-
-    What is fitted are whole discs, which shine through each other. Where they overlap so much of a source's
-    light may lack, or be another's. And one that seems farther than another, within two radii of which it
-    lies, may be as near as that, most of it hidden behind it. Eclipses are fitted as they are.
-    """
-    if solution.is_eclipse or solution.count == 1:
-        return 0.0
-    apart_px = np.hypot(solution.u_px - solution.u_px[index], solution.v_px - solution.v_px[index])
-    others_px = solution.radius_at_rest_px
-    nearer = [
-        k
-        for k in np.flatnonzero(apart_px < 2.0 * others_px).tolist()
-        if k != index and not _shows_its_size(solution, k, index)
-    ]
-    farther = solution.log_range[index] - solution.log_range[nearer]
-    hidden = sum(hidden_share(solution, k, index) for k in range(solution.count) if k != index)
-    return max(float(farther.max(initial=0.0)), 0.5 * hidden)
-
-
-def hidden_share(solution: Solution, near: int, far: int) -> float:
-    """Return about how much of a flare's disc another one covers: what a half plane at their mean edge does.
-
-    Of two discs of unlike size the chord of the smaller one is meant.
-    """
-    apart_px = math.hypot(solution.u_px[near] - solution.u_px[far], solution.v_px[near] - solution.v_px[far])
-    near_px, far_px = solution.radius_at_rest_px[[near, far]]
-    depth = min(max(float(near_px + far_px - apart_px) / (2.0 * max(float(far_px), 1e-9)), 0.0), 1.0)
-    middle = 1.0 - 2.0 * depth
-    return (math.acos(middle) - middle * 2.0 * math.sqrt(depth - depth**2)) / math.pi

@@ -16,6 +16,8 @@ from perception.model.layout import CLIPPED, SEEN, Sources
 from perception.model.spread import spread_nodes
 from perception.model.window import Camera, lay_out
 from perception.robust.goodness import MODEL_ERROR, is_likely, residual_e
+from perception.robust.overlap.deblend import LEAST_GAIN
+from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
@@ -95,6 +97,17 @@ def fit_oval(flares: Solution, camera: Camera) -> Oval:
         brightness=math.exp(log_flux - 2.0 * log_size - log_source) / (1.0 - axes**2),
         aspect=(1.0 + axes) / (1.0 - axes),
     )
+
+
+def is_oval(one: Solution, several: Solution, camera: Camera) -> bool:
+    """Tell whether a lone resolved source whose axes differ explains as well what takes several flares."""
+    if (
+        one.count > 1
+        or one.motion_px is not None
+        or not float(several.image_radius_px.max()) > LEAST_RADIUS_PX
+    ):
+        return False
+    return fit_oval(several, camera).chi2_more < LEAST_GAIN
 
 
 def _climbed(values: Array, fitted: Callable[[Array], Fitted]) -> tuple[Array, Fitted]:

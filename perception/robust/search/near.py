@@ -5,14 +5,20 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.ranging import brightness_e
+from perception.model.ranging import brightness_e, constant_spread
 from perception.robust.search.background import as_wide
 from perception.robust.search.frame import above
 from perception.types import Calibration, RawFrame
 
 _OF_BRIGHTNESS = 0.5
 _WINGS_SIGMAS = 4.0  # of the point spread, filtered
+_BRIGHTER = 1.3
 _LEAST_SHARE = 0.02  # of a cell: of less the scatter knows nothing, as it is blind to its outer thirds
+_MOST_SHARE = 0.5  # of which there is more, that is the ground
+_FEWEST_CELLS, _LEAST_CELLS = (
+    8,
+    0.08,
+)  # of a frame: what lies around a few may be its structure
 
 
 def brightness_mesh_e(
@@ -32,8 +38,9 @@ def brightness_mesh_e(
 def near_sources(
     lit_at: NDArray[np.int64],
     lit_e: NDArray[np.float32],
-    brightest_mesh_e: NDArray[np.floating],
-    least_mesh_e: NDArray[np.float32],
+    of_source_mesh_e: NDArray[np.floating],
+    clips_mesh_e: NDArray[np.floating],
+    least_mesh_e: NDArray[np.floating],
     calibration: Calibration,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
     """Mark what may be discs of near sources, and their wings.
@@ -42,8 +49,8 @@ def near_sources(
     ----------
     lit_at, lit_e
         Pixels above the detection limit, as indices in the frame, and the filtered image there.
-    brightest_mesh_e
-        How bright pixels are, in each cell, that a source covers, or where they clip.
+    of_source_mesh_e, clips_mesh_e
+        How bright pixels are, in each cell, that a source covers (`brightness_mesh_e`), and what clips.
     least_mesh_e
         So bright they must be at least.
     calibration
@@ -56,14 +63,21 @@ def near_sources(
     """
     import cv2
 
-    (down, across), (height, width) = brightest_mesh_e.shape, (calibration.height_px, calibration.width_px)
-    bright_e = (_OF_BRIGHTNESS * brightest_mesh_e).astype(np.float32)
+    (down, across), (height, width) = clips_mesh_e.shape, (calibration.height_px, calibration.width_px)
+    if not np.isfinite(of_source_mesh_e).any():  # points cover nothing
+        return None
+    bright_e = (_OF_BRIGHTNESS * np.fmin(of_source_mesh_e, clips_mesh_e)).astype(np.float32)
     bright_e[~(bright_e > least_mesh_e)] = np.inf
-    places = lit_at[above(lit_at, lit_e, as_wide(bright_e, calibration), height)]
+    most_e = _BRIGHTER * (1.0 + 4.0 * constant_spread(calibration)) * of_source_mesh_e
+    most_e = np.where(most_e < clips_mesh_e, most_e, np.inf).astype(np.float32)
+    is_bright = above(lit_at, lit_e, as_wide(bright_e, calibration), height)
+    is_brighter = above(lit_at, lit_e, as_wide(most_e, calibration), height)
+    places = lit_at[is_bright & ~is_brighter]
     cell = places // width * down // height * across + places % width * across // width
     count = np.bincount(cell, minlength=down * across).reshape(down, across)
-    many = (count > _LEAST_SHARE * height * width / (down * across)).astype(np.uint8)
-    if not many.any():
+    share = count * (down * across) / (height * width)
+    many = ((share > _LEAST_SHARE) & (share < _MOST_SHARE)).astype(np.uint8)
+    if many.sum() < max(1.0, _LEAST_CELLS * many.size):
         return None
     bright = np.zeros((height, width), dtype=np.uint8)
     bright.ravel()[places] = 1

@@ -229,8 +229,10 @@ def prepare(frame: RawFrame, calibration: Calibration) -> PreparedFrame:
     of_sources = None
     if (ratio > 1.0).any():
         clips_e = clip_level_e(calibration, frame.black_level_dn, frame.gain) - mesh_e
-        brightest_e = np.fmin(brightness_mesh_e(frame, calibration, mesh_e.shape), clips_e)
-        found = near_sources(lit_at, lit_e, brightest_e, _CLIPPED_NOISES * noise_mesh_e, calibration)
+        of_source_e = brightness_mesh_e(frame, calibration, mesh_e.shape)
+        # Ground that is bright itself may be so here and there.
+        least_e = np.maximum(_CLIPPED_NOISES * noise_mesh_e, mesh_e)
+        found = near_sources(lit_at, lit_e, of_source_e, clips_e, least_e, calibration)
         if found is not None:
             of_sources, many = found
             is_left_out = of_sources[np.ix_(rows.ravel(), columns.ravel())]

@@ -54,6 +54,14 @@ def test_the_limb_of_a_clipped_lamp_is_no_source_s(frame: int) -> None:
     assert ROWS["lamps where sources are balls of 1 cm"](frames=1, first=frame)["reported"] == 0
 
 
+@pytest.mark.parametrize("frame", [14, 128, 209, 241, 463, 485])
+def test_one_of_seven_lamps_is_no_source(frame: int) -> None:
+    """Clipped ovals a fifth wider than high, told by their flanks as if charge had spilled; and dim squares of 7 px, told
+    as five and six flares that move side by side."""
+    row = ROWS["seven lamps where sources are balls of 1 cm"]
+    assert row(frames=1, first=frame)["reported"] == 0
+
+
 @pytest.mark.parametrize(
     "frame", [7, *(pytest.param(k, marks=pytest.mark.verify) for k in (1, 4, 8, 13, 21))]
 )

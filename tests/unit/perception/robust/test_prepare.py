@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
+from scipy.ndimage import correlate1d, gaussian_filter
 from scipy.stats import norm, poisson
 
 from perception.robust.search.background import background_mesh_e, cell_means, cell_scatter, spread_mesh
@@ -11,7 +11,7 @@ from perception.robust.search.frame import Pixels, above, exceeding, filtered, w
 from perception.robust.search.limit import FALSE_ALARMS_PER_PIXEL, detection_limit_e, in_threes, point_kernel
 from perception.robust.search.prepare import prepare
 from perception.types import Calibration
-from tests.unit.perception.simulation import calibration, expose, random
+from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 
 @pytest.mark.parametrize("level_e", [0.0, 0.6, 40.0, 2000.0])
@@ -197,3 +197,24 @@ def test_clipped_pixels_are_no_background() -> None:
     assert abs(mesh - 30.0).max() < 1.0
     prepared = prepare(frame, camera)
     assert np.bincount(prepared.lit_at // 640, minlength=480)[160:340].min() >= 200
+
+
+def test_discs_of_near_sources_are_no_structure_of_even_ground() -> None:
+    """Sixty balls of 4 to 13 px cover a tenth of the frame: nine cells of ten counted as uneven."""
+    camera = calibration(width_px=640, height_px=480, cx_px=319.5, cy_px=239.5)
+    number = random(30).random((60, 3))
+    places = [(20.0 + 600.0 * a, 20.0 + 440.0 * b, 0.35 * 3.0**c) for a, b, c in number]
+    frame = expose(expected_e(camera, places, 1e-4, 3.0), camera, random(31), 1e-4)
+    texture_e = prepare(frame, camera).texture_e
+    assert texture_e is None or np.mean(texture_e > 0.0) < 0.05
+
+
+@pytest.mark.parametrize("correlation_px", [4.0, 8.0])
+def test_ground_as_bright_as_half_of_full_scale_keeps_its_structure(correlation_px: float) -> None:
+    """Sunlit, 3 600 e and a fifth of that up and down: its hills are as bright as half of what clips above it."""
+    camera = calibration(width_px=384, height_px=384, cx_px=191.5, cy_px=191.5)
+    hills = gaussian_filter(random(32).normal(size=(384, 384)), correlation_px, mode="wrap")
+    frame = expose(3600.0 * (1.0 + 0.2 * hills / hills.std()), camera, random(33))
+    texture_e = prepare(frame, camera).texture_e
+    assert texture_e is not None
+    assert np.mean(texture_e > 0.0) > 0.95
