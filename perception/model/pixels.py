@@ -101,18 +101,40 @@ def dot(one: Array, other: Array) -> float:
 
 
 @compiled
+def _four_dots(x: Array, p: Array, q: Array, r: Array, s: Array) -> tuple[float, float, float, float]:
+    """Return `dot` of an array and four others each, to the bit: their sums do not wait for one another."""
+    p0 = p1 = p2 = p3 = q0 = q1 = q2 = q3 = r0 = r1 = r2 = r3 = s0 = s1 = s2 = s3 = 0.0
+    whole = len(x) - len(x) % 4
+    for at in range(0, whole, 4):
+        a, b, c, d = x[at], x[at + 1], x[at + 2], x[at + 3]
+        p0, p1, p2, p3 = p0 + a * p[at], p1 + b * p[at + 1], p2 + c * p[at + 2], p3 + d * p[at + 3]
+        q0, q1, q2, q3 = q0 + a * q[at], q1 + b * q[at + 1], q2 + c * q[at + 2], q3 + d * q[at + 3]
+        r0, r1, r2, r3 = r0 + a * r[at], r1 + b * r[at + 1], r2 + c * r[at + 2], r3 + d * r[at + 3]
+        s0, s1, s2, s3 = s0 + a * s[at], s1 + b * s[at + 1], s2 + c * s[at + 2], s3 + d * s[at + 3]
+    for at in range(whole, len(x)):
+        p0, q0, r0, s0 = p0 + x[at] * p[at], q0 + x[at] * q[at], r0 + x[at] * r[at], s0 + x[at] * s[at]
+    return (p0 + p1) + (p2 + p3), (q0 + q1) + (q2 + q3), (r0 + r1) + (r2 + r3), (s0 + s1) + (s2 + s3)
+
+
+@compiled
 def add_information(jacobian: Array, weight: Array, into: Array) -> None:
     """Add J W Jᵀ."""
     size, pixels = jacobian.shape
-    weighted = np.empty(pixels)
+    weighted, totals = np.empty(pixels), np.empty(size)
     for one in range(size):
         for pixel in range(pixels):
             weighted[pixel] = jacobian[one, pixel] * weight[pixel]
-        for other in range(one + 1):
-            total = dot(weighted, jacobian[other])
-            into[one, other] += total
-            if other != one:
-                into[other, one] += total
+        fours = (one + 1) // 4 * 4
+        for at in range(0, fours, 4):
+            totals[at], totals[at + 1], totals[at + 2], totals[at + 3] = _four_dots(
+                weighted, jacobian[at], jacobian[at + 1], jacobian[at + 2], jacobian[at + 3]
+            )
+        for at in range(fours, one + 1):
+            totals[at] = dot(weighted, jacobian[at])
+        into[one, one] += totals[one]
+        for other in range(one):
+            into[one, other] += totals[other]
+            into[other, one] += totals[other]
 
 
 @compiled

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import bearing_body
 from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
-from perception.model.ranging import constant_spread, flux_at_one_metre_dn
+from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.flare import MeasuredFlare
@@ -18,6 +18,7 @@ from perception.robust.measure import measure
 from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.hills import prominent, summit
+from perception.robust.search.near import most_brightness
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
 from perception.types import Calibration, Detection, Detections, RawFrame
@@ -33,7 +34,7 @@ _RING_PX = 4
 _SUMMIT_REACH = 4.0  # σ of the point spread: three of what it is filtered to, √2 times as wide
 _FEWEST_RING_PIXELS = 8
 _LEAST_DISC_PX2 = 30
-_MOSTLY_SEEN, _BRIGHTER = 0.7, 1.3  # of the brightness of sources: as much as their discs have, and no more
+_MOSTLY_SEEN = 0.7  # of the brightness of sources
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
 
@@ -235,7 +236,9 @@ def _disc_level_e(component: Blob, prepared: PreparedFrame) -> float:
     if component.area_px < _LEAST_DISC_PX2 or prepared.clipped_in(box).any():
         return math.inf
     of_source_e = prepared.brightness_e(box.left + 0.5 * box.width, box.top + 0.5 * box.height)
-    most_e = _BRIGHTER * (1.0 + 4.0 * constant_spread(prepared.calibration)) * of_source_e
+    if not 0.0 < of_source_e < math.inf:
+        return math.inf
+    most_e = most_brightness(prepared.calibration) * of_source_e
     level_e = _MOSTLY_SEEN * of_source_e
     if not level_e < component.peak_e < most_e:
         return math.inf

@@ -35,6 +35,11 @@ def brightness_mesh_e(
     return brightness_e(places_px, frame.exposure_s, frame.gain, calibration).reshape(cells)
 
 
+def most_brightness(calibration: Calibration) -> float:
+    """Return how many times as bright as a source of its calibration may be what is one."""
+    return _BRIGHTER * (1.0 + 4.0 * constant_spread(calibration))
+
+
 def near_sources(
     lit_at: NDArray[np.int64],
     lit_e: NDArray[np.float32],
@@ -64,11 +69,11 @@ def near_sources(
     import cv2
 
     (down, across), (height, width) = clips_mesh_e.shape, (calibration.height_px, calibration.width_px)
-    if not np.isfinite(of_source_mesh_e).any():  # points cover nothing
+    if not ((of_source_mesh_e > 0.0) & np.isfinite(of_source_mesh_e)).any():  # points cover nothing
         return None
     bright_e = (_OF_BRIGHTNESS * np.fmin(of_source_mesh_e, clips_mesh_e)).astype(np.float32)
     bright_e[~(bright_e > least_mesh_e)] = np.inf
-    most_e = _BRIGHTER * (1.0 + 4.0 * constant_spread(calibration)) * of_source_mesh_e
+    most_e = most_brightness(calibration) * of_source_mesh_e
     most_e = np.where(most_e < clips_mesh_e, most_e, np.inf).astype(np.float32)
     is_bright = above(lit_at, lit_e, as_wide(bright_e, calibration), height)
     is_brighter = above(lit_at, lit_e, as_wide(most_e, calibration), height)
