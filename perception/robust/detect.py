@@ -35,6 +35,7 @@ _SUMMIT_REACH = 4.0  # σ of the point spread: three of what it is filtered to, 
 _FEWEST_RING_PIXELS = 8
 _LEAST_DISC_PX2 = 30
 _MOSTLY_SEEN = 0.7  # of the brightness of sources
+_LEAST_OF_PART = 0.25
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
 
@@ -224,7 +225,7 @@ def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Bl
         for part in parts
         for flare in (
             _off_hill(part, component, noise_e, reach_px, prepared)
-            if part.peak_e < disc_e and (part.area_px >= least_px or prepared.is_structured(part.box))
+            if not _is_disc(part, disc_e) and (part.area_px >= least_px or prepared.is_structured(part.box))
             else [part]
         )
     ]
@@ -244,6 +245,12 @@ def _disc_level_e(component: Blob, prepared: PreparedFrame) -> float:
         return math.inf
     is_disc = np.count_nonzero(component.filtered_e > level_e) >= _LEAST_DISC_PX2
     return level_e if is_disc else math.inf
+
+
+def _is_disc(part: Blob, disc_e: float) -> bool:
+    """Tell whether much of a part is as bright as near sources are, and not a flare's middle on a hill."""
+    bright_px = np.count_nonzero(part.filtered_e > disc_e)
+    return bool(bright_px >= max(_LEAST_DISC_PX2, _LEAST_OF_PART * part.area_px))
 
 
 def _off_hill(
