@@ -10,7 +10,7 @@ import numpy as np
 
 import perception
 from perception.types import Calibration, Detection
-from tests.hard_frames.scores import BACKGROUND_E, POINT, Array, rms
+from tests.hard_frames.scores import BACKGROUND_E, POINT, Array, paired, rms
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, expose, random
 
 RADIUS_M = 0.01
@@ -114,19 +114,10 @@ def union_of_discs(balls: list[Place], camera: Calibration) -> tuple[Array, Arra
 
 def _paired(balls: list[Place], found: list[Detection], camera: Calibration) -> list[Detection | None]:
     """Pair balls and detections one to one, nearest first, within a pixel or half of a radius."""
-    hits: list[Detection | None] = [None] * len(balls)
     if not found:
-        return hits
+        return [None] * len(balls)
     u_px, v_px, range_m = np.array(balls).T
     within_px = np.maximum(1.0, 0.5 * camera.fx_px * RADIUS_M / range_m)
     told = np.array([(one.u_px, one.v_px) for one in found])
-    apart = np.hypot(told[:, 0] - u_px[:, None], told[:, 1] - v_px[:, None]) / within_px[:, None]
-    left = set(range(len(found)))
-    for flat in np.argsort(apart, axis=None).tolist():
-        ball, one = divmod(flat, len(found))
-        if apart[ball, one] >= 1.0:
-            break
-        if hits[ball] is None and one in left:
-            hits[ball] = found[one]
-            left.remove(one)
-    return hits
+    apart_px = np.hypot(told[:, 0] - u_px[:, None], told[:, 1] - v_px[:, None])
+    return paired(apart_px / within_px[:, None], found, 1.0)

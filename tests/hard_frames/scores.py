@@ -65,17 +65,25 @@ def frame_of(
 def score(flares: Sequence[Flare], found: Sequence[Detection], within_px: float) -> Scored:
     """Pair flares and detections one to one, nearest first, within a distance."""
     hits: list[Detection | None] = [None] * len(flares)
-    left = set(range(len(found)))
     if flares and found:
         apart = cdist([(f.u_px, f.v_px) for f in flares], [(d.u_px, d.v_px) for d in found])
-        for flat in np.argsort(apart, axis=None):
-            i, j = divmod(int(flat), len(found))
-            if not apart[i, j] <= within_px:
-                break
-            if hits[i] is None and j in left:
-                hits[i] = found[j]
-                left.remove(j)
-    return Scored(flares, hits, [found[j] for j in sorted(left)])
+        hits = paired(apart, found, within_px)
+    taken = {id(hit) for hit in hits}
+    return Scored(flares, hits, [one for one in found if id(one) not in taken])
+
+
+def paired(apart: Array, found: Sequence[Detection], within: float) -> list[Detection | None]:
+    """Return for each row of distances, shape (flares, detections), its detection: nearest first, each once."""
+    hits: list[Detection | None] = [None] * len(apart)
+    left = set(range(len(found)))
+    for flat in np.argsort(apart, axis=None).tolist():
+        row, one = divmod(flat, len(found))
+        if not apart[row, one] <= within:
+            break
+        if hits[row] is None and one in left:
+            hits[row] = found[one]
+            left.remove(one)
+    return hits
 
 
 def cell_centres(inner: int = 0) -> Iterator[tuple[float, float]]:

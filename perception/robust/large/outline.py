@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.lens import project
+from perception.robust.overlap.outlines import on_cones, refined_cone
 from perception.robust.search.blobs import Blob
 from perception.robust.search.prepare import PreparedFrame
 from perception.types import Calibration
@@ -91,23 +92,12 @@ def _likeliest_cone(limb: Array, calibration: Calibration) -> tuple[Array | None
     if len(three) == 0:
         return None, 0.0
     cones = np.linalg.solve(three, np.ones((len(three), 3, 1)))[..., 0]
-    pixel_rad = 1.0 / min(calibration.fx_px, calibration.fy_px)
-
-    def on_cone(axes: Array) -> NDArray[np.bool_]:
-        lengths = np.linalg.norm(axes, axis=-1, keepdims=True)
-        angle_rad = np.arccos(np.minimum(1.0 / lengths, 1.0))
-        off_rad = abs(np.arccos(np.clip(axes / lengths @ limb.T, -1.0, 1.0)) - angle_rad)
-        is_near = off_rad < _ON_PX * pixel_rad + _ON_SHARE * angle_rad
-        return np.asarray(is_near & (lengths > 1.0) & (angle_rad < _MOST_ANGLE_RAD))
-
-    axis = cones[int(np.argmax(on_cone(cones).sum(axis=1)))]
-    for _ in range(_ROUNDS):
-        kept = on_cone(axis[None])[0]
-        if np.count_nonzero(kept) < 3:
-            return None, 0.0
-        axis = np.linalg.lstsq(limb[kept], np.ones(np.count_nonzero(kept)), rcond=None)[0]
-    share = float(on_cone(axis[None])[0].mean())
-    return (axis, share) if float(np.linalg.norm(axis)) > 1.0 else (None, 0.0)
+    within = _ON_PX / min(calibration.fx_px, calibration.fy_px), _ON_SHARE
+    likeliest = cones[int(np.argmax(on_cones(cones, limb, *within, _MOST_ANGLE_RAD).sum(axis=1)))]
+    axis = refined_cone(likeliest, limb, *within, _ROUNDS, _MOST_ANGLE_RAD)
+    if axis is None:
+        return None, 0.0
+    return axis, float(on_cones(axis[None], limb, *within, _MOST_ANGLE_RAD)[0].mean())
 
 
 def _along(corners: Array) -> Array:

@@ -105,7 +105,7 @@ class Climb(ABC):
                 if self.to_gain < _SETTLED:
                     break
                 is_judged = done >= _JUDGED_AFTER and not may_be_bad
-                if is_judged and not self._is_promising(inverse, self.to_gain, to_beat):
+                if is_judged and not self._is_promising(inverse, to_beat):
                     return False
                 before = self._objective(self._values, self._expected, variance)
             np.copyto(damped, fisher)
@@ -138,11 +138,14 @@ class Climb(ABC):
         self._fit.deviance = self._objective(self._values, self._expected)
         return math.isfinite(self._fit.log_information)
 
-    def _is_promising(self, covariance: Array, to_gain: float, to_beat: float) -> bool:
-        """Tell whether what lies ahead, so much likelier to first order, may be good, at no greater cost."""
+    def _is_promising(self, covariance: Array, to_beat: float) -> bool:
+        """Tell whether what lies ahead, by `to_gain` to first order, may be good, at no greater cost."""
         self._write(covariance)
         self._fit.deviance = self.so_far
-        here, ahead = solutions_of([self._fit], self._camera)[0], _MORE_TO_GAIN + _TIMES_TO_GAIN * to_gain
+        here, ahead = (
+            solutions_of([self._fit], self._camera)[0],
+            _MORE_TO_GAIN + _TIMES_TO_GAIN * self.to_gain,
+        )
         return here.left_over.may_be_good(ahead) and here.cost - ahead <= to_beat
 
     def _write(self, covariance: Array) -> None:

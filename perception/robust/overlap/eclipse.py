@@ -66,7 +66,7 @@ def eclipses(
     may_be: Sequence[bool],
     camera: Camera,
 ) -> tuple[dict[int, Solution], dict[int, Solution]]:
-    """Explain windows by resolved spheres, some partly behind others.
+    """Explain windows by two resolved spheres, one partly behind the other, where no outline shows them.
 
     Where robots are known to carry several sources, smaller ones too, others may be beside them, and two that
     stand as far apart as a robot's are believed where one that is not quite round would explain as much.
@@ -87,20 +87,20 @@ def eclipses(
     By index what explains a window well, nothing where nothing does; and likewise what does, but for which a
     globe that is not round would as well, or which is too small to be told.
     """
-    piles, rivals = dict[int, Solution](), dict[int, Solution]()
+    pairs, rivals = dict[int, Solution](), dict[int, Solution]()
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd:
             continue
         good = _by_both_ends(cluster, one, parted.get(index), camera, may_be=may_be[index])
         if not good:
             continue
-        likeliest = min(good, key=lambda pile: pile.cost)
+        likeliest = min(good, key=lambda pair: pair.cost)
         believed = _believed(likeliest, camera)
         if believed is None:
             rivals[index] = likeliest
         else:
-            piles[index] = believed
-    return piles, rivals
+            pairs[index] = believed
+    return pairs, rivals
 
 
 def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> Solution | None:

@@ -58,20 +58,21 @@ def discs_by_outline(cluster: Cluster, camera: Camera) -> list[Start]:
     corner = np.array([window.box.left, window.box.top], dtype=np.float64)
     limb = direction_camera(points + corner, calibration)
     cones = _cones(limb)
+    tolerance_rad = _ON_PX / min(calibration.fx_px, calibration.fy_px)
     starts: list[Start] = []
     left = np.isfinite(limb).all(axis=1)
     while len(cones) and np.count_nonzero(left) >= _FEWEST and len(starts) < MOST_DISCS:
-        near = _on_cones(cones, limb, calibration)
+        near = on_cones(cones, limb, tolerance_rad, _ON_SHARE)
         # Of large circles chance puts more of an outline on each.
         score = np.count_nonzero(near & left, axis=1)
         best = None
         for at in np.argsort(-score, kind="stable")[:_TRIED]:
             if score[at] < _FEWEST:
                 break
-            cone = _refined(cones[at], limb, calibration)
+            cone = refined_cone(cones[at], limb, tolerance_rad, _ON_SHARE, _ROUNDS)
             if cone is None or not _is_lit(cone, lit, window.usable, corner, calibration):
                 continue
-            on = _on_cones(cone[None], limb, calibration)[0]
+            on = on_cones(cone[None], limb, tolerance_rad, _ON_SHARE)[0]
             length_px = 2.0 * math.pi * _radius_px(cone, calibration)
             if np.count_nonzero(on & left) >= max(_FEWEST, _LEAST_ARC * length_px):
                 best = cone
@@ -83,7 +84,7 @@ def discs_by_outline(cluster: Cluster, camera: Camera) -> list[Start]:
         range_m = camera.radius_m / math.sin(math.acos(1.0 / length))
         if range_m > LEAST_RANGE_M and math.isfinite(u_px):
             starts.append((u_px, v_px, math.log(range_m)))
-        left &= ~_on_cones(best[None], limb, calibration, 2.0)[0]
+        left &= ~on_cones(best[None], limb, 2.0 * tolerance_rad, 2.0 * _ON_SHARE)[0]
     return starts
 
 
@@ -130,24 +131,35 @@ def _cones(limb: Array) -> Array:
     return np.asarray(cones[np.linalg.norm(cones, axis=1) > 1.0])
 
 
-def _on_cones(cones: Array, limb: Array, calibration: Calibration, times: float = 1.0) -> NDArray[np.bool_]:
-    """Tell which directions lie on which cones, shape (cones, directions), within so many tolerances."""
-    lengths = np.linalg.norm(cones, axis=1, keepdims=True)
+def on_cones(
+    cones: Array, limb: Array, tolerance_rad: float, share: float, most_angle_rad: float = math.inf
+) -> NDArray[np.bool_]:
+    """Tell which directions n lie on which cones, m · n = 1, shape (cones, directions).
+
+    Within a tolerance, and a share of the cone's angle more; on none that is no cone, or wider than that.
+    """
+    lengths = np.linalg.norm(cones, axis=-1, keepdims=True)
     angle_rad = np.arccos(np.minimum(1.0 / lengths, 1.0))
     off_rad = abs(np.arccos(np.clip(cones / lengths @ limb.T, -1.0, 1.0)) - angle_rad)
-    pixel_rad = 1.0 / min(calibration.fx_px, calibration.fy_px)
-    return np.asarray(off_rad < times * (_ON_PX * pixel_rad + _ON_SHARE * angle_rad))
+    is_near = off_rad < tolerance_rad + share * angle_rad
+    return np.asarray(is_near & (lengths > 1.0) & (angle_rad < most_angle_rad))
 
 
-def _refined(cone: Array, limb: Array, calibration: Calibration) -> Array | None:
-    for _ in range(_ROUNDS):
-        kept = _on_cones(cone[None], limb, calibration)[0]
+def refined_cone(
+    cone: Array,
+    limb: Array,
+    tolerance_rad: float,
+    share: float,
+    rounds: int,
+    most_angle_rad: float = math.inf,
+) -> Array | None:
+    """Fit a cone to the directions that lie on it, some times over; None where too few do."""
+    for _ in range(rounds):
+        kept = on_cones(cone[None], limb, tolerance_rad, share, most_angle_rad)[0]
         if np.count_nonzero(kept) < 3:
             return None
         cone = np.linalg.lstsq(limb[kept], np.ones(np.count_nonzero(kept)), rcond=None)[0]
-        if not float(np.linalg.norm(cone)) > 1.0:
-            return None
-    return cone
+    return cone if float(np.linalg.norm(cone)) > 1.0 else None
 
 
 def _radius_px(cone: Array, calibration: Calibration) -> float:

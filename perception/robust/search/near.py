@@ -15,10 +15,7 @@ _WINGS_SIGMAS = 4.0  # of the point spread, filtered
 _BRIGHTER = 1.3
 _LEAST_SHARE = 0.02  # of a cell: of less the scatter knows nothing, as it is blind to its outer thirds
 _MOST_SHARE = 0.5  # of which there is more, that is the ground
-_FEWEST_CELLS, _LEAST_CELLS = (
-    8,
-    0.08,
-)  # of a frame: what lies around a few may be its structure
+_LEAST_CELLS = 0.08  # of a frame: what lies around a few may be its structure
 
 
 def brightness_mesh_e(
