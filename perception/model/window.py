@@ -178,10 +178,7 @@ def lay_out(
     """
     calibration = camera.calibration
     direction = direction_camera(np.column_stack([u_px, v_px]), calibration)
-    exposed_s = exposure_towards(direction, camera.exposure_s, camera.gain, calibration)
-    at_1_m_e = flux_e_of(exposed_s, camera.gain, calibration)
-    if hidden_e is not None:
-        at_1_m_e = np.maximum(at_1_m_e - hidden_e, LEAST_LEFT * at_1_m_e)
+    log_flux = log_flux_at_1_m(camera, direction, hidden_e)
     radius_rad = angular_radius_rad(np.exp(log_range), camera.radius_m)
     imaged = is_before(direction, radius_rad)
     if not imaged.all():
@@ -190,8 +187,19 @@ def lay_out(
         radius_rad = np.where(imaged, radius_rad, 0.0)
     laid_out = disc_nodes if in_points else disc_rows
     nodes = laid_out(u_px, v_px, direction, radius_rad, calibration, moved_px, finer)
-    log_flux_at_1_m = np.log(np.where(at_1_m_e > 0.0, at_1_m_e, 1.0))
-    return Sources.of(nodes, np.ascontiguousarray(log_range), log_flux_at_1_m), imaged
+    return Sources.of(nodes, np.ascontiguousarray(log_range), log_flux), imaged
+
+
+def log_flux_at_1_m(camera: Camera, direction: Array, hidden_e: Array | None = None) -> Array:
+    """Return ln F₁ in electrons of sources in some directions, shape (n, 3) → (n,); 0 where there is no range.
+
+    Less `hidden_e`, what each would take away of the background from one metre.
+    """
+    exposed_s = exposure_towards(direction, camera.exposure_s, camera.gain, camera.calibration)
+    at_1_m_e = flux_e_of(exposed_s, camera.gain, camera.calibration)
+    if hidden_e is not None:
+        at_1_m_e = np.maximum(at_1_m_e - hidden_e, LEAST_LEFT * at_1_m_e)
+    return np.log(np.where(at_1_m_e > 0.0, at_1_m_e, 1.0))
 
 
 def motion_cost(motion_px: Array, log_range: Array, covariance_px2: Array, camera: Camera) -> float:

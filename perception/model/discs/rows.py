@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.bearing import angle_from_axis_rad, pixel_turn
-from perception.model.discs.nodes import DiscNodes, across_and_down, along_lines, disc_nodes, fineness_of
+from perception.model.discs.nodes import DiscNodes, along_lines, disc_nodes, fineness_of
+from perception.model.discs.outline import AROUND, HARMONICS, crossing, extreme, rims_of, series_of, value_at
 from perception.model.lens import distortion_of, project
 from perception.types import Calibration
 
@@ -24,17 +25,14 @@ Array = NDArray[np.float64]
 # Rows per ratio of image radius to smoothing: the smallest numbers, found by comparison with three times as
 # many, that keep the error below 1e-4 of the peak for radii from 0 to 130 px.
 _ROWS_BASE, _ROWS_SLOPE = 1.4, 2.7
-_SMOOTH_RAD, _MOST_PARTS = 0.05, 8  # half of a strip on the axis along which light is as in a parabola
-_HARMONICS = 7
-_AROUND = 2 * _HARMONICS + 2  # points of an outline
-_LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
+SMOOTH_RAD, _MOST_PARTS = 0.05, 8  # half of a strip on the axis along which light is as in a parabola
+LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
 _TIMES_MOVED = 2
 _PLACES = 5  # of a strip where light is looked at: its ends, its middle, and two between to try the parabola
 _MOST_OFF, _MOST_RATIO = 2e-4, 4.0  # of the greatest light; of that to the least
 _MOST_BENT = 1e-3  # of the response: how far a table's bend may change it over the radius
 # Strips of half so many widths of the point spread are even: where their light's middle is says all.
 _SHORT = 0.5
-_STEPS, _SETTLED = 40, 1e-8  # Newton's, in rad
 
 
 def disc_rows(
@@ -51,14 +49,14 @@ def disc_rows(
     The arguments are as for `nodes.disc_nodes`, which says the same in points.
     """
     smooth_px, fineness = fineness_of(direction, angular_radius_rad, calibration, finer)
-    rims, across, down = _rims(direction, angular_radius_rad)
-    outlines_px = project(rims.reshape(-1, 3), calibration).reshape(-1, _AROUND, 2)
+    rims, across, down = rims_of(direction, angular_radius_rad)
+    outlines_px = project(rims.reshape(-1, 3), calibration).reshape(-1, AROUND, 2)
     outlines_px -= np.stack([u_px, v_px], axis=1)[:, None, :]
     is_disc = angular_radius_rad > 0.0
     rows = np.where(is_disc, np.ceil(_ROWS_BASE + _ROWS_SLOPE * fineness), 1.0).astype(np.int64)
     # cos⁴ θ, as light falls off, bends so much more away from the axis.
     bend = np.sqrt(3.0 / direction[:, 2] ** 2 - 2.0)
-    parts = np.clip(np.ceil(angular_radius_rad * bend / _SMOOTH_RAD), 1.0, _MOST_PARTS).astype(np.int64)
+    parts = np.clip(np.ceil(angular_radius_rad * bend / SMOOTH_RAD), 1.0, _MOST_PARTS).astype(np.int64)
     first = np.cumsum([0, *(rows * parts).tolist()])
     strip_v_px, share, omega, is_known = _strips(
         first, rows, parts, outlines_px, direction, across, down, angular_radius_rad
@@ -73,7 +71,7 @@ def disc_rows(
                 off_px = at_px[:, :, 1] - (strip_v_px + v_px[of])[:, None]
                 omega -= off_px[:, :, None] * turn[:, None, :]
                 at_px = project(omega.reshape(-1, 3), calibration).reshape(-1, _PLACES, 2)
-        light, psf_px = _light(omega, calibration), calibration.psf_sigma_px
+        light, psf_px = light_from(omega, calibration), calibration.psf_sigma_px
         strips, is_so = _shaded(first, at_px[:, :, 0] - u_px[of][:, None], strip_v_px, share, light, psf_px)
     is_known &= is_so & ~_is_bent(direction, angular_radius_rad, calibration)
     if not is_known.all():
@@ -81,7 +79,7 @@ def disc_rows(
     return strips if moved_px is None else along_lines(strips, moved_px / smooth_px)
 
 
-def _light(omega: Array, calibration: Calibration) -> Array:
+def light_from(omega: Array, calibration: Calibration) -> Array:
     """Return the light that falls on an area of the image from directions, shape (..., 3)."""
     angle_rad = angle_from_axis_rad(omega)
     response = np.interp(angle_rad, calibration.response_angle_rad, calibration.response_relative)
@@ -106,82 +104,6 @@ def _is_bent(direction: Array, angular_radius_rad: Array, calibration: Calibrati
 
 
 @compiled
-def _rims(direction: Array, angular_radius_rad: Array) -> tuple[Array, Array, Array]:
-    """Return directions around each cap's rim, shape (caps, `_AROUND`, 3), and `across_and_down` of it."""
-    caps = len(direction)
-    rims, across, down = np.empty((caps, _AROUND, 3)), np.empty((caps, 3)), np.empty((caps, 3))
-    for cap in range(caps):
-        across[cap], down[cap] = across_and_down(direction[cap, 0], direction[cap, 1], direction[cap, 2])
-        cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
-        for at in range(_AROUND):
-            turn = 2.0 * math.pi * at / _AROUND
-            for axis in range(3):
-                aside = math.cos(turn) * across[cap, axis] + math.sin(turn) * down[cap, axis]
-                rims[cap, at, axis] = cosine * direction[cap, axis] + sine * aside
-    return rims, across, down
-
-
-@compiled
-def _series(values: Array) -> Array:
-    """Return the Fourier series through values around a circle: cosines and sines, (1 + harmonics, 2)."""
-    series = np.zeros((1 + _HARMONICS, 2))
-    for harmonic in range(1 + _HARMONICS):
-        for at in range(_AROUND):
-            turn = 2.0 * math.pi * ((harmonic * at) % _AROUND) / _AROUND
-            series[harmonic, 0] += values[at] * math.cos(turn) * 2.0 / _AROUND
-            series[harmonic, 1] += values[at] * math.sin(turn) * 2.0 / _AROUND
-    series[0] *= 0.5
-    return series
-
-
-@compiled
-def _at(series: Array, turn: float) -> tuple[float, float, float]:
-    """Return the value of a Fourier series at an angle, and its first two derivatives."""
-    cosine, sine, c, s = math.cos(turn), math.sin(turn), 1.0, 0.0
-    value, slope, bend = series[0, 0], 0.0, 0.0
-    for harmonic in range(1, 1 + _HARMONICS):
-        c, s = c * cosine - s * sine, s * cosine + c * sine
-        here = series[harmonic, 0] * c + series[harmonic, 1] * s
-        value += here
-        slope += harmonic * (series[harmonic, 1] * c - series[harmonic, 0] * s)
-        bend -= harmonic**2 * here
-    return value, slope, bend
-
-
-@compiled
-def _extreme(series: Array, turn: float) -> float:
-    """Return the angle of an extreme of a Fourier series near to one; NaN if there is none."""
-    for _ in range(_STEPS):
-        _, slope, bend = _at(series, turn)
-        step = slope / bend
-        turn -= step
-        if abs(step) < _SETTLED:
-            return turn
-    return math.nan
-
-
-@compiled
-def _crossing(series: Array, level: float, above: float, below: float, turn: float) -> float:
-    """Return the angle at which a Fourier series falls through a level, between one above it and one below.
-
-    By Newton's steps, halving where these leave what is left between; NaN if there is none.
-    """
-    for _ in range(_STEPS):
-        value, slope, _ = _at(series, turn)
-        if value > level:
-            above = turn
-        else:
-            below = turn
-        step = (value - level) / slope
-        if not min(above, below) <= turn - step <= max(above, below):
-            step = turn - 0.5 * (above + below)
-        turn -= step
-        if abs(step) < _SETTLED:
-            return turn
-    return math.nan
-
-
-@compiled
 def _strips(
     first: NDArray[np.int64], rows: NDArray[np.int64], parts: NDArray[np.int64], outlines_px: Array,
     direction: Array, across: Array, down: Array, angular_radius_rad: Array,
@@ -201,14 +123,14 @@ def _strips(
         omega[first[cap] : first[cap + 1]] = direction[cap]
         if angular_radius_rad[cap] == 0.0:
             continue
-        of_u, of_v = _series(outlines_px[cap, :, 0]), _series(outlines_px[cap, :, 1])
-        last = np.abs(of_u[_HARMONICS]).max() + np.abs(of_v[_HARMONICS]).max()
-        is_known[cap] = last <= _LEFT_OUT * np.abs(of_v[1]).max()  # not if it is not a number
+        of_u, of_v = series_of(outlines_px[cap, :, 0]), series_of(outlines_px[cap, :, 1])
+        last = np.abs(of_u[HARMONICS]).max() + np.abs(of_v[HARMONICS]).max()
+        is_known[cap] = last <= LEFT_OUT * np.abs(of_v[1]).max()  # not if it is not a number
         if not is_known[cap]:
             continue
-        lowest = _extreme(of_v, math.atan2(of_v[1, 1], of_v[1, 0]))
-        highest = _extreme(of_v, math.atan2(-of_v[1, 1], -of_v[1, 0]))
-        bottom, top = _at(of_v, lowest)[0], _at(of_v, highest)[0]
+        lowest = extreme(of_v, math.atan2(of_v[1, 1], of_v[1, 0]))
+        highest = extreme(of_v, math.atan2(-of_v[1, 1], -of_v[1, 0]))
+        bottom, top = value_at(of_v, lowest)[0], value_at(of_v, highest)[0]
         one_way = (highest - lowest) % (2.0 * math.pi)
         other_way = one_way - 2.0 * math.pi
         cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
@@ -216,9 +138,9 @@ def _strips(
             way = (row + 1) / (rows[cap] + 1)
             angle = math.pi * way
             at_v = 0.5 * (top + bottom) + 0.5 * (bottom - top) * math.cos(angle)
-            left = _crossing(of_v, at_v, lowest, lowest + one_way, lowest + way * one_way)
-            right = _crossing(of_v, at_v, lowest, lowest + other_way, lowest + way * other_way)
-            if _at(of_u, left)[0] > _at(of_u, right)[0]:
+            left = crossing(of_v, at_v, lowest, lowest + one_way, lowest + way * one_way)
+            right = crossing(of_v, at_v, lowest, lowest + other_way, lowest + way * other_way)
+            if value_at(of_u, left)[0] > value_at(of_u, right)[0]:
                 left, right = right, left
             is_known[cap] &= math.isfinite(left) and math.isfinite(right)
             for axis in range(3):

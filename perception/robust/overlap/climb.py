@@ -32,9 +32,9 @@ Array = NDArray[np.float64]
 _MOST_STEPS = 30  # what is of another shape goes on without an end
 # In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
 _SETTLED = 0.02
-_JUDGED_AFTER = 4  # steps
+JUDGED_AFTER = 4  # steps
 _MOST_GIVEN_UP = 3  # guesses, from the likeliest on, after which none of the others comes to anything
-_MORE_TO_GAIN, _TIMES_TO_GAIN = 10.0, 3.0  # in −2 ln L, over what is to be had to first order
+MORE_TO_GAIN, TIMES_TO_GAIN = 10.0, 3.0  # in −2 ln L, over what is to be had to first order
 
 
 def good_ones(
@@ -104,7 +104,7 @@ class Climb(ABC):
                 self.to_gain = float(gradient @ inverse @ gradient)
                 if self.to_gain < _SETTLED:
                     break
-                is_judged = done >= _JUDGED_AFTER and not may_be_bad
+                is_judged = done >= JUDGED_AFTER and not may_be_bad
                 if is_judged and not self._is_promising(inverse, to_beat):
                     return False
                 before = self._objective(self._values, self._expected, variance)
@@ -144,7 +144,7 @@ class Climb(ABC):
         self._fit.deviance = self.so_far
         here, ahead = (
             solutions_of([self._fit], self._camera)[0],
-            _MORE_TO_GAIN + _TIMES_TO_GAIN * self.to_gain,
+            MORE_TO_GAIN + TIMES_TO_GAIN * self.to_gain,
         )
         return here.left_over.may_be_good(ahead) and here.cost - ahead <= to_beat
 

@@ -21,8 +21,7 @@ from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.overlap.climb import Climb, good_ones
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
-from perception.robust.overlap.eclipse import finer, is_as_bright, lit_pixels
-from perception.robust.overlap.hidden import RAMP_PX
+from perception.robust.overlap.eclipse import is_as_bright, lit_pixels
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
@@ -33,6 +32,8 @@ Array = NDArray[np.float64]
 Guess = tuple[float, float, float, float, float]
 """u, v, ln range, the line's direction, and how far it lies that way from (u, v)."""
 
+_FINER = 2.0  # are the nodes of what is hidden in part
+_RAMP_PX = 0.4  # over so much what is hidden begins: about as far as nodes lie apart
 _DIRECTIONS = 16  # of the line, first guesses
 _TRIED, _GOOD = 7, 2
 _MOSTLY_SEEN = 0.8  # of the radius, up to the line: first guess where a whole disc explains most
@@ -139,7 +140,11 @@ class _Cut(Climb):
     def __init__(self, cluster: Cluster, guess: Guess, camera: Camera) -> None:
         u_px, v_px, log_range, turn, edge_px = guess
         problem = Problem(cluster.window, [(u_px, v_px, log_range)], cluster.background_e)
-        fit, self._finer, self._from = Fit(problem, camera), np.array([finer(camera)]), np.array([u_px, v_px])
+        fit, self._finer, self._from = (
+            Fit(problem, camera),
+            np.array([_finer(camera)]),
+            np.array([u_px, v_px]),
+        )
         size = fit.layout.size
         prior = np.diag([*np.zeros(size), _LOOSE, _LOOSE])
         prior[:size, :size] = fit.prior
@@ -205,10 +210,10 @@ class _Cut(Climb):
         away, beside = np.array([math.cos(turn), math.sin(turn)]), np.array([-math.sin(turn), math.cos(turn)])
         offset = np.column_stack([laid.node_u_px, laid.node_v_px])
         place = own[:2] - self._from + offset
-        stands_out = 0.5 + (edge_px - place @ away) / RAMP_PX
+        stands_out = 0.5 + (edge_px - place @ away) / _RAMP_PX
         self._seen = float(np.sum(laid.weight * np.clip(stands_out, 0.0, 1.0)) / np.sum(laid.weight))
         ramp = (stands_out > 0.0) & (stands_out < 1.0)
-        edge, light = _chosen(laid, ramp), laid.weight[ramp] / RAMP_PX
+        edge, light = _chosen(laid, ramp), laid.weight[ramp] / _RAMP_PX
         by_place, by_size, by_turn = (
             self._spread(edge._replace(weight=light * factor), own, sigma_px)[0]
             for factor in (np.ones(len(light)), (offset @ away)[ramp], (place @ beside)[ramp])
@@ -236,3 +241,11 @@ def _chosen(laid: Sources, which: NDArray[np.bool_]) -> Sources:
         node_along=laid.node_along[which],
         weight=laid.weight[which],
     )
+
+
+def _finer(camera: Camera) -> float:
+    """Return by how much finer sources are laid out: an edge is sharper than a limb.
+
+    No finer than what a pixel alone smooths asks for.
+    """
+    return min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))

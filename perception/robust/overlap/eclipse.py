@@ -13,17 +13,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import direction_camera, pixel_turn
-from perception.model.flare import image_radius_px
+from perception.model.bearing import direction_camera
+from perception.model.discs.visible import seen_of_discs
+from perception.model.flare import image_radius_px, is_before
 from perception.model.layout import UNUSABLE
-from perception.model.window import Camera, lay_out
+from perception.model.window import Camera, log_flux_at_1_m
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.climb import Climb, good_ones
 from perception.robust.overlap.covered import shows_its_size
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
-from perception.robust.overlap.hidden import expectation_behind
+from perception.robust.overlap.hidden import expectation_of_seen
 from perception.robust.overlap.outlines import discs_by_outline
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
@@ -45,7 +46,6 @@ Array = NDArray[np.float64]
 
 _LEAST_OF_A_LAYOUT = -6.0  # of 2 Δ ln L: an oval is believed where it is twenty times as likely as they are
 _DRAWN_OUT_CHI2 = 14.0  # of two degrees of freedom: by chance once in a thousand
-_FINER = 2.0  # are the nodes of what is hidden in part
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
 _BESIDE_PX = 2.0
@@ -147,7 +147,7 @@ def _believed(pile: Solution, camera: Camera) -> Solution | None:
     least_gain = _LEAST_OF_A_LAYOUT if is_of_a_layout(pile, camera) else LEAST_GAIN
     meet = [group for group in groups_of(pile) if len(group) > 1]
     if not is_near(pile, least_radius_px(camera)) or any(
-        fit_oval(alone(pile, group), camera).chi2_more < least_gain for group in meet
+        fit_oval(alone(pile, group), camera, least_gain).chi2_more < least_gain for group in meet
     ):
         return None
     if pile.count > pile.by_outline > 0:
@@ -196,7 +196,7 @@ def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
         starts[far] = (*place, log_range)
         climb = _Eclipse(Problem(pile.window, starts, pile.background_e), camera)
-        other = climb.solution()
+        other = climb.solution(pile.cost + _RIVAL)
         # One that goes on without an end is not excluded where it has come as far as the pair.
         above = climb.so_far - pile.deviance if other is None else other.cost - pile.cost
         if above > _RIVAL:
@@ -278,8 +278,8 @@ def is_as_bright(
     least_e: float, most_e: float, place: tuple[float, float], at_1_m_px: float, camera: Camera
 ) -> bool:
     """Tell whether pixels of so much light may be of sources, which are as bright at any range."""
-    laid, _ = lay_out(camera, np.array([place[0]]), np.array([place[1]]), np.zeros(1), in_points=True)
-    source_e = math.exp(float(laid.log_flux_at_1_m[0])) / (math.pi * at_1_m_px**2)
+    at_1_m_e = log_flux_at_1_m(camera, direction_camera([place], camera.calibration))
+    source_e = math.exp(float(at_1_m_e[0])) / (math.pi * at_1_m_px**2)
     spread = 1.0 + 4.0 * camera.flux_spread
     return _DIMMEST / spread * source_e < most_e and least_e < _BRIGHTEST * spread * source_e
 
@@ -288,12 +288,15 @@ class _Eclipse(Climb):
     """The fit of spheres to a window, of which nearer ones hide parts of farther ones, from first guesses."""
 
     def __init__(self, problem: Problem, camera: Camera) -> None:
-        fit, self._finer = Fit(problem, camera), finer(camera)
+        fit = Fit(problem, camera)
         super().__init__(fit, camera, fit.values.copy(), fit.layout.most_step, fit.prior)
 
-    def solution(self, *, may_be_bad: bool = False) -> Solution | None:
-        """Return what is likeliest; None where there is no maximum, or no good one unless it `may_be_bad`."""
-        if not self._reach(may_be_bad=may_be_bad):
+    def solution(self, to_beat: float = math.inf, *, may_be_bad: bool = False) -> Solution | None:
+        """Return what is likeliest; None where there is no maximum, or no good one unless it `may_be_bad`.
+
+        Nor where its cost would be greater than `to_beat`.
+        """
+        if not self._reach(to_beat, may_be_bad=may_be_bad):
             return None
         return solutions_of([self._fit], self._camera)[0]
 
@@ -301,31 +304,21 @@ class _Eclipse(Climb):
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
         fit, camera, layout = self._fit, self._camera, self._fit.layout
         own = layout.of_sources(values)
-        by_size = log_range_by_size(own, fit)
-        hidden_px = camera.hidden_px_at_1_m(own[:, :2])
-        hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
-        radius_rad = np.arcsin(np.minimum(camera.radius_m * np.exp(-by_size), 1.0))
+        radius_rad = np.arcsin(np.minimum(camera.radius_m * np.exp(-log_range_by_size(own, fit)), 1.0))
         axis = direction_camera(own[:, :2], camera.calibration)
-        hides = _hides(axis, radius_rad)
-        fineness = np.ones(layout.sources)
-        fineness[hides[:, 1]] = self._finer
-        laid, imaged = lay_out(
-            camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=fineness, in_points=True
-        )
-        fit.log_flux_at_1_m, fit.image_radius_px = laid.log_flux_at_1_m, laid.reach_px
-        flux = np.exp(laid.log_flux_at_1_m - 2.0 * own[:, 2])
-        flux[~imaged] = math.nan  # nowhere to go on to
-        away = [np.empty((0, 3))]
-        for near, far in hides:
-            nodes = slice(*laid.first_node[far : far + 2])
-            offset = np.column_stack([laid.node_u_px[nodes], laid.node_v_px[nodes]])
-            away.append(direction_camera(own[far, :2] + offset, camera.calibration) - axis[near])
         expected = np.empty(self._view.image_e.size)
         jacobian = np.zeros((layout.size, len(expected)))
-        expectation_behind(
-            values, hides, flux, np.concatenate(away), pixel_turn(own[:, :2], camera.calibration), radius_rad,
-            self._view, laid, fit.structure, fit.known, expected, jacobian,
-        )  # fmt: skip
+        seen = None
+        if is_before(axis, radius_rad).all():
+            seen = seen_of_discs(own[:, :2], axis, radius_rad, _hides(axis, radius_rad), camera.calibration)
+        if seen is None:
+            expected[:] = math.nan  # nowhere to go on to
+            return expected, jacobian
+        hidden_px = camera.hidden_px_at_1_m(own[:, :2])
+        hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
+        fit.log_flux_at_1_m, fit.image_radius_px = log_flux_at_1_m(camera, axis, hidden_e), seen.reach_px
+        flux = np.exp(fit.log_flux_at_1_m - 2.0 * own[:, 2])
+        expectation_of_seen(values, flux, seen, self._view, fit.structure, fit.known, expected, jacobian)
         return expected, jacobian
 
 
@@ -337,11 +330,3 @@ def _hides(axis: Array, radius_rad: Array) -> NDArray[np.int64]:
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     return np.argwhere(meet & (rank[:, None] < rank)).astype(np.int64)
-
-
-def finer(camera: Camera) -> float:
-    """Return by how much finer sources are laid out: an edge is sharper than a limb.
-
-    No finer than what a pixel alone smooths asks for.
-    """
-    return min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))

@@ -147,9 +147,8 @@ def test_sigmas_are_the_bound_s() -> None:
 
 
 @pytest.mark.parametrize("more", [[], [(38.4, 22.3, 1.1)]])
-def test_slopes_are_those_of_what_is_expected(more: list[Place], monkeypatch: pytest.MonkeyPatch) -> None:
-    """By differences, of each unknown, of two spheres and of three, one of which hides parts of both others, with nodes
-    so dense and steps so small that hardly one at the edge comes or goes: to 2 %."""
+def test_slopes_are_those_of_what_is_expected(more: list[Place]) -> None:
+    """By differences, of each unknown, of two spheres and of three, one of which hides parts of both others: to .3 %."""
     places = [*_behind(1.5, 2.0, 0.5, 0.7), *more]
     starts = [(u, v, math.log(range_m)) for u, v, range_m in places]
     seen: list[Cluster] = []
@@ -163,7 +162,6 @@ def test_slopes_are_those_of_what_is_expected(more: list[Place], monkeypatch: py
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("perception.robust.explain.pile_of", look)
         detect(frame, CAMERA)
-    monkeypatch.setattr(eclipse, "_FINER", 8.0)
     known = replace(CAMERA, sigma={"range_constant_dn_m2_per_s": 0.1 * CAMERA.range_constant_dn_m2_per_s})
     fit = eclipse._Eclipse(Problem(seen[0].window, starts, BACKGROUND_E), Camera(known, exposure_s, 1.0))
     values = fit._fit.values.copy()
@@ -173,7 +171,7 @@ def test_slopes_are_those_of_what_is_expected(more: list[Place], monkeypatch: py
         step[unknown] = (0.0005, 0.0005, 0.0001, 0.001)[unknown % 4]
         above, below = fit._expectation(values + step)[0], fit._expectation(values - step)[0]
         slope = (above - below) / (2.0 * step[unknown])
-        assert np.linalg.norm(slope - jacobian[unknown]) < 0.02 * np.linalg.norm(slope)
+        assert np.linalg.norm(slope - jacobian[unknown]) < 0.003 * np.linalg.norm(slope)
 
 
 @pytest.mark.parametrize("width", [0.97, 1.0, 1.03])

@@ -1,0 +1,91 @@
+"""The outline of a source's image: the rim of a cap of directions, through the lens, as Fourier series."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.discs.nodes import across_and_down
+
+Array = NDArray[np.float64]
+
+HARMONICS = 7
+AROUND = 2 * HARMONICS + 2  # points of an outline
+_STEPS, _SETTLED = 40, 1e-8  # Newton's, in rad
+
+
+@compiled
+def rims_of(direction: Array, angular_radius_rad: Array) -> tuple[Array, Array, Array]:
+    """Return directions around each cap's rim, shape (caps, `AROUND`, 3), and `across_and_down` of it."""
+    caps = len(direction)
+    rims, across, down = np.empty((caps, AROUND, 3)), np.empty((caps, 3)), np.empty((caps, 3))
+    for cap in range(caps):
+        across[cap], down[cap] = across_and_down(direction[cap, 0], direction[cap, 1], direction[cap, 2])
+        cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
+        for at in range(AROUND):
+            turn = 2.0 * math.pi * at / AROUND
+            for axis in range(3):
+                aside = math.cos(turn) * across[cap, axis] + math.sin(turn) * down[cap, axis]
+                rims[cap, at, axis] = cosine * direction[cap, axis] + sine * aside
+    return rims, across, down
+
+
+@compiled
+def series_of(values: Array) -> Array:
+    """Return the Fourier series through values around a circle: cosines and sines, (1 + harmonics, 2)."""
+    series = np.zeros((1 + HARMONICS, 2))
+    for harmonic in range(1 + HARMONICS):
+        for at in range(AROUND):
+            turn = 2.0 * math.pi * ((harmonic * at) % AROUND) / AROUND
+            series[harmonic, 0] += values[at] * math.cos(turn) * 2.0 / AROUND
+            series[harmonic, 1] += values[at] * math.sin(turn) * 2.0 / AROUND
+    series[0] *= 0.5
+    return series
+
+
+@compiled
+def value_at(series: Array, turn: float) -> tuple[float, float, float]:
+    """Return the value of a Fourier series at an angle, and its first two derivatives."""
+    cosine, sine, c, s = math.cos(turn), math.sin(turn), 1.0, 0.0
+    value, slope, bend = series[0, 0], 0.0, 0.0
+    for harmonic in range(1, 1 + HARMONICS):
+        c, s = c * cosine - s * sine, s * cosine + c * sine
+        here = series[harmonic, 0] * c + series[harmonic, 1] * s
+        value += here
+        slope += harmonic * (series[harmonic, 1] * c - series[harmonic, 0] * s)
+        bend -= harmonic**2 * here
+    return value, slope, bend
+
+
+@compiled
+def extreme(series: Array, turn: float) -> float:
+    """Return the angle of an extreme of a Fourier series near to one; NaN if there is none."""
+    for _ in range(_STEPS):
+        _, slope, bend = value_at(series, turn)
+        step = slope / bend
+        turn -= step
+        if abs(step) < _SETTLED:
+            return turn
+    return math.nan
+
+
+@compiled
+def crossing(series: Array, level: float, above: float, below: float, turn: float) -> float:
+    """Return the angle at which a Fourier series falls through a level, between one above it and one below.
+
+    By Newton's steps, halving where these leave what is left between; NaN if there is none.
+    """
+    for _ in range(_STEPS):
+        value, slope, _ = value_at(series, turn)
+        if value > level:
+            above = turn
+        else:
+            below = turn
+        step = (value - level) / slope
+        if not min(above, below) <= turn - step <= max(above, below):
+            step = turn - 0.5 * (above + below)
+        turn -= step
+        if abs(step) < _SETTLED:
+            return turn
+    return math.nan
