@@ -191,7 +191,7 @@ def lay_out(
 
 
 def log_flux_at_1_m(camera: Camera, direction: Array, hidden_e: Array | None = None) -> Array:
-    """Return ln F₁ in electrons of sources in some directions, shape (n, 3) → (n,); 0 where there is no range.
+    """Return ln F₁ in electrons of sources in directions, shape (n, 3) → (n,); 0 where there is no range.
 
     Less `hidden_e`, what each would take away of the background from one metre.
     """

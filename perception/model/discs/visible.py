@@ -1,9 +1,9 @@
-"""What is seen of spheres' images where nearer ones hide parts of farther ones: in rows, from limb to limb.
+"""What is seen of spheres' images where nearer ones, or an edge, hide parts: in rows, from limb to limb.
 
-A row of a disc is a piece of a line from limb to limb, of which discs before it take away theirs: what is left
-ends on limbs whose places are known exactly. Between the heights at which other limbs come in, or cross, ends
-move smoothly, and few rows (Gauss and Legendre's, in the angle around the height) integrate what is seen; as the
-discs move, what is seen changes along its ends alone.
+A row of a disc is a piece of a line from limb to limb, of which discs before it take away theirs, and a
+straight edge all beyond it: what is left ends in places that are known exactly. Between the heights at which
+other limbs come in, or cross, these ends move smoothly, and few rows (Gauss and Legendre's, in the angle
+around the height) integrate what is seen; as discs move, what is seen changes along its ends alone.
 """
 
 import math
@@ -27,7 +27,10 @@ _ROWS_BASE, _ROWS_SLOPE = 5.0, 4.0
 _MOST_ROWS = 64  # more are of several heights
 _LEAST_HEIGHT_PX = 1e-4
 _MOST_PARTS = 8
-NO_LIMB = -1
+_SIMPSON: Array = np.array([1.0, 4.0, 1.0]) / 6.0
+_LEAST_COSINE = 1e-4  # of an edge's direction: along a row it would end everywhere at once
+NO_LIMB, EDGE = -1, -2
+NO_EDGE: Array = np.full(4, np.nan)
 
 Piece = tuple[float, float, int, int, float, float]
 """Both ends of a piece of a row, whose limbs these are, and how they go aside."""
@@ -57,13 +60,15 @@ class Seen(NamedTuple):
     v_px, ends_px
         Its row, and the columns where it begins and ends, shape (pieces,) and (pieces, 2).
     limb, slope
-        Whose limb each end is, `NO_LIMB` where it goes on there, and by how many columns a limb goes aside
-        from one row to the next, shape (pieces, 2).
+        Whose limb each end is, `EDGE` for the edge, `NO_LIMB` where it goes on there, and by how many columns
+        a limb goes aside from one row to the next, shape (pieces, 2).
     density
         Share of the whole disc's light in a pixel, at both ends and in the middle, shape (pieces, 3): times
         the row's height.
     reach_px
         Radius of each whole image, shape (discs,).
+    edge
+        The edge, as for `seen_of_discs`.
     """
 
     disc: NDArray[np.int64]
@@ -73,10 +78,22 @@ class Seen(NamedTuple):
     slope: Array
     density: Array
     reach_px: Array
+    edge: Array
+
+    @property
+    def shares(self) -> Array:
+        """What share of each disc's light is seen, shape (discs,)."""
+        light = (self.ends_px[:, 1] - self.ends_px[:, 0]) * (self.density @ _SIMPSON)
+        return np.asarray(np.bincount(self.disc, light, minlength=len(self.reach_px)), dtype=np.float64)
 
 
 def seen_of_discs(
-    places_px: Array, direction: Array, radius_rad: Array, hides: NDArray[np.int64], calibration: Calibration
+    places_px: Array,
+    direction: Array,
+    radius_rad: Array,
+    hides: NDArray[np.int64],
+    calibration: Calibration,
+    edge: Array = NO_EDGE,
 ) -> Seen | None:
     """Lay out what is seen of discs, some partly behind others; None where an image is not known so.
 
@@ -88,8 +105,14 @@ def seen_of_discs(
         Which nearer one hides a part of which farther one, shape (pairs, 2).
     calibration
         Intrinsics, point spread and response.
+    edge
+        A place u, v, a direction from there, in rad from u towards v, and how far that way a straight edge
+        lies, at a right angle to it, beyond which nothing is seen of any; by default none.
     """
     smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
+    if abs(math.cos(edge[2])) < _LEAST_COSINE:
+        cosine, sine = math.copysign(_LEAST_COSINE, math.cos(edge[2])), math.sin(edge[2])
+        edge = np.array([edge[0], edge[1], math.atan2(sine, cosine), edge[3]])
     rims, across, down = rims_of(direction, radius_rad)
     with np.errstate(invalid="ignore", divide="ignore"):
         outlines_px = project(rims.reshape(-1, 3), calibration).reshape(-1, AROUND, 2)
@@ -97,7 +120,7 @@ def seen_of_discs(
     bend = np.sqrt(np.maximum(3.0 / direction[:, 2] ** 2 - 2.0, 0.0))
     parts = np.clip(np.ceil(radius_rad * bend / SMOOTH_RAD), 1.0, _MOST_PARTS).astype(np.int64)
     row_disc, of_rows, row, of_pieces, limb, is_known = _pieces(
-        outlines_px, direction, across, down, radius_rad, hides, parts, smooth_px
+        outlines_px, direction, across, down, radius_rad, hides, edge, parts, smooth_px
     )
     if not is_known:
         return None
@@ -111,12 +134,12 @@ def seen_of_discs(
     light = light_from(direction_camera(at_px, calibration), calibration).reshape(-1, 3)
     light_of_rows, light_of_pieces = light[: len(row_disc)], light[len(row_disc) :]
     lengths_px = row_ends_px[:, 1] - row_ends_px[:, 0]
-    of_row = row_height_px * lengths_px * (light_of_rows @ (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0))  # Simpson's
+    of_row = row_height_px * lengths_px * (light_of_rows @ _SIMPSON)
     total = np.bincount(row_disc, of_row, minlength=len(places_px))
     disc = row_disc[row]
     density = light_of_pieces * (row_height_px[row] / total[disc])[:, None]
     reach_px = np.hypot(*(outlines_px - places_px[:, None, :]).transpose(2, 0, 1)).max(axis=1)
-    return Seen(disc, row_v_px[row], ends_px, limb, slope, density, reach_px)
+    return Seen(disc, row_v_px[row], ends_px, limb, slope, density, reach_px, edge)
 
 
 @compiled
@@ -150,35 +173,54 @@ def _is_within(
 
 @compiled
 def _heights(
-    far: int, nearer: NDArray[np.int64], of_v: Array, turns: Array, direction: Array, across: Array,
-    down: Array, radius_rad: Array,
+    far: int, nearer: NDArray[np.int64], of_u: Array, of_v: Array, turns: Array, direction: Array,
+    across: Array, down: Array, radius_rad: Array, edge: Array,
 ) -> Array:  # fmt: skip
     """Return the rows between which the ends of what is seen of a disc move smoothly, top to bottom.
 
     `turns` are at which angles around their rims outlines are highest and lowest, shape (discs, 2).
     """
     top, bottom = value_at(of_v[far], turns[far, 0])[0], value_at(of_v[far], turns[far, 1])[0]
-    events = [top, bottom]
-    for at in range(len(nearer)):
-        near = nearer[at]
-        for end in range(2):
-            if _is_within(direction, across, down, radius_rad, near, turns[near, end], far):
-                events.append(value_at(of_v[near], turns[near, end])[0])
-        for turn in _cut_by(direction, across, down, radius_rad, far, near):
-            if math.isfinite(turn):
-                events.append(value_at(of_v[far], turn)[0])
-        for before in range(at):
-            other = nearer[before]
-            for turn in _cut_by(direction, across, down, radius_rad, near, other):
-                if math.isfinite(turn) and _is_within(direction, across, down, radius_rad, near, turn, far):
-                    events.append(value_at(of_v[near], turn)[0])
-    inside = [min(max(one, top), bottom) for one in events]
-    return np.sort(np.array(inside))
+    limbs, at = [far, far], [turns[far, 0], turns[far, 1]]
+    for one in range(len(nearer)):
+        near = nearer[one]
+        for turn in turns[near]:
+            if _is_within(direction, across, down, radius_rad, near, turn, far):
+                limbs.append(near)
+                at.append(turn)
+        for other in range(one + 1):
+            # What crosses the farther one's limb, and what crosses another before it.
+            crossed = far if other == one else nearer[other]
+            for turn in _cut_by(direction, across, down, radius_rad, near, crossed):
+                if crossed == far or _is_within(direction, across, down, radius_rad, near, turn, far):
+                    limbs.append(near)
+                    at.append(turn)
+    for turn in _on_edge(of_u[far], of_v[far], edge):
+        limbs.append(far)
+        at.append(turn)
+    rows = np.array([value_at(of_v[limbs[event]], at[event])[0] for event in range(len(at))])
+    return np.sort(np.minimum(np.maximum(rows[np.isfinite(rows)], top), bottom))
+
+
+@compiled
+def _on_edge(of_u: Array, of_v: Array, edge: Array) -> tuple[float, float]:
+    """Return at which angles an outline crosses an edge; NaN if it does not."""
+    cosine, sine = math.cos(edge[2]), math.sin(edge[2])
+    beyond = cosine * of_u + sine * of_v
+    level = cosine * edge[0] + sine * edge[1] + edge[3]
+    farthest = extreme(beyond, math.atan2(beyond[1, 1], beyond[1, 0]))
+    nearest = extreme(beyond, math.atan2(-beyond[1, 1], -beyond[1, 0]))
+    if not value_at(beyond, nearest)[0] < level < value_at(beyond, farthest)[0]:
+        return math.nan, math.nan
+    one_way = (nearest - farthest) % (2.0 * math.pi)
+    first = crossing(beyond, level, farthest, farthest + one_way, farthest + 0.5 * one_way)
+    other_way = one_way - 2.0 * math.pi
+    return first, crossing(beyond, level, farthest, farthest + other_way, farthest + 0.5 * other_way)
 
 
 @compiled
 def _ends_of(of_u: Array, of_v: Array, turns: Array, v_px: float) -> tuple[float, float, float, float]:
-    """Return where a row meets an outline, left and right, and how these places go aside; all 0 if nowhere."""
+    """Return where a row meets an outline, left and right, and how these places go aside; 0 if nowhere."""
     highest, lowest = turns[0], turns[1]
     top, bottom = value_at(of_v, highest)[0], value_at(of_v, lowest)[0]
     if not top < v_px < bottom:
@@ -199,13 +241,28 @@ def _ends_of(of_u: Array, of_v: Array, turns: Array, v_px: float) -> tuple[float
 
 
 @compiled
+def _beyond_edge(edge: Array, v_px: float) -> tuple[float, float, float, float]:
+    """Return where what lies beyond an edge begins and ends on a row, and how these places go aside."""
+    cosine, sine = math.cos(edge[2]), math.sin(edge[2])
+    at_px = edge[0] + (edge[3] - (v_px - edge[1]) * sine) / cosine
+    if cosine > 0.0:
+        return at_px, math.inf, -sine / cosine, 0.0
+    return -math.inf, at_px, 0.0, -sine / cosine
+
+
+@compiled
 def _left_of(
-    whole: Piece, disc: int, v_px: float, nearer: NDArray[np.int64], of_u: Array, of_v: Array, turns: Array
+    whole: Piece, v_px: float, nearer: NDArray[np.int64], of_u: Array, of_v: Array, turns: Array, edge: Array
 ) -> list[Piece]:
-    """Return what nearer ones leave of a row of a disc, from left to right."""
+    """Return what nearer ones and an edge leave of a row of a disc, from left to right."""
     seen = [whole]
-    for near in nearer:
-        left, right, left_slope, right_slope = _ends_of(of_u[near], of_v[near], turns[near], v_px)
+    for at in range(len(nearer) + 1):
+        if at < len(nearer):
+            near = nearer[at]
+            left, right, left_slope, right_slope = _ends_of(of_u[near], of_v[near], turns[near], v_px)
+        else:
+            near = EDGE
+            left, right, left_slope, right_slope = _beyond_edge(edge, v_px)
         if not left < right:
             continue
         rest = seen[:0]
@@ -222,9 +279,18 @@ def _left_of(
 
 
 @compiled
+def _length_px(height_px: float, v_px: float, of_u: Array, of_v: Array, turns: Array, edge: Array) -> float:
+    """Return how long is what ends in rows of a height about a middle one: an edge, where it runs there."""
+    left, right, _, _ = _ends_of(of_u, of_v, turns, v_px)
+    begin, end, _, _ = _beyond_edge(edge, v_px)
+    runs_there = left < begin < right or left < end < right
+    return height_px / abs(math.cos(edge[2])) if runs_there else height_px
+
+
+@compiled
 def _pieces(
     outlines_px: Array, direction: Array, across: Array, down: Array, radius_rad: Array,
-    hides: NDArray[np.int64], parts: NDArray[np.int64], smooth_px: float,
+    hides: NDArray[np.int64], edge: Array, parts: NDArray[np.int64], smooth_px: float,
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, NDArray[np.int64], bool]:  # fmt: skip
     """Return rows of whole discs, pieces of them that are seen, and whether all outlines are known.
 
@@ -245,12 +311,14 @@ def _pieces(
     piece_row, of_pieces, limbs = [0][:0], [0.0][:0], [0][:0]
     for disc in range(discs if is_known else 0):
         nearer = hides[hides[:, 1] == disc, 0]
-        heights = _heights(disc, nearer, of_v, turns, direction, across, down, radius_rad)
+        heights = _heights(disc, nearer, of_u, of_v, turns, direction, across, down, radius_rad, edge)
         for panel in range(len(heights) - 1):
             height_px = heights[panel + 1] - heights[panel]
             if height_px < _LEAST_HEIGHT_PX:
                 continue
-            more = _ROWS_SLOPE * 0.5 * height_px / smooth_px
+            middle_px = 0.5 * (heights[panel] + heights[panel + 1])
+            length_px = _length_px(height_px, middle_px, of_u[disc], of_v[disc], turns[disc], edge)
+            more = _ROWS_SLOPE * 0.5 * length_px / smooth_px
             times = math.ceil(more / (_MOST_ROWS - _ROWS_BASE))
             rows = math.ceil(_ROWS_BASE + more / times)
             for at in range(times * rows):
@@ -263,7 +331,7 @@ def _pieces(
                 of_rows.extend((v_px, height_px * share / times, left, right))
                 whole = (left, right, disc, disc, left_slope, right_slope)
                 for begin, end, limb, end_limb, slope, end_slope in _left_of(
-                    whole, disc, v_px, nearer, of_u, of_v, turns
+                    whole, v_px, nearer, of_u, of_v, turns, edge
                 ):
                     part_px = (end - begin) / parts[disc]
                     for part in range(parts[disc]):

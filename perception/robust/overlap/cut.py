@@ -1,8 +1,8 @@
 """A resolved source partly behind a body with a straight edge, such as another robot's column.
 
-A whole disc does not explain what is seen of it: nothing does, or pieces that seem far away. Here each
-quadrature node counts by how much of it lies on the lit side of a line of free place and direction; how
-bright the source is and how its limb bends still tell how far it is.
+A whole disc does not explain what is seen of it: nothing does, or pieces that seem far away. Here it is seen
+as far as a straight line of free place and direction; how bright the source is and how its limb bends still
+tell how far it is.
 """
 
 import math
@@ -14,14 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import image_radius_px
-from perception.model.layout import Sources
-from perception.model.spread import spread_nodes
-from perception.model.window import Camera, lay_out
+from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
-from perception.robust.fit import Fit, log_range_by_size
+from perception.robust.fit import Fit
 from perception.robust.overlap.climb import Climb, good_ones
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
-from perception.robust.overlap.eclipse import is_as_bright, lit_pixels
+from perception.robust.overlap.eclipse import expectation_of_spheres, is_as_bright, lit_pixels
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
 from perception.robust.problem import Problem
@@ -32,8 +30,6 @@ Array = NDArray[np.float64]
 Guess = tuple[float, float, float, float, float]
 """u, v, ln range, the line's direction, and how far it lies that way from (u, v)."""
 
-_FINER = 2.0  # are the nodes of what is hidden in part
-_RAMP_PX = 0.4  # over so much what is hidden begins: about as far as nodes lie apart
 _DIRECTIONS = 16  # of the line, first guesses
 _TRIED, _GOOD = 7, 2
 _MOSTLY_SEEN = 0.8  # of the radius, up to the line: first guess where a whole disc explains most
@@ -140,11 +136,7 @@ class _Cut(Climb):
     def __init__(self, cluster: Cluster, guess: Guess, camera: Camera) -> None:
         u_px, v_px, log_range, turn, edge_px = guess
         problem = Problem(cluster.window, [(u_px, v_px, log_range)], cluster.background_e)
-        fit, self._finer, self._from = (
-            Fit(problem, camera),
-            np.array([_finer(camera)]),
-            np.array([u_px, v_px]),
-        )
+        fit, self._from = Fit(problem, camera), (u_px, v_px)
         size = fit.layout.size
         prior = np.diag([*np.zeros(size), _LOOSE, _LOOSE])
         prior[:size, :size] = fit.prior
@@ -166,86 +158,8 @@ class _Cut(Climb):
 
     def _expectation(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
-        fit, known, layout = self._fit, self._fit.known, self._fit.layout
-        own = layout.of_sources(values[: layout.size])
-        background_e = float(values[layout.background])
-        by_size = log_range_by_size(own, fit)
-        hidden_px = self._camera.hidden_px_at_1_m(own[:, :2])
-        hidden_e = None if hidden_px is None else hidden_px * max(background_e, 0.0)
-        sigma_px = known.psf_sigma_px
-        if layout.has_width:
-            sigma_px *= math.exp(known.width_spread * float(values[layout.width]))
-        laid, imaged = lay_out(
-            self._camera, own[:, 0], own[:, 1], by_size, hidden_e, finer=self._finer, in_points=True
-        )
-        fit.log_flux_at_1_m[0], fit.image_radius_px[0] = laid.log_flux_at_1_m[0], laid.reach_px[0]
-        flux = math.exp(float(laid.log_flux_at_1_m[0]) - 2.0 * float(own[0, 2]))
-        flux = flux if imaged[0] else math.nan  # nowhere to go on to
-        seen, changes = self._seen_part(laid, own[0], float(values[-2]), float(values[-1]), sigma_px)
-        image = self._spread(seen, own[0], sigma_px)
-        jacobian = np.zeros((len(values), fit.window.image_e.size))
-        beside = slice(layout.background + 1, layout.size)
-        jacobian[layout.background] = 1.0
-        jacobian[beside] = fit.structure.columns
-        expected = background_e + self._view.known_e.ravel() + values[beside] @ fit.structure.columns
-        expected = expected + flux * image[0]
-        grown = image[3] + changes[2]
-        jacobian[:2] = flux * (image[1:3] + changes[:2])
-        jacobian[2] = -flux * (2.0 * image[0] + grown)
-        if layout.has_slack:
-            jacobian[3] = known.tie_spread * flux * grown
-        if layout.has_width:
-            jacobian[layout.width] = known.width_spread * flux * image[4]
-        jacobian[-2:] = flux * changes[3:]
+        size = self._fit.layout.size
+        edge = np.array([*self._from, *values[size:]])
+        expected, jacobian, seen = expectation_of_spheres(values, self._fit, self._camera, edge)
+        self._seen = math.nan if seen is None else float(seen.shares[0])
         return expected, jacobian
-
-    def _seen_part(
-        self, laid: Sources, own: Array, turn: float, edge_px: float, sigma_px: float
-    ) -> tuple[Sources, Array]:
-        """Return what lies on the lit side of the line, and how that changes.
-
-        The changes, shape (5, pixels), are by column, row and ln size of the source, and by the line's
-        direction and place.
-        """
-        away, beside = np.array([math.cos(turn), math.sin(turn)]), np.array([-math.sin(turn), math.cos(turn)])
-        offset = np.column_stack([laid.node_u_px, laid.node_v_px])
-        place = own[:2] - self._from + offset
-        stands_out = 0.5 + (edge_px - place @ away) / _RAMP_PX
-        self._seen = float(np.sum(laid.weight * np.clip(stands_out, 0.0, 1.0)) / np.sum(laid.weight))
-        ramp = (stands_out > 0.0) & (stands_out < 1.0)
-        edge, light = _chosen(laid, ramp), laid.weight[ramp] / _RAMP_PX
-        by_place, by_size, by_turn = (
-            self._spread(edge._replace(weight=light * factor), own, sigma_px)[0]
-            for factor in (np.ones(len(light)), (offset @ away)[ramp], (place @ beside)[ramp])
-        )
-        seen = laid._replace(weight=laid.weight * np.clip(stands_out, 0.0, 1.0))
-        return seen, np.stack([-away[0] * by_place, -away[1] * by_place, -by_size, -by_turn, by_place])
-
-    def _spread(self, laid: Sources, own: Array, sigma_px: float) -> Array:
-        """Return shares of light in each pixel, and derivatives, as `spread_nodes`; shape (5, pixels)."""
-        image = np.zeros((5, *self._fit.window.image_e.shape))
-        place = (float(own[0]) - self._view.left, float(own[1]) - self._view.top)
-        spread_nodes(laid, 0, place, 1.0, (0.0, 0.0), sigma_px, image)
-        return image.reshape(5, -1)
-
-
-def _chosen(laid: Sources, which: NDArray[np.bool_]) -> Sources:
-    """Return some of the nodes of a source."""
-    return laid._replace(
-        first_node=np.array([0, int(which.sum())]),
-        node_u_px=laid.node_u_px[which],
-        node_v_px=laid.node_v_px[which],
-        half_px=laid.half_px[which],
-        tilt=laid.tilt[which],
-        bend=laid.bend[which],
-        node_along=laid.node_along[which],
-        weight=laid.weight[which],
-    )
-
-
-def _finer(camera: Camera) -> float:
-    """Return by how much finer sources are laid out: an edge is sharper than a limb.
-
-    No finer than what a pixel alone smooths asks for.
-    """
-    return min(_FINER, math.sqrt(12.0 * camera.calibration.psf_sigma_px**2 + 1.0))

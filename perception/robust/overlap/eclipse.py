@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
-from perception.model.discs.visible import seen_of_discs
+from perception.model.discs.visible import NO_EDGE, Seen, seen_of_discs
 from perception.model.flare import image_radius_px, is_before
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera, log_flux_at_1_m
@@ -302,24 +302,49 @@ class _Eclipse(Climb):
 
     def _expectation(self, values: Array) -> tuple[Array, Array]:
         """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
-        fit, camera, layout = self._fit, self._camera, self._fit.layout
-        own = layout.of_sources(values)
-        radius_rad = np.arcsin(np.minimum(camera.radius_m * np.exp(-log_range_by_size(own, fit)), 1.0))
-        axis = direction_camera(own[:, :2], camera.calibration)
-        expected = np.empty(self._view.image_e.size)
-        jacobian = np.zeros((layout.size, len(expected)))
-        seen = None
-        if is_before(axis, radius_rad).all():
-            seen = seen_of_discs(own[:, :2], axis, radius_rad, _hides(axis, radius_rad), camera.calibration)
-        if seen is None:
-            expected[:] = math.nan  # nowhere to go on to
-            return expected, jacobian
-        hidden_px = camera.hidden_px_at_1_m(own[:, :2])
-        hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
-        fit.log_flux_at_1_m, fit.image_radius_px = log_flux_at_1_m(camera, axis, hidden_e), seen.reach_px
-        flux = np.exp(fit.log_flux_at_1_m - 2.0 * own[:, 2])
-        expectation_of_seen(values, flux, seen, self._view, fit.structure, fit.known, expected, jacobian)
+        expected, jacobian, _ = expectation_of_spheres(values, self._fit, self._camera)
         return expected, jacobian
+
+
+def expectation_of_spheres(
+    values: Array, fit: Fit, camera: Camera, edge: Array = NO_EDGE
+) -> tuple[Array, Array, Seen | None]:
+    """Return λ, its derivatives, and what is seen of spheres, some before others, or partly behind an edge.
+
+    Lays the fit's images out anew. NaN and None where not all are imaged: there is nowhere to go on to.
+
+    Parameters
+    ----------
+    values
+        Unknowns, those of the fit, and of an edge its direction and place after them.
+    fit, camera
+        The fit and its camera.
+    edge
+        As for `seen_of_discs`.
+
+    Returns
+    -------
+    Shapes (pixels,) and (unknowns, pixels); and what is seen.
+    """
+    layout = fit.layout
+    own = layout.of_sources(values[: layout.size])
+    radius_rad = np.arcsin(np.minimum(camera.radius_m * np.exp(-log_range_by_size(own, fit)), 1.0))
+    axis = direction_camera(own[:, :2], camera.calibration)
+    expected = np.empty(fit.window.image_e.size)
+    jacobian = np.zeros((len(values), len(expected)))
+    seen = None
+    if is_before(axis, radius_rad).all():
+        hides = _hides(axis, radius_rad)
+        seen = seen_of_discs(own[:, :2], axis, radius_rad, hides, camera.calibration, edge)
+    if seen is None:
+        expected[:] = math.nan
+        return expected, jacobian, None
+    hidden_px = camera.hidden_px_at_1_m(own[:, :2])
+    hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
+    fit.log_flux_at_1_m, fit.image_radius_px = log_flux_at_1_m(camera, axis, hidden_e), seen.reach_px
+    flux = np.exp(fit.log_flux_at_1_m - 2.0 * own[:, 2])
+    expectation_of_seen(values, flux, seen, fit.window.view, fit.structure, fit.known, expected, jacobian)
+    return expected, jacobian, seen
 
 
 def _hides(axis: Array, radius_rad: Array) -> NDArray[np.int64]:

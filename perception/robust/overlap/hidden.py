@@ -1,7 +1,7 @@
-"""What pixels expect of spheres that hide parts of each other: compiled.
+"""What pixels expect of spheres that hide parts of each other, or are partly behind an edge: compiled.
 
-What is seen of each is laid out in pieces of rows (`model.discs.visible`); it changes where these end, with the
-sphere whose limb that is.
+What is seen of each is laid out in pieces of rows (`model.discs.visible`); it changes where these end, with
+the sphere whose limb that is, or the edge.
 """
 
 import math
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.discs.visible import NO_LIMB, Seen
+from perception.model.discs.visible import EDGE, NO_LIMB, Seen
 from perception.model.layout import Known, Structure, View
 from perception.model.normal import shares, strip_shares
 from perception.model.spread import LEAST_STRIP
@@ -28,7 +28,8 @@ def expectation_of_seen(
     Parameters
     ----------
     values, view, structure, known
-        As there; nothing moves.
+        As there; nothing moves. Where there is an edge its direction and how far it lies that way are the
+        last two unknowns.
     flux
         Of each sphere, were it whole, shape (sources,).
     seen
@@ -78,13 +79,21 @@ def expectation_of_seen(
             if limb == NO_LIMB:
                 continue
             at_px = seen.ends_px[piece, end]
-            edge_e = flux[disc] * seen.density[piece, 2 * end] * (2.0 * end - 1.0)
+            by_u = flux[disc] * seen.density[piece, 2 * end] * (2.0 * end - 1.0)
+            left, right = shares(at_px - view.left, columns, sigma_px, across)
+            if limb == EDGE:
+                cosine, sine = math.cos(seen.edge[2]), math.sin(seen.edge[2])
+                beside_px = (v_px - seen.edge[1]) * cosine - (at_px - seen.edge[0]) * sine
+                for row in range(top, bottom):
+                    for column in range(left, right):
+                        light = by_u / cosine * down[0, row] * across[0, column]
+                        slopes[-2, row, column] -= beside_px * light
+                        slopes[-1, row, column] += light
+                continue
             # The limb's place on the row, as its sphere goes aside, down, or grows.
             own = limb * step
-            out_u, out_v = at_px - values[own], v_px - values[own + 1]
-            by_u, by_v = edge_e, -edge_e * seen.slope[piece, end]
-            grown = by_u * out_u + by_v * out_v
-            left, right = shares(at_px - view.left, columns, sigma_px, across)
+            by_v = -by_u * seen.slope[piece, end]
+            grown = by_u * (at_px - values[own]) + by_v * (v_px - values[own + 1])
             for row in range(top, bottom):
                 for column in range(left, right):
                     share = down[0, row] * across[0, column]

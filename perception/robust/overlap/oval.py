@@ -156,8 +156,8 @@ def _first_guess(flares: Solution, light: Array) -> Array:
     """Return u, v, ln flux, ln size, both parts of the axes, background of what has an image's moments.
 
     The size is relative to the larger flare's; the image of a disc has a quarter of its radius squared as the
-    variance of its light along each axis. What is above the diagonal of the matrix that makes it of a round one
-    (`_image`) are, by Cholesky's method from below, the roots of that.
+    variance of its light along each axis. The matrix that makes it of a round one (`_image`) is, by
+    Cholesky's method from below, the root of that.
     """
     box = flares.window.box
     rows, columns = np.mgrid[: light.shape[0], : light.shape[1]]
