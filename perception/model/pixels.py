@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 MOST_STEPS, LEAST_PIVOT = 50, 1e-10
+# Whether a climb is hopeless is judged after so many steps: ahead is, in -2 ln L, at most so much more than
+# so many times what is to be had to first order.
+JUDGED_AFTER, MORE_TO_GAIN, TIMES_TO_GAIN = 4, 10.0, 3.0
 LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
 
 
@@ -303,7 +306,7 @@ def is_inside(values: Array, view: View, count: int, step: int) -> bool:
 @compiled
 def maximise(
     view: View, sources: Sources, structure: Structure, known: Known, precision: Array, most_step: Array,
-    values: Array, covariance: Array, expected: Array,
+    to_beat: float, values: Array, covariance: Array, expected: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Find the unknowns that make what a window shows likeliest, by Fisher scoring with Levenberg's damping.
 
@@ -314,6 +317,8 @@ def maximise(
     precision, most_step
         Of the unknowns: a priori, shape (unknowns, unknowns), and how far they may move at once, shape
         (unknowns,) (`layout.Layout`).
+    to_beat
+        -2 ln L: where all that is ahead is sure to be less likely, the climb is given up.
     values
         First values, shape (unknowns,); the estimates are written there.
     covariance, expected
@@ -322,7 +327,7 @@ def maximise(
     Returns
     -------
     −2 ln L, priors included, but for a constant of the data, and ln of the determinant of information and
-    priors; both infinite where no step below a hundredth of a standard deviation was reached.
+    priors; both infinite where no step below a hundredth of a standard deviation was reached, or none tried.
     """
     size, pixels, count = len(values), len(expected), len(sources.log_range_at)
     step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
@@ -330,7 +335,7 @@ def maximise(
     new_expected, variance, new_variance = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     gradient, trial, clip_e = np.empty(size), np.empty(size), known.clip_e
     fisher, inverse, damped = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
-    damping, is_new, log_det, before = FIRST_DAMPING, True, 0.0, 0.0
+    damping, is_new, log_det, before, taken = FIRST_DAMPING, True, 0.0, 0.0, 0
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
     for _ in range(MOST_STEPS):
         if is_new:
@@ -338,15 +343,21 @@ def maximise(
             log_det = inverted(fisher, inverse)
             if math.isnan(log_det):
                 return math.inf, math.inf
-            settled = True
-            for one in range(count * step):
+            settled, to_gain = True, 0.0
+            for one in range(size):
                 free_step = 0.0
                 for other in range(size):
                     free_step += inverse[one, other] * gradient[other]
-                settled &= abs(free_step) <= SETTLED_SIGMAS * math.sqrt(inverse[one, one])
+                if one < count * step:
+                    settled &= abs(free_step) <= SETTLED_SIGMAS * math.sqrt(inverse[one, one])
+                to_gain += free_step * gradient[one]
             if settled:
                 break
             before = objective(view, values, expected, variance, precision, clip_e)
+            if taken >= JUDGED_AFTER and math.isfinite(to_beat):
+                ahead = MORE_TO_GAIN + TIMES_TO_GAIN * to_gain
+                if before + log_variances(view, variance) - ahead > to_beat:
+                    return math.inf, math.inf
         for one in range(size):
             damped[one] = fisher[one]
             damped[one, one] *= 1.0 + damping
@@ -368,7 +379,7 @@ def maximise(
             values[:], expected[:] = trial, new_expected
             jacobian, new_jacobian = new_jacobian, jacobian
             variance, new_variance = new_variance, variance
-            damping = max(0.1 * damping, LEAST_DAMPING)
+            damping, taken = max(0.1 * damping, LEAST_DAMPING), taken + 1
         else:
             damping *= 10.0
             if not damping < MOST_DAMPING:

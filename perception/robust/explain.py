@@ -39,13 +39,14 @@ from perception.robust.overlap.eclipse import eclipses, pile_of
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import is_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
-from perception.robust.overlap.rivals import weighed
+from perception.robust.overlap.rivals import NO_RIVAL, weighed
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, likely_starts, solve
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
+_GOOD_SIGMAS = 10.0  # of χ²: two good explanations of a window differ by less
 _ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
 
@@ -102,7 +103,11 @@ def _piles(
             if pile is not None and pile.left_over.is_nothing:
                 piles[index] = pile
     lone = [one if index in piles else None for index, one in enumerate(plain)]
-    for index, line in moving(lone, camera).items():
+    to_beat = {
+        index: pile.deviance + _GOOD_SIGMAS * math.sqrt(2.0 * pile.expected_e.size)
+        for index, pile in piles.items()
+    }
+    for index, line in moving(lone, camera, to_beat).items():
         if line.motion_px is not None and line.left_over.is_good:
             del piles[index]
     return piles
@@ -145,7 +150,8 @@ def _explained(
         for several in (piles, pairs):
             _take_up(several, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
-        known = _take_lines(chosen, plain, halos, without_spill(plain, prepared, camera), camera)
+        spilled = without_spill(plain, prepared, camera)
+        known = _take_lines(chosen, plain, halos, spilled, _to_beat(parted), camera)
         _drop_beside_lines(chosen, parted, halos, prepared.shape, camera, cut_short)
     retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
@@ -167,7 +173,7 @@ def _explained(
     if prepared.frame.line_time_s == 0.0:
         highlit = _beside_highlights(found, at_rest, chosen, parted, prepared.shape, camera)
         _adopt(likelier_beside_highlights(highlit, chosen, parted), chosen, parted, uneven_e)
-    retry_on_uneven_ground(chosen, uneven_e, camera)
+    retry_on_uneven_ground(chosen, uneven_e, _to_beat(parted), camera)
     for index, more in parted.items():
         chosen[index] = _better(more, chosen[index])
     for index, pair in rivals.items():
@@ -180,6 +186,11 @@ def _explained(
         if one is not None and asks_for_more(one):
             chosen[index] = replace(one, may_be_more=True)
     return chosen
+
+
+def _to_beat(parted: Mapping[int, Solution]) -> dict[int, float]:
+    """Return by index which -2 ln L lets a rival of what is certain to explain a window matter."""
+    return {index: more.cost + NO_RIVAL for index, more in parted.items()}
 
 
 def _take_up(others: Mapping[int, Solution], parted: dict[int, Solution], shape: tuple[int, int]) -> None:
@@ -215,6 +226,7 @@ def _take_lines(
     plain: Sequence[Solution | None],
     halos: dict[int, Solution],
     without_spill: Mapping[int, Solution],
+    to_beat: Mapping[int, float],
     camera: Camera,
 ) -> list[Solution | None]:
     """Choose flares that move where they explain more than flares at rest; both with their halos, if any.
@@ -223,7 +235,7 @@ def _take_lines(
     are those of what is returned: of lines where these were chosen, else of `plain`.
     """
     known = list(plain)
-    lines = moving(plain, camera)
+    lines = moving(plain, camera, to_beat)
     tried = {index: one for index, one in lines.items() if one.motion_px is not None and index in halos}
     of_lines = with_halo(tried, camera)
     for index, line in lines.items():

@@ -1,7 +1,7 @@
 """Flares that are drawn out, as they move while they are exposed: rivals of round ones and of pairs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,15 @@ AT_REST = (0.0, 0.0)
 """A fit that begins so stays so: to first order a motion changes nothing."""
 
 
-def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
+def moving(
+    solutions: Sequence[Solution | None], camera: Camera, to_beat: Mapping[int, float] | None = None
+) -> dict[int, Solution]:
     """Fit flares that are longer than wide as moving ones, and return by index the likelier of both.
 
     Lone ones where the residual says so; of several in one window, where it asks for more. The sigmas of what
-    is returned know of the other.
+    is returned know of the other. None that is sure to be less likely than `to_beat` says, −2 ln L by index.
     """
+    least = to_beat or {}
     tried: list[tuple[int, Solution]] = []
     problems = []
     for index, solution in enumerate(solutions):
@@ -49,7 +52,10 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
             continue
         if any(motion != AT_REST for motion in motions):
             tried.append((index, solution))
-            problems.append(Problem(solution.window, solution.starts, solution.background_e, motions))
+            window, background_e = solution.window, solution.background_e
+            problems.append(
+                Problem(window, solution.starts, background_e, motions, least.get(index, math.inf))
+            )
     fits = solve(problems, camera)
     return {
         index: weighed(fit, at_rest) if fit.cost < at_rest.cost else weighed(at_rest, fit)

@@ -1,5 +1,6 @@
 """What is to be fitted: a window, what may lie in it, and first guesses of its flares."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -79,9 +80,13 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A window, first guesses of its flares, of its background, and of how each moves; None: none does."""
+    """A window, first guesses of its flares, of its background, and of how each moves; None: none does.
+
+    `to_beat` is −2 ln L of a fit that is worth no further step if it is sure to be less likely.
+    """
 
     window: Window
     starts: Sequence[Start]
     background_e: float
     motions: Sequence[Motion] | None = None
+    to_beat: float = math.inf

@@ -1,7 +1,7 @@
 """Flares fitted again where what is left over has no shape: uneven ground, charge that was spilled."""
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,10 +30,13 @@ _WIDTHS_OF_DISC = (0.5, 1.0)
 """Of what is clipped, first guesses: a disc is as wide, the image of a point is so by its point spread."""
 
 
-def retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:
+def retry_on_uneven_ground(
+    best: list[Solution | None], uneven_e: Sequence[float], to_beat: Mapping[int, float], camera: Camera
+) -> None:
     """Fit again where something lies around the flares: edges, of the strength that plain fits leave over.
 
-    What is too sharp even for them counts as noise of the window.
+    What is too sharp even for them counts as noise of the window. Nothing is left of what is sure to be less
+    likely than `to_beat` says, −2 ln L by index.
     """
     for is_noise in (False, True):
         tried, problems = [], []
@@ -50,7 +53,7 @@ def retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float
             else:
                 continue
             tried.append(index)
-            problems.append(solution.again(window))
+            problems.append(solution.again(window, to_beat.get(index, math.inf)))
         for index, again in zip(tried, solve(problems, camera), strict=True):
             best[index] = again
 

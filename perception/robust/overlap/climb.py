@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from perception.model.pixels import (
     FIRST_DAMPING,
+    JUDGED_AFTER,
     LEAST_DAMPING,
+    MORE_TO_GAIN,
     MOST_DAMPING,
+    TIMES_TO_GAIN,
     inverted,
     is_inside,
     log_variances,
@@ -32,9 +35,7 @@ Array = NDArray[np.float64]
 _MOST_STEPS = 30  # what is of another shape goes on without an end
 # In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
 _SETTLED = 0.02
-JUDGED_AFTER = 4  # steps
 _MOST_GIVEN_UP = 3  # guesses, from the likeliest on, after which none of the others comes to anything
-MORE_TO_GAIN, TIMES_TO_GAIN = 10.0, 3.0  # in −2 ln L, over what is to be had to first order
 
 
 def good_ones(
