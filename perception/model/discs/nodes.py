@@ -132,7 +132,7 @@ def fineness_of(
 
 def along_lines(still: DiscNodes, length: Array) -> DiscNodes:
     """Return each source's nodes again for each node of its line, of a length relative to the smoothing."""
-    rules = [_line_rule(math.ceil(_LINE_BASE + _LINE_SLOPE * one)) for one in length.tolist()]
+    rules = [line_rule(one) for one in length.tolist()]
     parts = [slice(first, end) for first, end in zip(still.first[:-1], still.first[1:], strict=True)]
     both = list(zip(parts, rules, strict=True))
     times = [len(along) for along, _ in rules]
@@ -150,6 +150,14 @@ def along_lines(still: DiscNodes, length: Array) -> DiscNodes:
         np.concatenate([np.repeat(along, part.stop - part.start) for part, (along, _) in both]),
         np.concatenate([np.outer(weight, still.weight[part]).ravel() for part, (_, weight) in both]),
     )
+
+
+def line_rule(length: float) -> tuple[Array, Array]:
+    """Return where on a line, from -½ to ½, images that move so far relative to the smoothing are looked at.
+
+    And the weight of each, of sum 1.
+    """
+    return _line_rule(math.ceil(_LINE_BASE + _LINE_SLOPE * length))
 
 
 @lru_cache(maxsize=64)

@@ -19,9 +19,10 @@ from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit
 from perception.robust.overlap.climb import Climb, good_ones
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
-from perception.robust.overlap.eclipse import expectation_of_spheres, is_as_bright, lit_pixels
+from perception.robust.overlap.eclipse import is_as_bright, lit_pixels
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
+from perception.robust.overlap.spheres import expectation_of_spheres
 from perception.robust.problem import Problem
 from perception.robust.solve import Solution, solutions_of
 

@@ -14,17 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
-from perception.model.discs.visible import NO_EDGE, Seen, seen_of_discs
-from perception.model.flare import image_radius_px, is_before
+from perception.model.flare import image_radius_px
 from perception.model.layout import UNUSABLE
 from perception.model.window import Camera, log_flux_at_1_m
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
-from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import MODEL_ERROR
-from perception.robust.overlap.climb import Climb, good_ones
+from perception.robust.overlap.climb import good_ones
 from perception.robust.overlap.covered import shows_its_size
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
-from perception.robust.overlap.hidden import expectation_of_seen
 from perception.robust.overlap.outlines import discs_by_outline
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
@@ -39,8 +36,9 @@ from perception.robust.overlap.pairs import (
     longer_chi2,
     meeting,
 )
+from perception.robust.overlap.spheres import Spheres
 from perception.robust.problem import Problem, Start
-from perception.robust.solve import Solution, solutions_of
+from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
 
@@ -51,7 +49,6 @@ _TRIED = 2
 _BESIDE_PX = 2.0
 _NEARLY = 1.0  # of 2 Δ ln L: of what is hardly seen the nodes come and go
 _MOST_MORE = 2  # flares than outline and blobs show
-_MEET = 1.1  # times the sum of their radii two may be apart, and one hide a little of the other
 # Of what is lit, over the brightness of sources: where clipped it seems dimmer.
 _DIMMEST, _BRIGHTEST = 0.5, 1.5
 
@@ -129,7 +126,7 @@ def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> So
         return None
     shown = len(starts)
     for more in range(1 + most_more):
-        climb = _Eclipse(Problem(cluster.window, starts, cluster.background_e), camera)
+        climb = Spheres(Problem(cluster.window, starts, cluster.background_e), camera)
         pile = climb.solution(may_be_bad=more < most_more)
         if pile is None:
             return None
@@ -173,9 +170,9 @@ def _by_both_ends(
         for each in (one, more)
         if each is not None and (of_layouts or each.count == 2) and is_near(each, least_radius_px(camera))
     ]
-    fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
+    fits = [Spheres(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
     fits.sort(key=lambda fit: fit.objective)
-    fits = [_Eclipse(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
+    fits = [Spheres(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
     return good_ones((fit.solution() for fit in fits), partial(_is_good, camera=camera), _TRIED)
 
 
@@ -195,7 +192,7 @@ def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
         inwards = float(pile.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
         starts[far] = (*place, log_range)
-        climb = _Eclipse(Problem(pile.window, starts, pile.background_e), camera)
+        climb = Spheres(Problem(pile.window, starts, pile.background_e), camera)
         other = climb.solution(pile.cost + _RIVAL)
         # One that goes on without an end is not excluded where it has come as far as the pair.
         above = climb.so_far - pile.deviance if other is None else other.cost - pile.cost
@@ -282,76 +279,3 @@ def is_as_bright(
     source_e = math.exp(float(at_1_m_e[0])) / (math.pi * at_1_m_px**2)
     spread = 1.0 + 4.0 * camera.flux_spread
     return _DIMMEST / spread * source_e < most_e and least_e < _BRIGHTEST * spread * source_e
-
-
-class _Eclipse(Climb):
-    """The fit of spheres to a window, of which nearer ones hide parts of farther ones, from first guesses."""
-
-    def __init__(self, problem: Problem, camera: Camera) -> None:
-        fit = Fit(problem, camera)
-        super().__init__(fit, camera, fit.values.copy(), fit.layout.most_step, fit.prior)
-
-    def solution(self, to_beat: float = math.inf, *, may_be_bad: bool = False) -> Solution | None:
-        """Return what is likeliest; None where there is no maximum, or no good one unless it `may_be_bad`.
-
-        Nor where its cost would be greater than `to_beat`.
-        """
-        if not self._reach(to_beat, may_be_bad=may_be_bad):
-            return None
-        return solutions_of([self._fit], self._camera)[0]
-
-    def _expectation(self, values: Array) -> tuple[Array, Array]:
-        """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
-        expected, jacobian, _ = expectation_of_spheres(values, self._fit, self._camera)
-        return expected, jacobian
-
-
-def expectation_of_spheres(
-    values: Array, fit: Fit, camera: Camera, edge: Array = NO_EDGE
-) -> tuple[Array, Array, Seen | None]:
-    """Return λ, its derivatives, and what is seen of spheres, some before others, or partly behind an edge.
-
-    Lays the fit's images out anew. NaN and None where not all are imaged: there is nowhere to go on to.
-
-    Parameters
-    ----------
-    values
-        Unknowns, those of the fit, and of an edge its direction and place after them.
-    fit, camera
-        The fit and its camera.
-    edge
-        As for `seen_of_discs`.
-
-    Returns
-    -------
-    Shapes (pixels,) and (unknowns, pixels); and what is seen.
-    """
-    layout = fit.layout
-    own = layout.of_sources(values[: layout.size])
-    radius_rad = np.arcsin(np.minimum(camera.radius_m * np.exp(-log_range_by_size(own, fit)), 1.0))
-    axis = direction_camera(own[:, :2], camera.calibration)
-    expected = np.empty(fit.window.image_e.size)
-    jacobian = np.zeros((len(values), len(expected)))
-    seen = None
-    if is_before(axis, radius_rad).all():
-        hides = _hides(axis, radius_rad)
-        seen = seen_of_discs(own[:, :2], axis, radius_rad, hides, camera.calibration, edge)
-    if seen is None:
-        expected[:] = math.nan
-        return expected, jacobian, None
-    hidden_px = camera.hidden_px_at_1_m(own[:, :2])
-    hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
-    fit.log_flux_at_1_m, fit.image_radius_px = log_flux_at_1_m(camera, axis, hidden_e), seen.reach_px
-    flux = np.exp(fit.log_flux_at_1_m - 2.0 * own[:, 2])
-    expectation_of_seen(values, flux, seen, fit.window.view, fit.structure, fit.known, expected, jacobian)
-    return expected, jacobian, seen
-
-
-def _hides(axis: Array, radius_rad: Array) -> NDArray[np.int64]:
-    """Return which sphere may hide a part of which farther one, shape (pairs, 2): where their images meet."""
-    apart_rad = np.arccos(np.clip(axis @ axis.T, -1.0, 1.0))
-    meet = apart_rad < _MEET * (radius_rad[:, None] + radius_rad)
-    order = np.argsort(-radius_rad, kind="stable")
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    return np.argwhere(meet & (rank[:, None] < rank)).astype(np.int64)

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from perception import Detection, detect
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster
-from perception.robust.overlap import eclipse
+from perception.robust.overlap.spheres import Spheres
 from perception.robust.problem import Problem
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expose, random
@@ -163,7 +163,7 @@ def test_slopes_are_those_of_what_is_expected(more: list[Place]) -> None:
         patch.setattr("perception.robust.explain.pile_of", look)
         detect(frame, CAMERA)
     known = replace(CAMERA, sigma={"range_constant_dn_m2_per_s": 0.1 * CAMERA.range_constant_dn_m2_per_s})
-    fit = eclipse._Eclipse(Problem(seen[0].window, starts, BACKGROUND_E), Camera(known, exposure_s, 1.0))
+    fit = Spheres(Problem(seen[0].window, starts, BACKGROUND_E), Camera(known, exposure_s, 1.0))
     values = fit._fit.values.copy()
     _, jacobian = fit._expectation(values)
     for unknown in range(4 * len(places)):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.discs.visible import EDGE, NO_LIMB, Seen
-from perception.model.layout import Known, Structure, View
+from perception.model.layout import Known, View
 from perception.model.normal import shares, strip_shares
 from perception.model.spread import LEAST_STRIP
 
@@ -19,35 +19,31 @@ Array = NDArray[np.float64]
 
 
 @compiled
-def expectation_of_seen(
-    values: Array, flux: Array, seen: Seen, view: View, structure: Structure, known: Known, expected: Array,
-    jacobian: Array,
+def add_seen(
+    flux: Array, places: Array, along: float, seen: Seen, sigma_px: float, view: View, known: Known,
+    expected: Array, jacobian: Array,
 ) -> None:  # fmt: skip
-    """Compute λ and its derivatives, as `pixels.expectation`, of spheres, some of them before others.
+    """Add the light of spheres, some of them before others, to λ, and its derivatives.
 
     Parameters
     ----------
-    values, view, structure, known
-        As there; nothing moves. Where there is an edge its direction and how far it lies that way are the
-        last two unknowns.
-    flux
-        Of each sphere, were it whole, shape (sources,).
+    flux, places
+        Of each sphere, were it whole, and where it is, shapes (sources,) and (sources, 2).
+    along
+        By what part of its motion each is off its place, where they move.
     seen
         What is seen of each.
+    sigma_px
+        Width of the point spread.
+    view, known
+        The window, and what is known of the camera.
     expected, jacobian
-        Shape (pixels,), written, and (unknowns, pixels), zeros that are added to.
+        Shapes (pixels,) and (unknowns, pixels): added to. The unknowns are in the order of `layout.Layout`;
+        where there is an edge its direction and how far it lies that way come last.
     """
-    has_slack, has_width = known.tie_spread > 0.0, known.width_spread > 0.0
-    step = 3 + has_slack
+    has_slack, moves, tie = known.tie_spread > 0.0, known.motion_px > 0.0, known.tie_spread
+    step = 3 + has_slack + 2 * moves
     width = len(flux) * step
-    background = width + has_width
-    expected[:], jacobian[background] = values[background] + view.known_e.ravel(), 1.0
-    for wave in range(len(structure.columns)):
-        expected += values[background + 1 + wave] * structure.columns[wave]
-        jacobian[background + 1 + wave] = structure.columns[wave]
-    sigma_px = known.psf_sigma_px
-    if has_width:
-        sigma_px *= math.exp(known.width_spread * values[width])
     rows, columns = view.image_e.shape
     lit, slopes = expected.reshape(rows, columns), jacobian.reshape(-1, rows, columns)
     across, down = np.empty((4, columns)), np.empty((3, rows))
@@ -64,15 +60,16 @@ def expectation_of_seen(
             left, right = strip_shares(middle_px, half_px, shading, 0.0, columns, sigma_px, across)
             light_e = flux[disc] * 2.0 * half_px * mean
             for row in range(top, bottom):
-                light, wider = light_e * down[0, row], light_e * down[2, row]
+                light, wider = light_e * down[0, row], known.width_spread * light_e * down[2, row]
                 for column in range(left, right):
                     lit[row, column] += light * across[0, column]
                 if has_slack:
+                    # Of a larger image of as much flux light is spread over more, and changes at its limb.
                     for column in range(left, right):
-                        slopes[disc * step + 3, row, column] -= light * across[0, column]
-                if has_width:
+                        slopes[disc * step + 3, row, column] -= 2.0 * tie * light * across[0, column]
+                if known.width_spread > 0.0:
                     for column in range(left, right):
-                        by_width = light * across[2, column] + wider * across[0, column]
+                        by_width = known.width_spread * light * across[2, column] + wider * across[0, column]
                         slopes[width, row, column] += by_width
         for end in range(2):
             limb = seen.limb[piece, end]
@@ -93,7 +90,7 @@ def expectation_of_seen(
             # The limb's place on the row, as its sphere goes aside, down, or grows.
             own = limb * step
             by_v = -by_u * seen.slope[piece, end]
-            grown = by_u * (at_px - values[own]) + by_v * (v_px - values[own + 1])
+            grown = by_u * (at_px - places[limb, 0]) + by_v * (v_px - places[limb, 1])
             for row in range(top, bottom):
                 for column in range(left, right):
                     share = down[0, row] * across[0, column]
@@ -101,10 +98,7 @@ def expectation_of_seen(
                     slopes[own + 1, row, column] += by_v * share
                     slopes[own + 2, row, column] -= grown * share
                     if has_slack:
-                        slopes[own + 3, row, column] += 0.5 * grown * share
-    if has_slack:
-        # With its size a sphere's light changes at its limb, and is spread over more: of as much flux.
-        for source in range(len(flux)):
-            jacobian[source * step + 3] *= 2.0 * known.tie_spread
-    if has_width:
-        jacobian[width] *= known.width_spread
+                        slopes[own + 3, row, column] += tie * grown * share
+                    if moves:
+                        slopes[own + step - 2, row, column] += along * by_u * share
+                        slopes[own + step - 1, row, column] += along * by_v * share
