@@ -44,12 +44,9 @@ def moving(
     for index, solution in enumerate(solutions):
         if solution is None or solution.count > MOST_TOGETHER:
             continue
-        if solution.count == 1:
-            motions = [_seen(solution, *solution.drawn_out, camera)]
-        elif asks_for_more(solution):
-            motions = [_seen(solution, *_drawn_out(solution, k), camera) for k in range(solution.count)]
-        else:
+        if solution.count > 1 and not asks_for_more(solution):
             continue
+        motions = asked_motions(solution, camera)
         if any(motion != AT_REST for motion in motions):
             tried.append((index, solution))
             window, background_e = solution.window, solution.background_e
@@ -62,6 +59,13 @@ def moving(
         for (index, at_rest), fit in zip(tried, fits, strict=True)
         if fit is not None and LEAST_PX <= fit.most_motion_px <= MOST_MOTION_PX
     }
+
+
+def asked_motions(solution: Solution, camera: Camera) -> list[Motion]:
+    """Return the motion of each that the residual of flares at rest asks for; `AT_REST` where of none."""
+    if solution.count == 1:
+        return [_seen(solution, *solution.drawn_out, camera)]
+    return [_seen(solution, *_drawn_out(solution, k), camera) for k in range(solution.count)]
 
 
 def is_long_clutter(solution: Solution, index: int, camera: Camera) -> bool:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from perception.model.bearing import direction_camera
 from perception.model.flare import image_radius_px
 from perception.model.layout import UNUSABLE
-from perception.model.window import Camera, log_flux_at_1_m
+from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera, log_flux_at_1_m
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.goodness import MODEL_ERROR
+from perception.robust.motion import AT_REST, LEAST_PX, asked_motions
 from perception.robust.overlap.climb import good_ones
 from perception.robust.overlap.covered import shows_its_size
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
@@ -36,6 +37,7 @@ from perception.robust.overlap.pairs import (
     longer_chi2,
     meeting,
 )
+from perception.robust.overlap.rivals import weighed
 from perception.robust.overlap.spheres import Spheres
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution
@@ -127,15 +129,39 @@ def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> So
     shown = len(starts)
     for more in range(1 + most_more):
         climb = Spheres(Problem(cluster.window, starts, cluster.background_e), camera)
-        pile = climb.solution(may_be_bad=more < most_more)
+        pile = climb.solution(may_be_bad=more < max(most_more, 1))
         if pile is None:
             return None
-        if pile.count > 1 and climb.to_gain < _NEARLY and _is_good(pile, camera):
+        is_there = climb.to_gain < _NEARLY and _is_good(pile, camera)
+        moved = _moved(pile, camera) if pile.count > 1 else None
+        if moved is not None:
+            pile = _likelier(pile if is_there else None, moved)
+        if pile.count > 1 and (is_there or moved is not None):
             return _believed(replace(pile, by_outline=shown), camera)
         if more == most_more or not pile.left_over.peak_sigmas > RESIDUAL_SIGMAS:
             return None
         starts = with_one_more(pile)[0]
     return None
+
+
+def _moved(pile: Solution, camera: Camera) -> Solution | None:
+    """Return spheres that move while they are exposed, if the residual of those at rest asks for that."""
+    motions = asked_motions(pile, camera)
+    if all(motion == AT_REST for motion in motions):
+        return None
+    problem = Problem(pile.window, pile.starts, pile.background_e, motions)
+    moving = replace(camera, motion_px=MOTION_PX)
+    moved = Spheres(problem, moving).solution()
+    if moved is None or not _is_good(moved, moving):
+        return None
+    return moved if LEAST_PX <= moved.most_motion_px <= MOST_MOTION_PX else None
+
+
+def _likelier(pile: Solution | None, moved: Solution) -> Solution:
+    """Return the likelier of spheres at rest, if these explain a window, and of ones that move."""
+    if pile is None:
+        return moved
+    return weighed(moved, pile) if moved.cost < pile.cost else weighed(pile, moved)
 
 
 def _believed(pile: Solution, camera: Camera) -> Solution | None:
@@ -192,7 +218,8 @@ def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
         inwards = float(pile.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
         starts[far] = (*place, log_range)
-        climb = Spheres(Problem(pile.window, starts, pile.background_e), camera)
+        moving = camera if pile.motions is None else replace(camera, motion_px=MOTION_PX)
+        climb = Spheres(Problem(pile.window, starts, pile.background_e, pile.motions), moving)
         other = climb.solution(pile.cost + _RIVAL)
         # One that goes on without an end is not excluded where it has come as far as the pair.
         above = climb.so_far - pile.deviance if other is None else other.cost - pile.cost
