@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
-from perception.model.discs.nodes import disc_nodes
 from perception.model.discs.rows import disc_rows
 from perception.model.flare import is_before
 from perception.model.layout import Known, Sources
@@ -152,9 +151,8 @@ def lay_out(
     hidden_e: Array | None = None,
     moved_px: Array | None = None,
     finer: Array | None = None,
-    in_points: bool = False,
 ) -> tuple[Sources, NDArray[np.bool_]]:
-    """Lay sources out as nodes, strips or points, all of them at once.
+    """Lay sources out in strips, all of them at once.
 
     Parameters
     ----------
@@ -168,9 +166,7 @@ def lay_out(
     moved_px
         How far each moves at most during the exposure, shape (sources,). By default nothing does.
     finer
-        As for `disc_nodes`.
-    in_points
-        That nodes are to be points, of which some may be left out, and not strips.
+        As for `disc_rows`.
 
     Returns
     -------
@@ -185,8 +181,7 @@ def lay_out(
         u_px, v_px = np.where(imaged, u_px, calibration.cx_px), np.where(imaged, v_px, calibration.cy_px)
         direction = np.where(imaged[:, None], direction, (0.0, 0.0, 1.0))
         radius_rad = np.where(imaged, radius_rad, 0.0)
-    laid_out = disc_nodes if in_points else disc_rows
-    nodes = laid_out(u_px, v_px, direction, radius_rad, calibration, moved_px, finer)
+    nodes = disc_rows(u_px, v_px, direction, radius_rad, calibration, moved_px, finer)
     return Sources.of(nodes, np.ascontiguousarray(log_range), log_flux), imaged
 
 

@@ -27,19 +27,19 @@ from perception.robust.around.uneven import (
 )
 from perception.robust.clusters import Cluster, guesses
 from perception.robust.forward_light import fit_beside_forward_light
+from perception.robust.hiding.cut import cut_discs
+from perception.robust.hiding.eclipse import eclipses, pile_of
 from perception.robust.motion import moving
-from perception.robust.overlap.cut import cut_discs
 from perception.robust.overlap.deblend import (
     RESIDUAL_SIGMAS,
     asks_for_more,
     deblend,
     of_free_width,
 )
-from perception.robust.overlap.eclipse import eclipses, pile_of
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import is_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
-from perception.robust.overlap.rivals import NO_RIVAL, weighed
+from perception.robust.overlap.rivals import beside_rival, better, to_beat, weighed
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
@@ -47,7 +47,6 @@ from perception.robust.solve import Solution, likely_starts, solve
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 _GOOD_SIGMAS = 10.0  # of χ²: two good explanations of a window differ by less
-_ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
 
 def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
@@ -103,11 +102,11 @@ def _piles(
             if pile is not None and pile.left_over.is_nothing:
                 piles[index] = pile
     lone = [one if index in piles else None for index, one in enumerate(plain)]
-    to_beat = {
+    least = {
         index: pile.deviance + _GOOD_SIGMAS * math.sqrt(2.0 * pile.expected_e.size)
         for index, pile in piles.items()
     }
-    for index, line in moving(lone, camera, to_beat).items():
+    for index, line in moving(lone, camera, least).items():
         if line.motion_px is not None and line.left_over.is_good:
             del piles[index]
     return piles
@@ -151,7 +150,7 @@ def _explained(
             _take_up(several, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
         spilled = without_spill(plain, prepared, camera)
-        known = _take_lines(chosen, plain, halos, spilled, _to_beat(parted), camera)
+        known = _take_lines(chosen, plain, halos, spilled, to_beat(parted), camera)
         _drop_beside_lines(chosen, parted, halos, prepared.shape, camera, cut_short)
     retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
@@ -173,11 +172,11 @@ def _explained(
     if prepared.frame.line_time_s == 0.0:
         highlit = _beside_highlights(found, at_rest, chosen, parted, prepared.shape, camera)
         _adopt(likelier_beside_highlights(highlit, chosen, parted), chosen, parted, uneven_e)
-    retry_on_uneven_ground(chosen, uneven_e, _to_beat(parted), camera)
+    retry_on_uneven_ground(chosen, uneven_e, to_beat(parted), camera)
     for index, more in parted.items():
-        chosen[index] = _better(more, chosen[index])
+        chosen[index] = better(more, chosen[index])
     for index, pair in rivals.items():
-        chosen[index] = _beside_rival(chosen[index], pair)
+        chosen[index] = beside_rival(chosen[index], pair)
     if prepared.frame.line_time_s == 0.0:
         for index, one_or_two in doubted(chosen, plain, camera).items():
             chosen[index] = one_or_two
@@ -188,37 +187,11 @@ def _explained(
     return chosen
 
 
-def _to_beat(parted: Mapping[int, Solution]) -> dict[int, float]:
-    """Return by index which -2 ln L lets a rival of what is certain to explain a window matter."""
-    return {index: more.cost + NO_RIVAL for index, more in parted.items()}
-
-
 def _take_up(others: Mapping[int, Solution], parted: dict[int, Solution], shape: tuple[int, int]) -> None:
     """Hold other explanations of windows against those so far, where they explain all that is seen."""
     for index, other in others.items():
         if _explains_all(other, shape):
-            parted[index] = _better(other, parted.get(index))
-
-
-def _better(pair: Solution, other: Solution | None) -> Solution:
-    """Return what explains a window better, the other weighed in; of as many flares what knows of hiding."""
-    if other is None:
-        return pair
-    alike = _ALIKE if pair.count == other.count else 0.0
-    return weighed(pair, other) if pair.cost < other.cost + alike else weighed(other, pair)
-
-
-def _beside_rival(one: Solution | None, pair: Solution) -> Solution | None:
-    """Weigh what explains a window with two spheres that do, too, but may be one that is not round.
-
-    One that is not round is told as one; several flares are no better a guess than the two where these
-    explain more.
-    """
-    if one is None:
-        return None
-    if one.count > 1 and pair.cost < one.cost:
-        return replace(weighed(pair, one), is_doubtful=True)
-    return weighed(one, pair)
+            parted[index] = better(other, parted.get(index))
 
 
 def _take_lines(
@@ -226,7 +199,7 @@ def _take_lines(
     plain: Sequence[Solution | None],
     halos: dict[int, Solution],
     without_spill: Mapping[int, Solution],
-    to_beat: Mapping[int, float],
+    least: Mapping[int, float],
     camera: Camera,
 ) -> list[Solution | None]:
     """Choose flares that move where they explain more than flares at rest; both with their halos, if any.
@@ -235,7 +208,7 @@ def _take_lines(
     are those of what is returned: of lines where these were chosen, else of `plain`.
     """
     known = list(plain)
-    lines = moving(plain, camera, to_beat)
+    lines = moving(plain, camera, least)
     tried = {index: one for index, one in lines.items() if one.motion_px is not None and index in halos}
     of_lines = with_halo(tried, camera)
     for index, line in lines.items():

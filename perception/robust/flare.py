@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from perception.model.fog import may_be_in_fog
-from perception.robust.overlap.covered import hidden_log_range
+from perception.robust.hiding.covered import hidden_log_range
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS
 from perception.robust.search.blobs import Blob
 from perception.robust.search.prepare import PreparedFrame

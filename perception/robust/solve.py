@@ -77,7 +77,7 @@ class Solution:
         Whether what one hides of another is left out of λ, where fluxes are of whole sources, and nothing
         else explains the window as well (`eclipse`).
     by_outline
-        How many flares the outline of what is lit shows (`overlap.outlines`).
+        How many flares the outline of what is lit shows (`hiding.outlines`).
     """
 
     window: Window

@@ -184,7 +184,8 @@ def _heights(
     limbs, at = [far, far], [turns[far, 0], turns[far, 1]]
     for one in range(len(nearer)):
         near = nearer[one]
-        for turn in turns[near]:
+        on_edge = _on_edge(of_u[near], of_v[near], edge)
+        for turn in (turns[near, 0], turns[near, 1], on_edge[0], on_edge[1]):
             if _is_within(direction, across, down, radius_rad, near, turn, far):
                 limbs.append(near)
                 at.append(turn)

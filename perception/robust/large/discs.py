@@ -16,10 +16,10 @@ from perception.robust.around.uneven import MOST_LEFT
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, least_flux_e
 from perception.robust.flare import MeasuredFlare, measured_flare
 from perception.robust.forward_light import fit_beside_forward_light
+from perception.robust.hiding.eclipse import pile_of
 from perception.robust.large.aperture import mask_in, measure_by_aperture
 from perception.robust.large.outline import Outline, outline_of
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_width
-from perception.robust.overlap.eclipse import pile_of
 from perception.robust.problem import Problem, Start, Window
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame

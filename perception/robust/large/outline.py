@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.lens import project
-from perception.robust.overlap.outlines import on_cones, refined_cone
+from perception.robust.hiding.outlines import on_cones, refined_cone
 from perception.robust.search.blobs import Blob
 from perception.robust.search.prepare import PreparedFrame
 from perception.types import Calibration

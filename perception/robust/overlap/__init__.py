@@ -1,1 +1,1 @@
-"""Flares that overlap, told apart: those that add up, and those of which one hides a part of the other."""
+"""Flares that overlap, told apart: those that add up, and what else would explain them as well."""

@@ -1,6 +1,7 @@
 """Of two explanations the likelier one, its sigmas wider by what differs in the other."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ Array = NDArray[np.float64]
 
 _LEAST_SHARE, _DOUBTFUL_SHARE = 1e-4, 0.01
 _MOST_COST = 40.0
+_ALIKE = 10.0  # in −2 ln of the evidence: discs that hardly overlap add up to the same, but for quadrature
 
 NO_RIVAL = -2.0 * math.log(_LEAST_SHARE)
 """What costs so much more changes nothing."""
@@ -28,6 +30,32 @@ def weighed(solution: Solution, *others: Solution) -> Solution:
     for other, own_odds in zip(others, odds, strict=True):
         wider = _wider(wider, solution, other, own_odds / (1.0 + sum(odds)))
     return wider
+
+
+def to_beat(parted: Mapping[int, Solution]) -> dict[int, float]:
+    """Return by index which -2 ln L lets a rival of what is certain to explain a window matter."""
+    return {index: more.cost + NO_RIVAL for index, more in parted.items()}
+
+
+def better(pair: Solution, other: Solution | None) -> Solution:
+    """Return what explains a window better, the other weighed in; of as many flares what knows of hiding."""
+    if other is None:
+        return pair
+    alike = _ALIKE if pair.count == other.count else 0.0
+    return weighed(pair, other) if pair.cost < other.cost + alike else weighed(other, pair)
+
+
+def beside_rival(one: Solution | None, pair: Solution) -> Solution | None:
+    """Weigh what explains a window with two spheres that do, too, but may be one that is not round.
+
+    One that is not round is told as one; several flares are no better a guess than the two where these
+    explain more.
+    """
+    if one is None:
+        return None
+    if one.count > 1 and pair.cost < one.cost:
+        return replace(weighed(pair, one), is_doubtful=True)
+    return weighed(one, pair)
 
 
 def _wider(wider: Solution, solution: Solution, other: Solution, share: float) -> Solution:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from perception import Detection, detect
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster
-from perception.robust.overlap import cut
+from perception.robust.hiding import cut
 from perception.robust.solve import Solution
 from tests.unit.perception.robust.test_eclipse import (
     BACKGROUND_E,

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from perception import Detection, detect
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster
-from perception.robust.overlap.spheres import Spheres
+from perception.robust.hiding.spheres import Spheres
 from perception.robust.problem import Problem
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expose, random

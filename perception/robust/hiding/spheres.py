@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from perception.model.bearing import direction_camera
 from perception.model.discs.nodes import line_rule
 from perception.model.discs.visible import NO_EDGE, Seen, seen_of_discs
-from perception.model.discs.visible_pixels import add_seen
 from perception.model.flare import is_before
 from perception.model.window import Camera, log_flux_at_1_m
 from perception.robust.fit import Fit, log_range_by_size
-from perception.robust.overlap.climb import Climb
+from perception.robust.hiding.climb import Climb
+from perception.robust.hiding.seen_light import add_seen
 from perception.robust.problem import Problem
 from perception.robust.solve import Solution, solutions_of
 from perception.types import Calibration

@@ -19,11 +19,12 @@ from perception.model.layout import UNUSABLE
 from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera, log_flux_at_1_m
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.goodness import MODEL_ERROR
+from perception.robust.hiding.climb import good_ones
+from perception.robust.hiding.covered import shows_its_size
+from perception.robust.hiding.outlines import discs_by_outline
+from perception.robust.hiding.spheres import Spheres
 from perception.robust.motion import AT_REST, LEAST_PX, asked_motions
-from perception.robust.overlap.climb import good_ones
-from perception.robust.overlap.covered import shows_its_size
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
-from perception.robust.overlap.outlines import discs_by_outline
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
     OTHER_SIGMAS,
@@ -38,7 +39,6 @@ from perception.robust.overlap.pairs import (
     meeting,
 )
 from perception.robust.overlap.rivals import weighed
-from perception.robust.overlap.spheres import Spheres
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution
 

@@ -17,12 +17,12 @@ from perception.model.flare import image_radius_px
 from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit
-from perception.robust.overlap.climb import Climb, good_ones
+from perception.robust.hiding.climb import Climb, good_ones
+from perception.robust.hiding.eclipse import is_as_bright, lit_pixels
+from perception.robust.hiding.spheres import expectation_of_spheres
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
-from perception.robust.overlap.eclipse import is_as_bright, lit_pixels
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL
-from perception.robust.overlap.spheres import expectation_of_spheres
 from perception.robust.problem import Problem
 from perception.robust.solve import Solution, solutions_of
 
