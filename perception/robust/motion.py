@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
+from perception.model.pixels import MORE_TO_GAIN, TIMES_TO_GAIN
 from perception.model.window import MOST_MOTION_PX, Camera, is_usual_motion, motion_price
 from perception.robust.goodness import drawn_out
 from perception.robust.overlap.deblend import asks_for_more
@@ -84,16 +85,17 @@ def _seen(
 ) -> Motion:
     """Return the motion that a residual asks for (`drawn_out`), if it does.
 
-    One of a lone flare that costs more than it may gain, by so much that it would not be weighed in, is none.
+    One that costs more than it may gain, by so much that it would not be weighed in, is none.
     """
     length_px = math.hypot(along_u, along_v)
     if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
         return AT_REST
-    if solution.count == 1:
-        # To first order a residual may ask for a motion that is too long, and longer ones cost more.
-        price = motion_price(np.array([0.5 * length_px]), solution.log_range, camera)
-        if most_gain < float(price[0]) - NO_RIVAL:
-            return AT_REST
+    # To first order a residual may ask for a motion that is too long, and longer ones cost more.
+    price = motion_price(np.array([0.5 * length_px]), solution.log_range, camera)
+    if solution.count > 1:
+        most_gain = min(most_gain, MORE_TO_GAIN + TIMES_TO_GAIN * chi2)
+    if most_gain < float(price.min()) - NO_RIVAL:
+        return AT_REST
     shorter = min(1.0, 0.5 * MOST_MOTION_PX / length_px)
     return shorter * along_u, shorter * along_v
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.flare import image_radius_px
-from perception.model.layout import UNUSABLE
+from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera, log_flux_at_1_m
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.goodness import MODEL_ERROR
@@ -50,6 +50,7 @@ _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first gu
 _TRIED = 2
 _BESIDE_PX = 2.0
 _NEARLY = 1.0  # of 2 Δ ln L: of what is hardly seen the nodes come and go
+_MOST_MOVED = 0.15  # of the light: so much those at rest may leave of ones that move, if nothing clips
 _MOST_MORE = 2  # flares than outline and blobs show
 # Of what is lit, over the brightness of sources: where clipped it seems dimmer.
 _DIMMEST, _BRIGHTEST = 0.5, 1.5
@@ -126,26 +127,28 @@ def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> So
     ]
     if not reach_px or len(starts) + most_more < 2:
         return None
-    shown = len(starts)
+    shown, likeliest = len(starts), None
     for more in range(1 + most_more):
         climb = Spheres(Problem(cluster.window, starts, cluster.background_e), camera)
         pile = climb.solution(may_be_bad=more < max(most_more, 1))
         if pile is None:
-            return None
-        is_there = climb.to_gain < _NEARLY and _is_good(pile, camera)
-        moved = _moved(pile, camera) if pile.count > 1 else None
-        if moved is not None:
-            pile = _likelier(pile if is_there else None, moved)
-        if pile.count > 1 and (is_there or moved is not None):
-            return _believed(replace(pile, by_outline=shown), camera)
-        if more == most_more or not pile.left_over.peak_sigmas > RESIDUAL_SIGMAS:
-            return None
+            break
+        if pile.count > 1:
+            is_there = climb.to_gain < _NEARLY and _is_good(pile, camera)
+            for each in (pile if is_there else None, _moved(pile, camera)):
+                likeliest = _likelier(likeliest, each)
+        may_be_more = (one.left_over.peak_sigmas > RESIDUAL_SIGMAS for one in (pile, likeliest or pile))
+        if more == most_more or not all(may_be_more):
+            break
         starts = with_one_more(pile)[0]
-    return None
+    return None if likeliest is None else _believed(replace(likeliest, by_outline=shown), camera)
 
 
 def _moved(pile: Solution, camera: Camera) -> Solution | None:
     """Return spheres that move while they are exposed, if the residual of those at rest asks for that."""
+    is_clipped = bool((pile.window.state == CLIPPED).any())
+    if not is_clipped and pile.left_over.share > _MOST_MOVED:
+        return None
     motions = asked_motions(pile, camera)
     if all(motion == AT_REST for motion in motions):
         return None
@@ -157,11 +160,11 @@ def _moved(pile: Solution, camera: Camera) -> Solution | None:
     return moved if LEAST_PX <= moved.most_motion_px <= MOST_MOTION_PX else None
 
 
-def _likelier(pile: Solution | None, moved: Solution) -> Solution:
-    """Return the likelier of spheres at rest, if these explain a window, and of ones that move."""
-    if pile is None:
-        return moved
-    return weighed(moved, pile) if moved.cost < pile.cost else weighed(pile, moved)
+def _likelier(one: Solution | None, other: Solution | None) -> Solution | None:
+    """Return the likelier of two explanations, if there are two, the other in its sigmas."""
+    if one is None or other is None:
+        return other or one
+    return weighed(other, one) if other.cost < one.cost else weighed(one, other)
 
 
 def _believed(pile: Solution, camera: Camera) -> Solution | None:
