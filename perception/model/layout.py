@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.compiled import compiled
 from perception.model.discs.nodes import DiscNodes
 
 Array = NDArray[np.float64]
@@ -158,27 +159,22 @@ class Sources(NamedTuple):
             nodes.weight, log_range_at, log_flux_at_1_m,
         )  # fmt: skip
 
-    def part(self, first: int, end: int) -> "Sources":
-        """Return some of the sources."""
-        nodes = slice(int(self.first_node[first]), int(self.first_node[end]))
-        return Sources(
-            self.first_node[first : end + 1] - nodes.start,
-            self.node_u_px[nodes],
-            self.node_v_px[nodes],
-            self.half_px[nodes],
-            self.tilt[nodes],
-            self.bend[nodes],
-            self.node_along[nodes],
-            self.weight[nodes],
-            self.log_range_at[first:end],
-            self.log_flux_at_1_m[first:end],
-        )
-
     @property
     def reach_px(self) -> Array:
         """Radius of each source's image before the point spread, as laid out."""
         reach_px = np.hypot(abs(self.node_u_px) + self.half_px, self.node_v_px)
         return np.maximum.reduceat(np.where(np.isfinite(reach_px), reach_px, 0.0), self.first_node[:-1])
+
+
+@compiled
+def part_of(sources: Sources, first: int, end: int) -> Sources:
+    """Return some of the sources."""
+    a, b = sources.first_node[first], sources.first_node[end]
+    return Sources(
+        sources.first_node[first : end + 1] - a, sources.node_u_px[a:b], sources.node_v_px[a:b],
+        sources.half_px[a:b], sources.tilt[a:b], sources.bend[a:b], sources.node_along[a:b],
+        sources.weight[a:b], sources.log_range_at[first:end], sources.log_flux_at_1_m[first:end],
+    )  # fmt: skip
 
 
 class View(NamedTuple):

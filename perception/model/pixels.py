@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View, part_of
 from perception.model.normal import log_upper_tail, of_clipped
 from perception.model.spread import spread_nodes
 
@@ -202,20 +202,24 @@ def log_variances(view: View, variance: Array) -> float:
 
 @compiled
 def unlikeliness(
-    view: View, sources: Sources, structure: Structure, known: Known, precision: Array, values: Array
-) -> float:
-    """Return −2 ln L of some values of the unknowns, as `maximise` does of the likeliest; infinite if none.
+    view: View, sources: Sources, structure: Structure, known: Known, precision: Array, guesses: Array
+) -> Array:
+    """Return −2 ln L of guesses of the unknowns, as `maximise` of the likeliest; infinite where none can be.
 
-    The arguments are as for that.
+    The arguments are as for that; `guesses` has the shape (guesses, unknowns), `sources` are those of all.
     """
-    count, pixels = len(sources.log_range_at), view.image_e.size
+    pixels, unknowns = view.image_e.size, guesses.shape[1]
+    count = len(sources.log_range_at) // len(guesses)
     step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
-    if not is_inside(values, view, count, step):
-        return math.inf
-    expected, variance, jacobian = np.empty(pixels), np.empty(pixels), np.empty((len(values), pixels))
-    expectation(values, view, sources, structure, known, expected, jacobian, variance)
-    total = objective(view, values, expected, variance, precision, known.clip_e)
-    return total + log_variances(view, variance)
+    expected, variance, jacobian = np.empty(pixels), np.empty(pixels), np.empty((unknowns, pixels))
+    totals = np.full(len(guesses), math.inf)
+    for guess in range(len(guesses)):
+        if is_inside(guesses[guess], view, count, step):
+            own = part_of(sources, guess * count, (guess + 1) * count)
+            expectation(guesses[guess], view, own, structure, known, expected, jacobian, variance)
+            totals[guess] = objective(view, guesses[guess], expected, variance, precision, known.clip_e)
+            totals[guess] += log_variances(view, variance)
+    return totals
 
 
 @compiled

@@ -62,9 +62,15 @@ class Fit:
         """Precision of the unknowns a priori."""
         return self.layout.prior(self.structure, self.known.motion_px)
 
-    def unlikeliness(self, sources: Sources) -> float:
-        """Return −2 ln L of the present values but for a constant, with images as laid out for them."""
-        return unlikeliness(self.window.view, sources, self.structure, self.known, self.prior, self.values)
+    def unlikeliness(self, sources: Sources, starts: Array) -> Array:
+        """Return −2 ln L but for a constant of first guesses, with images as laid out for these.
+
+        Shape (guesses, sources of each, 3) → (guesses,).
+        """
+        guesses = np.tile(self.values, (len(starts), 1))
+        own = guesses[:, : self.layout.width].reshape(*starts.shape[:2], self.layout.per_source)
+        own[:, :, :3] = starts
+        return unlikeliness(self.window.view, sources, self.structure, self.known, self.prior, guesses)
 
     def climb(self, sources: Sources, reach_px: Array) -> None:
         """Go on to the greatest likelihood, with images as laid out, of so large radii."""

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.layout import Sources
+from perception.model.layout import Sources, part_of
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import MOTION_PX, Camera, lay_out
@@ -218,18 +218,28 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     return [solved.get(index) for index in range(len(fits))]
 
 
-def start_costs(problems: Sequence[Problem], camera: Camera) -> list[float]:
-    """Return −2 ln L of each problem's first guesses, all at rest, but for a constant of its window.
+def start_costs(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[list[float]]:
+    """Return −2 ln L of each window's first guesses, all at rest, but for a constant of the window.
 
     By coarse images: they tell apart guesses whose fluxes differ several times.
     """
     if not problems:
         return []
-    fits = [Fit(problem, camera) for problem in problems]
-    laid, imaged, _ = _laid_out(fits, camera, None, finer=_OF_STARTS)
-    ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
-    parts = zip(fits, [0, *ends], ends, strict=False)
-    return [f.unlikeliness(laid.part(a, b)) if imaged[a:b].all() else math.inf for f, a, b in parts]
+    starts = [np.array([each.starts for each in of_one]) for of_one in problems]
+    counts = [each.shape[0] * each.shape[1] for each in starts]
+    all_starts = np.concatenate([each.reshape(-1, 3) for each in starts])
+    u_px, v_px, log_range = np.ascontiguousarray(all_starts.T)
+    hidden_e = camera.hidden_px_at_1_m(all_starts[:, :2])
+    if hidden_e is not None:
+        hidden_e *= np.repeat([max(of_one[0].background_e, 0.0) for of_one in problems], counts)
+    laid, imaged = lay_out(camera, u_px, v_px, log_range, hidden_e, None, np.full(len(u_px), _OF_STARTS))
+    costs, first = [], 0
+    for of_one, own, count in zip(problems, starts, counts, strict=True):
+        here = slice(first, first := first + count)
+        each = Fit(of_one[0], camera).unlikeliness(part_of(laid, here.start, here.stop), own)
+        is_image = imaged[here].reshape(own.shape[:2]).all(axis=1)
+        costs.append(np.where(is_image, each, math.inf).tolist())
+    return costs
 
 
 def likely_starts(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple[int, Problem]]:
@@ -237,14 +247,13 @@ def likely_starts(problems: Sequence[Sequence[Problem]], camera: Camera) -> list
 
     From one that is not the climb would lead to where a likelier one leads.
     """
-    several = [each for of_one in problems if len(of_one) > 1 for each in of_one]
-    costs = iter(start_costs(several, camera))
+    costs = iter(start_costs([of_one for of_one in problems if len(of_one) > 1], camera))
     chosen = []
     for index, of_one in enumerate(problems):
         if len(of_one) == 1:
             chosen.append((index, of_one[0]))
             continue
-        cost = [math.inf, *(next(costs) for _ in of_one), math.inf]
+        cost = [math.inf, *next(costs), math.inf]
         chosen += [
             (index, each) for at, each in enumerate(of_one, 1) if cost[at] <= min(cost[at - 1], cost[at + 1])
         ]
@@ -263,7 +272,7 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
         fit.converged = False
         if imaged[first:end].all():
-            fit.climb(laid.part(first, end), reach_px[first:end])
+            fit.climb(part_of(laid, first, end), reach_px[first:end])
     laid_at, own = own[:, :2], np.concatenate([fit.own for fit in fits])
     change = laid.log_range_at - log_range_by_size(own, fits[0])
     moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
@@ -289,7 +298,7 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
 
 
 def _laid_out(
-    fits: Sequence[Fit], camera: Camera, moved_px: Array | None, finer: float = 1.0
+    fits: Sequence[Fit], camera: Camera, moved_px: Array | None
 ) -> tuple[Sources, NDArray[np.bool_], Array | None]:
     """Lay out the sources of fits; beside what `lay_out` returns, how many pixels each would hide at 1 m."""
     own = np.concatenate([fit.own for fit in fits])
@@ -297,8 +306,7 @@ def _laid_out(
     hidden_px = camera.hidden_px_at_1_m(own[:, :2])
     hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
     by_size = log_range_by_size(own, fits[0])
-    fineness = np.full(len(own), finer)
-    return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px, fineness), hidden_px
+    return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px), hidden_px
 
 
 def _motion_px(own: Array, fit: Fit) -> Array | None:
