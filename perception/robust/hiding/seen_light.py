@@ -41,16 +41,13 @@ def add_seen(
         Shapes (pixels,) and (unknowns, pixels): added to. The unknowns are in the order of `layout.Layout`;
         where there is an edge its direction and how far it lies that way come last.
     """
-    has_slack, moves, tie = known.tie_spread > 0.0, known.motion_px > 0.0, known.tie_spread
-    step = 3 + has_slack + 2 * moves
-    width = len(flux) * step
     rows, columns = view.image_e.shape
     lit, slopes = expected.reshape(rows, columns), jacobian.reshape(-1, rows, columns)
     across, down = np.empty((4, columns)), np.empty((3, rows))
     for piece in range(len(seen.disc)):
         disc, v_px = seen.disc[piece], seen.v_px[piece]
-        begin_px, end_px = seen.ends_px[piece]
         top, bottom = shares(v_px - view.top, rows, sigma_px, down)
+        begin_px, end_px = seen.ends_px[piece]
         half_px, middle_px = 0.5 * (end_px - begin_px), 0.5 * (begin_px + end_px) - view.left
         if half_px > LEAST_STRIP * sigma_px:
             first, middle, last = seen.density[piece]
@@ -59,46 +56,77 @@ def add_seen(
             shading = 0.5 * (last - first) / mean, (0.5 * (first + last) - middle) / mean
             left, right = strip_shares(middle_px, half_px, shading, 0.0, columns, sigma_px, across)
             light_e = flux[disc] * 2.0 * half_px * mean
-            for row in range(top, bottom):
-                light, wider = light_e * down[0, row], known.width_spread * light_e * down[2, row]
-                for column in range(left, right):
-                    lit[row, column] += light * across[0, column]
-                if has_slack:
-                    # Of a larger image of as much flux light is spread over more, and changes at its limb.
-                    for column in range(left, right):
-                        slopes[disc * step + 3, row, column] -= 2.0 * tie * light * across[0, column]
-                if known.width_spread > 0.0:
-                    for column in range(left, right):
-                        by_width = known.width_spread * light * across[2, column] + wider * across[0, column]
-                        slopes[width, row, column] += by_width
+            _add_strip(
+                light_e, disc, len(flux), known, down[:, top:bottom], across[:, left:right],
+                lit[top:bottom, left:right], slopes[:, top:bottom, left:right],
+            )  # fmt: skip
         for end in range(2):
             limb = seen.limb[piece, end]
             if limb == NO_LIMB:
                 continue
             at_px = seen.ends_px[piece, end]
-            by_u = flux[disc] * seen.density[piece, 2 * end] * (2.0 * end - 1.0)
+            edge_e = flux[disc] * seen.density[piece, 2 * end] * (2.0 * end - 1.0)
             left, right = shares(at_px - view.left, columns, sigma_px, across)
+            by_end = slopes[:, top:bottom, left:right]
             if limb == EDGE:
                 cosine, sine = math.cos(seen.edge[2]), math.sin(seen.edge[2])
                 beside_px = (v_px - seen.edge[1]) * cosine - (at_px - seen.edge[0]) * sine
-                for row in range(top, bottom):
-                    for column in range(left, right):
-                        light = by_u / cosine * down[0, row] * across[0, column]
-                        slopes[-2, row, column] -= beside_px * light
-                        slopes[-1, row, column] += light
+                for row in range(bottom - top):
+                    for column in range(right - left):
+                        light = edge_e / cosine * down[0, top + row] * across[0, left + column]
+                        by_end[-2, row, column] -= beside_px * light
+                        by_end[-1, row, column] += light
                 continue
-            # The limb's place on the row, as its sphere goes aside, down, or grows.
-            own = limb * step
-            by_v = -by_u * seen.slope[piece, end]
-            grown = by_u * (at_px - places[limb, 0]) + by_v * (v_px - places[limb, 1])
-            for row in range(top, bottom):
-                for column in range(left, right):
-                    share = down[0, row] * across[0, column]
-                    slopes[own, row, column] += by_u * share
-                    slopes[own + 1, row, column] += by_v * share
-                    slopes[own + 2, row, column] -= grown * share
-                    if has_slack:
-                        slopes[own + 3, row, column] += tie * grown * share
-                    if moves:
-                        slopes[own + step - 2, row, column] += along * by_u * share
-                        slopes[own + step - 1, row, column] += along * by_v * share
+            by_v = -edge_e * seen.slope[piece, end]
+            grown = edge_e * (at_px - places[limb, 0]) + by_v * (v_px - places[limb, 1])
+            _add_end(
+                (edge_e, by_v, grown), along, limb, known, down[0, top:bottom], across[0, left:right], by_end
+            )
+
+
+@compiled
+def _add_strip(
+    light_e: float, disc: int, discs: int, known: Known, down: Array, across: Array, lit: Array, slopes: Array
+) -> None:
+    """Add the light of a strip, of a disc, to pixels that it reaches, and how it changes with no limb of it.
+
+    With the width of the point spread, and as a larger image of as much flux is spread over more.
+    """
+    has_slack, moves = known.tie_spread > 0.0, known.motion_px > 0.0
+    step = 3 + has_slack + 2 * moves
+    for row in range(lit.shape[0]):
+        light, wider = light_e * down[0, row], known.width_spread * light_e * down[2, row]
+        for column in range(lit.shape[1]):
+            lit[row, column] += light * across[0, column]
+        if has_slack:
+            for column in range(lit.shape[1]):
+                slopes[disc * step + 3, row, column] -= 2.0 * known.tie_spread * light * across[0, column]
+        if known.width_spread > 0.0:
+            for column in range(lit.shape[1]):
+                by_width = known.width_spread * light * across[2, column] + wider * across[0, column]
+                slopes[discs * step, row, column] += by_width
+
+
+@compiled
+def _add_end(
+    changes_e: tuple[float, float, float], along: float, limb: int, known: Known, down: Array, across: Array,
+    slopes: Array,
+) -> None:  # fmt: skip
+    """Add how light at the end of a strip changes as the sphere whose limb it is goes aside, down, or grows.
+
+    By so much in all, `changes_e`, of which pixels get their shares.
+    """
+    has_slack, moves = known.tie_spread > 0.0, known.motion_px > 0.0
+    step = 3 + has_slack + 2 * moves
+    own, (by_u, by_v, grown) = limb * step, changes_e
+    for row in range(len(down)):
+        for column in range(len(across)):
+            share = down[row] * across[column]
+            slopes[own, row, column] += by_u * share
+            slopes[own + 1, row, column] += by_v * share
+            slopes[own + 2, row, column] -= grown * share
+            if has_slack:
+                slopes[own + 3, row, column] += known.tie_spread * grown * share
+            if moves:
+                slopes[own + step - 2, row, column] += along * by_u * share
+                slopes[own + step - 1, row, column] += along * by_v * share

@@ -147,7 +147,8 @@ def test_sigmas_are_the_bound_s() -> None:
 
 
 @pytest.mark.parametrize("more", [[], [(38.4, 22.3, 1.1)]])
-def test_slopes_are_those_of_what_is_expected(more: list[Place]) -> None:
+@pytest.mark.parametrize("moves", [False, True])
+def test_slopes_are_those_of_what_is_expected(more: list[Place], *, moves: bool) -> None:
     """By differences, of each unknown, of two spheres and of three, one of which hides parts of both others: to .3 %."""
     places = [*_behind(1.5, 2.0, 0.5, 0.7), *more]
     starts = [(u, v, math.log(range_m)) for u, v, range_m in places]
@@ -162,13 +163,17 @@ def test_slopes_are_those_of_what_is_expected(more: list[Place]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("perception.robust.explain.pile_of", look)
         detect(frame, CAMERA)
-    known = replace(CAMERA, sigma={"range_constant_dn_m2_per_s": 0.1 * CAMERA.range_constant_dn_m2_per_s})
-    fit = Spheres(Problem(seen[0].window, starts, BACKGROUND_E), Camera(known, exposure_s, 1.0))
+    sigma = {"range_constant_dn_m2_per_s": 0.1 * CAMERA.range_constant_dn_m2_per_s, "psf_sigma_px": 0.02}
+    camera = Camera(replace(CAMERA, sigma=sigma), exposure_s, 1.0, 1.0 if moves else 0.0)
+    motions = [(0.8, 0.5), (-0.3, 1.1), (0.4, -0.6)][: len(places)] if moves else None
+    fit = Spheres(Problem(seen[0].window, starts, BACKGROUND_E, motions), camera)
     values = fit._fit.values.copy()
     _, jacobian = fit._expectation(values)
-    for unknown in range(4 * len(places)):
+    of_each = 6 if moves else 4
+    for unknown in range(of_each * len(places) + 1):
         step = np.zeros(len(values))
-        step[unknown] = (0.0005, 0.0005, 0.0001, 0.001)[unknown % 4]
+        steps = (0.0005, 0.0005, 0.0001, 0.001, 0.0005, 0.0005)
+        step[unknown] = 0.01 if unknown == of_each * len(places) else steps[unknown % of_each]
         above, below = fit._expectation(values + step)[0], fit._expectation(values - step)[0]
         slope = (above - below) / (2.0 * step[unknown])
         assert np.linalg.norm(slope - jacobian[unknown]) < 0.003 * np.linalg.norm(slope)
