@@ -152,7 +152,7 @@ def lay_out(
     moved_px: Array | None = None,
     finer: Array | None = None,
 ) -> tuple[Sources, NDArray[np.bool_]]:
-    """Lay sources out in strips, all of them at once.
+    """Lay sources out, all of them at once, in strips where their images are known in these.
 
     Parameters
     ----------

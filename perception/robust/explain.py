@@ -46,7 +46,7 @@ from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, likely_starts, solve
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
-_GOOD_SIGMAS = 10.0  # of χ²: two good explanations of a window differ by less
+_GOOD_SIGMAS = 10.0  # of χ²: what leaves so much more is not as good, whatever error the model may have
 
 
 def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
@@ -150,7 +150,11 @@ def _explained(
             _take_up(several, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)
         spilled = without_spill(plain, prepared, camera)
-        known = _take_lines(chosen, plain, halos, spilled, to_beat(parted), camera)
+        # Of what takes several more flares at rest one that moves is where others that move begin.
+        few = {
+            k: more for k, more in parted.items() if (one := plain[k]) is None or more.count <= one.count + 1
+        }
+        known = _take_lines(chosen, plain, halos, spilled, to_beat(few), camera)
         _drop_beside_lines(chosen, parted, halos, prepared.shape, camera, cut_short)
     retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]

@@ -1,8 +1,7 @@
 """The way from a first guess to the greatest likelihood, where a part of a sphere is hidden.
 
-As `model.pixels.maximise`, but images are laid out anew at each step: what is hidden changes with them. Nodes
-that come and go at an edge leave the likelihood no smoother than they are, so a climb may go to and fro
-about its end; one that has come so far, and explains too little, is given up.
+As `model.pixels.maximise`, but images are laid out anew at each step: what is hidden changes with them. One
+that has come so far, and explains too little, is given up.
 """
 
 import math
@@ -33,8 +32,7 @@ from perception.robust.solve import Solution, solutions_of
 Array = NDArray[np.float64]
 
 _MOST_STEPS = 30  # what is of another shape goes on without an end
-# In −2 ln L, a seventh of a standard deviation: nodes at the edge come and go, and leave it no smoother.
-_SETTLED = 0.02
+_SETTLED = 0.002  # in −2 ln L: a twentieth of a standard deviation
 _MOST_GIVEN_UP = 3  # guesses, from the likeliest on, after which none of the others comes to anything
 
 
@@ -85,10 +83,10 @@ class Climb(ABC):
         """Logarithms of the sources' ranges where it stands, as their fluxes say."""
         return self._fit.layout.of_sources(self._values[: self._fit.layout.size])[:, 2]
 
-    def _reach(self, to_beat: float = math.inf, *, may_be_bad: bool = False) -> bool:
+    def _reach(self, most_cost: float = math.inf, *, may_be_bad: bool = False) -> bool:
         """Go on to the greatest likelihood, and write it into the fit; tell whether it is reached.
 
-        It is not where what is ahead has a greater cost than `to_beat`, or is no good explanation. One that
+        It is not where what is ahead has a greater cost than `most_cost`, or is no good explanation. One that
         `may_be_bad` need not be, and is taken as far as it has come.
         """
         layout, size = self._fit.layout, len(self._values)
@@ -106,7 +104,7 @@ class Climb(ABC):
                 if self.to_gain < _SETTLED:
                     break
                 is_judged = done >= JUDGED_AFTER and not may_be_bad
-                if is_judged and not self._is_promising(inverse, to_beat):
+                if is_judged and not self._is_promising(inverse, most_cost):
                     return False
                 before = self._objective(self._values, self._expected, variance)
             np.copyto(damped, fisher)
@@ -139,7 +137,7 @@ class Climb(ABC):
         self._fit.deviance = self._objective(self._values, self._expected)
         return math.isfinite(self._fit.log_information)
 
-    def _is_promising(self, covariance: Array, to_beat: float) -> bool:
+    def _is_promising(self, covariance: Array, most_cost: float) -> bool:
         """Tell whether what lies ahead, by `to_gain` to first order, may be good, at no greater cost."""
         self._write(covariance)
         self._fit.deviance = self.so_far
@@ -147,7 +145,7 @@ class Climb(ABC):
             solutions_of([self._fit], self._camera)[0],
             MORE_TO_GAIN + TIMES_TO_GAIN * self.to_gain,
         )
-        return here.left_over.may_be_good(ahead) and here.cost - ahead <= to_beat
+        return here.left_over.may_be_good(ahead) and here.cost - ahead <= most_cost
 
     def _write(self, covariance: Array) -> None:
         """Write what is reached into the fit, the unknowns that are not its own left free."""

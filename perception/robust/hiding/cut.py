@@ -14,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import image_radius_px
-from perception.model.window import Camera
+from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit
 from perception.robust.hiding.climb import Climb, good_ones
 from perception.robust.hiding.eclipse import is_as_bright, lit_pixels
 from perception.robust.hiding.spheres import expectation_of_spheres
+from perception.robust.motion import AT_REST, LEAST_PX, asked_motions
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
-from perception.robust.overlap.rivals import NO_RIVAL
-from perception.robust.problem import Problem
+from perception.robust.overlap.rivals import NO_RIVAL, likelier
+from perception.robust.problem import Motion, Problem, Window
 from perception.robust.solve import Solution, solutions_of
 
 Array = NDArray[np.float64]
@@ -68,12 +69,13 @@ def cut_discs(
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd or not may_be[index]:
             continue
-        fits = [_Cut(cluster, guess, camera) for guess in _guesses(cluster, camera)]
+        window, background_e = cluster.window, cluster.background_e
+        fits = [_Cut(window, background_e, guess, camera) for guess in _guesses(cluster, camera)]
         fits.sort(key=lambda fit: fit.objective)
         if fits and one is not None and one.count == 1:
-            fits.insert(0, _Cut(cluster, _where_light_lacks(one), camera))
-        to_beat = parted[index].cost + NO_RIVAL if index in parted else math.inf
-        cut = (fit.solution(to_beat) for fit in fits[:_TRIED])
+            fits.insert(0, _Cut(window, background_e, _where_light_lacks(one), camera))
+        most_cost = parted[index].cost + NO_RIVAL if index in parted else math.inf
+        cut = (fit.solution(most_cost) for fit in fits[:_TRIED])
         good = good_ones(cut, partial(_explains_more, one), _GOOD)
         if good:
             cuts[index] = min(good, key=lambda cut: cut.cost)
@@ -134,9 +136,16 @@ class _Cut(Climb):
     angle to the line, and how far the line lies that way from where the flare was guessed.
     """
 
-    def __init__(self, cluster: Cluster, guess: Guess, camera: Camera) -> None:
+    def __init__(
+        self,
+        window: Window,
+        background_e: float,
+        guess: Guess,
+        camera: Camera,
+        motions: list[Motion] | None = None,
+    ) -> None:
         u_px, v_px, log_range, turn, edge_px = guess
-        problem = Problem(cluster.window, [(u_px, v_px, log_range)], cluster.background_e)
+        problem = Problem(window, [(u_px, v_px, log_range)], background_e, motions)
         fit, self._from = Fit(problem, camera), (u_px, v_px)
         size = fit.layout.size
         prior = np.diag([*np.zeros(size), _LOOSE, _LOOSE])
@@ -144,12 +153,26 @@ class _Cut(Climb):
         most_step = np.array([*fit.layout.most_step, _MOST_TURN_RAD, _MOST_SHIFT_PX])
         super().__init__(fit, camera, np.array([*fit.values, turn, edge_px]), most_step, prior)
 
-    def solution(self, to_beat: float) -> Solution | None:
-        """Return what is likeliest; None where no maximum is reached, or hardly any is hidden or seen.
+    def solution(self, most_cost: float) -> Solution | None:
+        """Return what is likeliest, at rest or not; None where nothing is, or hardly any is hidden or seen.
 
-        Nor where its cost would be greater than `to_beat`.
+        Nor where its cost would be greater than `most_cost`.
         """
-        if not self._reach(to_beat) or not _LEAST_SEEN < self._seen < 1.0 - _LEAST_HIDDEN:
+        at_rest = self._likeliest(most_cost)
+        motions = [AT_REST] if at_rest is None else asked_motions(at_rest, self._camera)
+        if at_rest is None or motions == [AT_REST]:
+            return at_rest
+        ((u_px, v_px, log_range),) = at_rest.starts
+        turn, edge_px = self._values[-2:].tolist()
+        edge_px += (self._from[0] - u_px) * math.cos(turn) + (self._from[1] - v_px) * math.sin(turn)
+        guess, moving = (u_px, v_px, log_range, turn, edge_px), replace(self._camera, motion_px=MOTION_PX)
+        moved = _Cut(at_rest.window, at_rest.background_e, guess, moving, motions)._likeliest(most_cost)
+        if moved is None or not LEAST_PX <= moved.most_motion_px <= MOST_MOTION_PX:
+            return at_rest
+        return likelier(at_rest, moved)
+
+    def _likeliest(self, most_cost: float) -> Solution | None:
+        if not self._reach(most_cost) or not _LEAST_SEEN < self._seen < 1.0 - _LEAST_HIDDEN:
             return None
         found = solutions_of([self._fit], self._camera)[0]
         # A priori the line has any direction, and cuts the disc anywhere.

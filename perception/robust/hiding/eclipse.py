@@ -1,8 +1,8 @@
 """Resolved spheres, some of them partly behind others: of the farther ones what stands out.
 
 Deblending adds discs up, which shine through each other; where two overlap neither is then where and as large
-as it seems. Here each quadrature node of the farther counts by how much of it stands out from behind the
-nearer, so that the expected image and its derivatives, by places and sizes of all, are of what is seen.
+as it seems. Here farther ones are seen as far as they stand out from behind nearer ones, so that the expected
+image and its derivatives, by places and sizes of all, are of what is seen.
 """
 
 import math
@@ -38,7 +38,7 @@ from perception.robust.overlap.pairs import (
     longer_chi2,
     meeting,
 )
-from perception.robust.overlap.rivals import weighed
+from perception.robust.overlap.rivals import likelier
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution
 
@@ -49,7 +49,7 @@ _DRAWN_OUT_CHI2 = 14.0  # of two degrees of freedom: by chance once in a thousan
 _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first guesses
 _TRIED = 2
 _BESIDE_PX = 2.0
-_NEARLY = 1.0  # of 2 Δ ln L: of what is hardly seen the nodes come and go
+_NEARLY = 1.0  # of 2 Δ ln L: what has more to gain goes on without an end
 _MOST_MOVED = 0.15  # of the light: so much those at rest may leave of ones that move, if nothing clips
 _MOST_MORE = 2  # flares than outline and blobs show
 # Of what is lit, over the brightness of sources: where clipped it seems dimmer.
@@ -95,6 +95,7 @@ def eclipses(
         if not good:
             continue
         likeliest = min(good, key=lambda pair: pair.cost)
+        likeliest = likelier(likeliest, _moved(likeliest, camera)) or likeliest
         believed = _believed(likeliest, camera)
         if believed is None:
             rivals[index] = likeliest
@@ -136,9 +137,11 @@ def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> So
         if pile.count > 1:
             is_there = climb.to_gain < _NEARLY and _is_good(pile, camera)
             for each in (pile if is_there else None, _moved(pile, camera)):
-                likeliest = _likelier(likeliest, each)
-        may_be_more = (one.left_over.peak_sigmas > RESIDUAL_SIGMAS for one in (pile, likeliest or pile))
-        if more == most_more or not all(may_be_more):
+                likeliest = likelier(likeliest, each)
+        # Ones that move may explain what another flare does far better.
+        explained = pile if likeliest is None or likeliest.motion_px is not None else likeliest
+        asking = (pile.left_over.peak_sigmas, explained.left_over.peak_sigmas)
+        if more == most_more or not min(asking) > RESIDUAL_SIGMAS:
             break
         starts = with_one_more(pile)[0]
     return None if likeliest is None else _believed(replace(likeliest, by_outline=shown), camera)
@@ -158,13 +161,6 @@ def _moved(pile: Solution, camera: Camera) -> Solution | None:
     if moved is None or not _is_good(moved, moving):
         return None
     return moved if LEAST_PX <= moved.most_motion_px <= MOST_MOTION_PX else None
-
-
-def _likelier(one: Solution | None, other: Solution | None) -> Solution | None:
-    """Return the likelier of two explanations, if there are two, the other in its sigmas."""
-    if one is None or other is None:
-        return other or one
-    return weighed(other, one) if other.cost < one.cost else weighed(one, other)
 
 
 def _believed(pile: Solution, camera: Camera) -> Solution | None:
@@ -218,7 +214,7 @@ def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
     apart_px = max(math.hypot(far_u - near_u, far_v - near_v), 1e-9)
     for share in (0.5, 1.0):
         starts, log_range = pile.starts, far_log + share * (near_log - far_log)
-        inwards = float(pile.image_radius_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
+        inwards = float(pile.radius_at_rest_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
         starts[far] = (*place, log_range)
         moving = camera if pile.motions is None else replace(camera, motion_px=MOTION_PX)

@@ -31,6 +31,7 @@ _SETTLED = 0.1  # in χ²
 _MOST_LOG_STEP = 0.2  # of size and axes
 _MOST_LOG_AXES, _MOST_LEAN = 1.1, 2.0  # nine times as long as wide
 _LEAST_SPREAD_PX2 = 0.05
+_FINER = 2.5
 
 
 @dataclass(frozen=True)
@@ -126,10 +127,12 @@ def _climbed(values: Array, fitted: Callable[[Array], Fitted], hopeless: float) 
     damping, taken = 1e-3, 0
     for _ in range(_MOST_STEPS):
         information, pull = (slopes * weight) @ slopes.T, (slopes * weight) @ left
+        if taken >= JUDGED_AFTER and chi2 > hopeless:
+            to_gain = float(pull @ np.linalg.lstsq(information, pull, rcond=None)[0])
+            if chi2 - MORE_TO_GAIN - TIMES_TO_GAIN * to_gain > hopeless:
+                break
         information[np.diag_indices(len(values))] *= 1.0 + damping
         step = np.linalg.lstsq(information, pull, rcond=None)[0]
-        if taken >= JUDGED_AFTER and chi2 - MORE_TO_GAIN - TIMES_TO_GAIN * float(pull @ step) > hopeless:
-            break
         step[:2] = np.clip(step[:2], -1.0, 1.0)
         step[2:6] = np.clip(step[2:6], -_MOST_LOG_STEP, _MOST_LOG_STEP)
         trial = values + step
@@ -147,9 +150,10 @@ def _climbed(values: Array, fitted: Callable[[Array], Fitted], hopeless: float) 
 
 
 def _largest(flares: Solution, camera: Camera) -> Sources:
-    """Return the image of the flare that looks largest."""
+    """Return the image of the flare that looks largest, in rows so near together that it may be stretched."""
     one = slice(largest := int(np.argmax(flares.radius_at_rest_px)), largest + 1)
-    return lay_out(camera, flares.u_px[one], flares.v_px[one], flares.log_range[one])[0]
+    finer = np.full(1, _FINER)
+    return lay_out(camera, flares.u_px[one], flares.v_px[one], flares.log_range[one], finer=finer)[0]
 
 
 def _first_guess(flares: Solution, light: Array) -> Array:

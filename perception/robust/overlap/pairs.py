@@ -45,15 +45,15 @@ def longer_chi2(one: Solution) -> float:
 
 def is_near(several: Solution, least_px: float) -> bool:
     """Tell whether of flares two are resolved, and one within two radii of the other."""
-    radius_px, apart_px = several.image_radius_px, _apart_px(several)
+    radius_px, apart_px = several.radius_at_rest_px, _apart_px(several)
     near_px, far_px = np.maximum.outer(radius_px, radius_px), np.minimum.outer(radius_px, radius_px)
     is_so = (apart_px < 2.0 * near_px + far_px) & (near_px > least_px) & (far_px > SMALLEST_PX)
     return bool(np.triu(is_so, 1).any())
 
 
 def meeting(several: Solution) -> list[tuple[int, int]]:
-    """Return which two flares' images meet, the larger one first."""
-    radius_px, apart_px = several.image_radius_px, _apart_px(several)
+    """Return which two flares' images meet, as they are at rest, the larger one first."""
+    radius_px, apart_px = several.radius_at_rest_px, _apart_px(several)
     return [
         (one, other) if radius_px[one] >= radius_px[other] else (other, one)
         for one, other in combinations(range(several.count), 2)
@@ -80,7 +80,7 @@ def alone(several: Solution, group: Sequence[int]) -> Solution:
     rows, columns = np.indices(window.image_e.shape)
     beyond_px = [
         np.hypot(columns + window.box.left - u, rows + window.box.top - v) - radius_px
-        for u, v, radius_px in zip(several.u_px, several.v_px, several.image_radius_px, strict=True)
+        for u, v, radius_px in zip(several.u_px, several.v_px, several.radius_at_rest_px, strict=True)
     ]
     is_own = np.isin(np.argmin(beyond_px, axis=0), kept)
     state = np.where(is_own, window.state, UNUSABLE).astype(np.uint8)

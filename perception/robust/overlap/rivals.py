@@ -32,8 +32,18 @@ def weighed(solution: Solution, *others: Solution) -> Solution:
     return wider
 
 
+def likelier(one: Solution | None, other: Solution | None) -> Solution | None:
+    """Return the likelier of two explanations, if there are two, the other in its sigmas."""
+    if one is None or other is None:
+        return other or one
+    return weighed(other, one) if other.cost < one.cost else weighed(one, other)
+
+
 def to_beat(parted: Mapping[int, Solution]) -> dict[int, float]:
-    """Return by index which -2 ln L lets a rival of what is certain to explain a window matter."""
+    """Return by index what a rival of what explains a window must not pass, to matter: its cost, or more.
+
+    As −2 ln L, which is less than a cost by what flares and structure cost.
+    """
     return {index: more.cost + NO_RIVAL for index, more in parted.items()}
 
 

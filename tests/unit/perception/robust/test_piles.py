@@ -57,32 +57,52 @@ def test_each_is_ranged(places: list[Place], times: float) -> None:
         (THREE[:2], [(2.4, -1.8), (2.4, -1.8)]),
         (THREE[:2], [(1.0, 0.0), (0.0, -1.5)]),
         (THREE, [(1.0, 0.5), (-0.7, 0.7), (0.0, 0.0)]),
+        ([(27.3, 30.2, 1.5), (34.1, 33.6, 1.65)], [(0.0, 0.0), (2.3, -1.2)]),
     ],
-    ids=["1 px", "3 px", "each its own", "three"],
+    ids=["1 px", "3 px", "each its own", "three", "the farther one looks larger"],
 )
 def test_each_is_ranged_while_they_move(
     places: list[Place], ways_px: list[tuple[float, float]], times: float
 ) -> None:
     """Clipped none was found, and of others ranges were up to .8 % off, by 11 σ."""
-    parts = (np.arange(9) + 0.5) / 9.0 - 0.5
-    mean_e_per_s = np.mean(
-        [
-            union_e_per_s([(u + at * du, v + at * dv, m) for (u, v, m), (du, dv) in zip(places, ways_px, strict=True)])
-            for at in parts
-        ],
-        axis=0,
-    )  # fmt: skip
-    exposure_s = times * 4000.0 / 0.74 / float(mean_e_per_s.max())
-    # As bright as that in an exposure in which robots move so far.
-    camera = replace(
-        CAMERA, range_constant_dn_m2_per_s=CAMERA.range_constant_dn_m2_per_s * exposure_s / 5e-3, sigma={}
-    )
-    frame = expose(mean_e_per_s * exposure_s + BACKGROUND_E, camera, random(93, round(times)), 5e-3)
-    found = sorted(detect(frame, camera), key=lambda one: one.range_m)
+    found = _told_while_moving(places, ways_px, times, round(times))
     assert len(found) == len(places)
     for place, told in zip(sorted(places, key=lambda place: place[2]), found, strict=True):
         assert np.abs(_pulls(place, told)).max() < 4.5
         assert told.range_sigma_m < 0.005 * told.range_m
+
+
+@pytest.mark.parametrize(
+    ("places", "way_px"),
+    [([(31.83, 31.14, 19.6), (31.38, 28.26, 24.0)], (-0.33, 4.62)), ([(31.9, 32.0, 27.7), (29.0, 32.2, 34.6)], (-2.1, 2.8))],
+)  # fmt: skip
+def test_two_small_ones_that_move_far_are_two(places: list[Place], way_px: tuple[float, float]) -> None:
+    """Of 0.3 to 0.6 px: four to six at rest explain what they add up to, too."""
+    found = _told_while_moving(places, [way_px, way_px], 0.6, 40)
+    assert len(found) == 2
+    for place, told in zip(places, found, strict=True):
+        assert np.abs(_pulls(place, told)).max() < 4.5
+
+
+def _told_while_moving(
+    places: list[Place], ways_px: list[tuple[float, float]], times: float, key: int
+) -> list[Detection]:
+    """Return what is told of a frame in which each moves so far, nearest first."""
+    mean_e_per_s = np.mean(
+        [
+            union_e_per_s(
+                [(u + at * du, v + at * dv, m) for (u, v, m), (du, dv) in zip(places, ways_px, strict=True)]
+            )
+            for at in (np.arange(9) + 0.5) / 9.0 - 0.5
+        ],
+        axis=0,
+    )
+    exposure_s = times * 4000.0 / 0.74 / float(mean_e_per_s.max())
+    # As bright as that in an exposure in which robots move so far.
+    constant = CAMERA.range_constant_dn_m2_per_s * exposure_s / 5e-3
+    camera = replace(CAMERA, range_constant_dn_m2_per_s=constant)
+    frame = expose(mean_e_per_s * exposure_s + BACKGROUND_E, camera, random(93, key), 5e-3)
+    return sorted(detect(frame, camera), key=lambda one: one.range_m)
 
 
 def test_sigmas_are_true() -> None:
