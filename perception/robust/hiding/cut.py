@@ -112,7 +112,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
     u_px, v_px = (corner + middle).tolist()
     at_1_m_px = float(image_radius_px(u_px, v_px, math.asin(min(camera.radius_m, 1.0)), camera.calibration))
     most_e = math.inf if cluster.is_clipped else level_e
-    if not at_1_m_px > 0.0 or not is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
+    if not at_1_m_px > 0.0 or not is_as_bright(level_e, most_e, (u_px, v_px), camera):
         return []
     guesses = []
     for turn in np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS):

@@ -13,10 +13,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import direction_camera
 from perception.model.flare import image_radius_px
 from perception.model.layout import CLIPPED, UNUSABLE
-from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera, log_flux_at_1_m
+from perception.model.ranging import brightness_e
+from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.hiding.climb import good_ones
@@ -136,7 +136,9 @@ def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> So
             break
         if pile.count > 1:
             is_there = climb.to_gain < _NEARLY and _is_good(pile, camera)
-            for each in (pile if is_there else None, _moved(pile, camera)):
+            # Of what clips, more that move than its outline shows fill any patch.
+            moved = None if more > 0 and cluster.is_clipped else _moved(pile, camera)
+            for each in (pile if is_there else None, moved):
                 likeliest = likelier(likeliest, each)
         # Ones that move may explain what another flare does far better.
         explained = pile if likeliest is None or likeliest.motion_px is not None else likeliest
@@ -249,7 +251,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     most_e = math.inf if cluster.is_clipped else level_e
     if not at_1_m_px > 0.0 or at_1_m_px / near_px < LEAST_RANGE_M:
         return []
-    if not is_as_bright(level_e, most_e, (u_px, v_px), at_1_m_px, camera):
+    if not is_as_bright(level_e, most_e, (u_px, v_px), camera):
         return []
     guesses = []
     for sign in (1.0, -1.0):
@@ -297,11 +299,8 @@ def lit_pixels(cluster: Cluster) -> tuple[float, Array] | None:
     return level_e, np.column_stack([columns, rows]).astype(np.float64)
 
 
-def is_as_bright(
-    least_e: float, most_e: float, place: tuple[float, float], at_1_m_px: float, camera: Camera
-) -> bool:
+def is_as_bright(least_e: float, most_e: float, place: tuple[float, float], camera: Camera) -> bool:
     """Tell whether pixels of so much light may be of sources, which are as bright at any range."""
-    at_1_m_e = log_flux_at_1_m(camera, direction_camera([place], camera.calibration))
-    source_e = math.exp(float(at_1_m_e[0])) / (math.pi * at_1_m_px**2)
+    source_e = float(brightness_e(np.array([place]), camera.exposure_s, camera.gain, camera.calibration)[0])
     spread = 1.0 + 4.0 * camera.flux_spread
     return _DIMMEST / spread * source_e < most_e and least_e < _BRIGHTEST * spread * source_e

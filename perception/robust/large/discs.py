@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from perception.model.bearing import direction_camera
 from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.lens import stretch
-from perception.model.ranging import covered_px_at_1_m
+from perception.model.ranging import brightness_e, covered_px_at_1_m
 from perception.model.window import Camera
 from perception.robust.around.uneven import MOST_LEFT
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, least_flux_e
@@ -208,8 +208,8 @@ def _is_no_large_disc(member: Candidate, outline: Outline | None, prepared: Prep
         return True
     if not member.at_one_metre_e > 0.0:
         return False
-    at_1_m_px2 = float(covered_px_at_1_m(np.array([[member.u_px, member.v_px]]), calibration)[0])
-    disc_e = member.at_one_metre_e / at_1_m_px2
+    frame, place = prepared.frame, np.array([[member.u_px, member.v_px]])
+    disc_e = float(brightness_e(place, frame.exposure_s, frame.gain, calibration)[0])
     seen_e = float(np.median(prepared.excess_e[member.blob.box.slices][member.blob.pixels]))
     if disc_e > seen_e:
         return not member.is_clipped and disc_e > _MOST_BRIGHTNESS_FACTOR * seen_e
