@@ -38,7 +38,7 @@ from perception.robust.overlap.pairs import (
     longer_chi2,
     meeting,
 )
-from perception.robust.overlap.rivals import likelier
+from perception.robust.overlap.rivals import NO_RIVAL, likelier
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution
 
@@ -159,7 +159,8 @@ def _moved(pile: Solution, camera: Camera) -> Solution | None:
         return None
     problem = Problem(pile.window, pile.starts, pile.background_e, motions)
     moving = replace(camera, motion_px=MOTION_PX)
-    moved = Spheres(problem, moving).solution()
+    most_cost = pile.cost + NO_RIVAL if _is_good(pile, camera) else math.inf
+    moved = Spheres(problem, moving).solution(most_cost)
     if moved is None or not _is_good(moved, moving):
         return None
     return moved if LEAST_PX <= moved.most_motion_px <= MOST_MOTION_PX else None
