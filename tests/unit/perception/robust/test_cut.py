@@ -66,7 +66,7 @@ def test_a_part_tells_the_range_of_the_whole(range_m: float, shown: float) -> No
 def test_a_part_of_one_that_moves_does_too(range_m: float, way_px: tuple[float, float], times: float) -> None:
     """By 5 to 20 σ it was told too near."""
     place = (31.3, 31.6, range_m)
-    parts = (np.arange(9) + 0.5) / 9.0 - 0.5
+    parts = (np.arange(5) + 0.5) / 5.0 - 0.5
     mean_e_per_s = np.mean(
         [cut_e_per_s(place, 0.7, 0.7, (at * way_px[0], at * way_px[1])) for at in parts], axis=0
     )

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -84,19 +85,24 @@ def test_two_small_ones_that_move_far_are_two(places: list[Place], way_px: tuple
         assert np.abs(_pulls(place, told)).max() < 4.5
 
 
-def _told_while_moving(
-    places: list[Place], ways_px: list[tuple[float, float]], times: float, key: int
-) -> list[Detection]:
-    """Return what is told of a frame in which each moves so far, nearest first."""
-    mean_e_per_s = np.mean(
+@cache
+def _moved_e_per_s(moving: tuple[tuple[Place, tuple[float, float]], ...]) -> Array:
+    """Return the mean frame of places, each of which moves evenly by so much."""
+    mean = np.mean(
         [
-            union_e_per_s(
-                [(u + at * du, v + at * dv, m) for (u, v, m), (du, dv) in zip(places, ways_px, strict=True)]
-            )
+            union_e_per_s([(u + at * du, v + at * dv, range_m) for (u, v, range_m), (du, dv) in moving])
             for at in (np.arange(9) + 0.5) / 9.0 - 0.5
         ],
         axis=0,
     )
+    return np.asarray(mean)
+
+
+def _told_while_moving(
+    places: list[Place], ways_px: list[tuple[float, float]], times: float, key: int
+) -> list[Detection]:
+    """Return what is told of a frame in which each moves so far, nearest first."""
+    mean_e_per_s = _moved_e_per_s(tuple(zip(places, ways_px, strict=True)))
     exposure_s = times * 4000.0 / 0.74 / float(mean_e_per_s.max())
     # As bright as that in an exposure in which robots move so far.
     constant = CAMERA.range_constant_dn_m2_per_s * exposure_s / 5e-3
