@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from perception.model.layout import Layout, Structure, View, even
 from perception.model.pixels import expectation
 from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import clip_level_e, noise_floor_e2, pixel_variance_e2
-from perception.model.window import MOTION_PX, Camera, lay_out
+from perception.model.window import Camera, lay_out
 from perception.types import Calibration
 
 WIDE_PX = 64.0
@@ -311,7 +311,7 @@ def _known(
     """Return what is known of flares, shape (flares, 4) as in `flare_limits`; None if nothing is."""
     box, camera, moved_px = limit_box(calibration, place), Camera(calibration, 1.0, 1.0), None
     if motions_px is not None:
-        camera = replace(camera, motion_px=MOTION_PX)
+        camera = camera.moving
         moved_px = np.hypot(*np.array(motions_px, dtype=np.float64).T)
         box = box.with_margin(math.ceil(float(moved_px.max()))).inside(
             (calibration.height_px, calibration.width_px)

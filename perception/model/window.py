@@ -11,7 +11,7 @@ u its place in the middle of the exposure.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,11 @@ class Camera:
     exposure_s: float
     gain: float
     motion_px: float = 0.0
+
+    @property
+    def moving(self) -> "Camera":
+        """The camera of flares that may move."""
+        return replace(self, motion_px=MOTION_PX)
 
     @property
     def flux_spread(self) -> float:

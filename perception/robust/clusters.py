@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
+from perception.model.discs.nodes import smoothing_px
 from perception.model.flare import PixelBox
 from perception.model.lens import stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
@@ -135,7 +136,7 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
         return False
     half_area = int(np.count_nonzero(candidate.blob.filtered_e > 0.5 * candidate.blob.peak_e))
     # Half maximum of a Gaussian filtered with itself lies at √(2 ln 2) · √2 σ = 1.67 σ.
-    smooth_px = math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
+    smooth_px = smoothing_px(prepared.calibration)
     return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
 
 
@@ -276,7 +277,7 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
         if starts not in sets:
             sets.append(starts)
     if len(sets) == 1 and len(cluster.members) == 1:
-        (member,), smooth_px = cluster.members, math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0)
+        (member,), smooth_px = cluster.members, smoothing_px(prepared.calibration)
         box, filtered_e = member.blob.box, member.blob.filtered_e
         row, column = divmod(int(np.argmax(filtered_e)), box.width)
         u_px, v_px = float(box.left + column), float(box.top + row)

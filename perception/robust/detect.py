@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import bearing_body
+from perception.model.discs.nodes import smoothing_px
 from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
 from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
@@ -213,7 +214,7 @@ def _split(component: Blob, middle_e: float, prepared: PreparedFrame) -> list[Bl
     """
     expected_e = np.maximum(component.filtered_e + np.float32(middle_e), np.float32(0.0))
     noise_e = np.sqrt(expected_e + np.float32(prepared.floor_e2)) * np.float32(prepared.filtered_noise)
-    reach_px = math.ceil(_SUMMIT_REACH * math.sqrt(prepared.calibration.psf_sigma_px**2 + 1.0 / 12.0))
+    reach_px = math.ceil(_SUMMIT_REACH * smoothing_px(prepared.calibration))
     least_px = _LARGE_HILL * (reach_px + 1) ** 2
     clips = component.pixels & prepared.clipped_in(component.box) if is_large(component) else None
     disc_e = _disc_level_e(component, prepared)

@@ -58,8 +58,13 @@ def moving(
     return {
         index: weighed(fit, at_rest) if fit.cost < at_rest.cost else weighed(at_rest, fit)
         for (index, at_rest), fit in zip(tried, fits, strict=True)
-        if fit is not None and LEAST_PX <= fit.most_motion_px <= MOST_MOTION_PX
+        if fit is not None and moves(fit)
     }
+
+
+def moves(fit: Solution) -> bool:
+    """Tell whether flares that may move do: as far as is seen, and no farther than is believed."""
+    return LEAST_PX <= fit.most_motion_px <= MOST_MOTION_PX
 
 
 def asked_motions(solution: Solution, camera: Camera) -> list[Motion]:

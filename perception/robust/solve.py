@@ -6,7 +6,7 @@ laid out for all windows at once, and anew where a size, or a large disc, has mo
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from perception.model.layout import Sources, part_of
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
-from perception.model.window import MOTION_PX, Camera, lay_out
+from perception.model.window import Camera, lay_out
 from perception.model.window import motion_cost as cost_of_motion
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import LeftOver, drawn_out, left_over, residual_e
@@ -202,7 +202,7 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     """
     if not problems:
         return []
-    moving = replace(camera, motion_px=MOTION_PX)
+    moving = camera.moving
     fits = [Fit(problem, camera if problem.motions is None else moving) for problem in problems]
     solved: dict[int, Solution] = {}
     for of_camera, moves in ((camera, False), (moving, True)):

@@ -121,13 +121,15 @@ def disc_nodes(
 def fineness_of(
     direction: Array, angular_radius_rad: Array, calibration: Calibration, finer: Array | None
 ) -> tuple[float, Array]:
-    """Return the width that smooths images, in pixels, and for each the ratio of its radius to that.
-
-    Pixels smooth like a box of variance 1/12 px², on top of the point spread.
-    """
-    smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
+    """Return the width that smooths images, in pixels, and for each the ratio of its radius to that."""
+    smooth_px = smoothing_px(calibration)
     radius_px = stretch(direction, calibration) * np.tan(angular_radius_rad)
     return smooth_px, radius_px / smooth_px if finer is None else radius_px / (smooth_px / finer)
+
+
+def smoothing_px(calibration: Calibration) -> float:
+    """Width that smooths images: of the point spread, and of pixels, like a box of variance 1/12 px²."""
+    return math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
 
 
 def along_lines(still: DiscNodes, length: Array) -> DiscNodes:

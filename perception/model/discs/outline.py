@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 HARMONICS = 7
 AROUND = 2 * HARMONICS + 2  # points of an outline
 _STEPS, _SETTLED = 40, 1e-8  # Newton's, in rad
+_LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
 
 
 @compiled
@@ -42,6 +43,20 @@ def series_of(values: Array) -> Array:
             series[harmonic, 1] += values[at] * math.sin(turn) * 2.0 / AROUND
     series[0] *= 0.5
     return series
+
+
+@compiled
+def outline_of(outline_px: Array) -> tuple[Array, Array, float, float]:
+    """Return u and v of an outline, shape (`AROUND`, 2), as series, and where it is highest and lowest.
+
+    NaN are both angles of an outline that so few harmonics do not make.
+    """
+    of_u, of_v = series_of(outline_px[:, 0]), series_of(outline_px[:, 1])
+    last = np.abs(of_u[HARMONICS]).max() + np.abs(of_v[HARMONICS]).max()
+    if not last <= _LEFT_OUT * np.abs(of_v[1]).max():
+        return of_u, of_v, math.nan, math.nan
+    lowest = extreme(of_v, math.atan2(of_v[1, 1], of_v[1, 0]))
+    return of_u, of_v, extreme(of_v, math.atan2(-of_v[1, 1], -of_v[1, 0])), lowest
 
 
 @compiled

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.bearing import angle_from_axis_rad, pixel_turn
 from perception.model.discs.nodes import DiscNodes, along_lines, disc_nodes, fineness_of
-from perception.model.discs.outline import AROUND, HARMONICS, crossing, extreme, rims_of, series_of, value_at
+from perception.model.discs.outline import AROUND, crossing, outline_of, rims_of, value_at
 from perception.model.lens import distortion_of, project
 from perception.types import Calibration
 
@@ -25,8 +25,7 @@ Array = NDArray[np.float64]
 # Rows per ratio of image radius to smoothing: the smallest numbers, found by comparison with three times as
 # many, that keep the error below 1e-4 of the peak for radii from 0 to 130 px.
 _ROWS_BASE, _ROWS_SLOPE = 1.4, 2.7
-SMOOTH_RAD, _MOST_PARTS = 0.05, 8  # half of a strip on the axis along which light is as in a parabola
-LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
+_SMOOTH_RAD, _MOST_PARTS = 0.05, 8  # half of a strip on the axis along which light is as in a parabola
 _TIMES_MOVED = 2
 _PLACES = 5  # of a strip where light is looked at: its ends, its middle, and two between to try the parabola
 _MOST_OFF, _MOST_RATIO = 2e-4, 4.0  # of the greatest light; of that to the least
@@ -54,9 +53,7 @@ def disc_rows(
     outlines_px -= np.stack([u_px, v_px], axis=1)[:, None, :]
     is_disc = angular_radius_rad > 0.0
     rows = np.where(is_disc, np.ceil(_ROWS_BASE + _ROWS_SLOPE * fineness), 1.0).astype(np.int64)
-    # cos⁴ θ, as light falls off, bends so much more away from the axis.
-    bend = np.sqrt(3.0 / direction[:, 2] ** 2 - 2.0)
-    parts = np.clip(np.ceil(angular_radius_rad * bend / SMOOTH_RAD), 1.0, _MOST_PARTS).astype(np.int64)
+    parts = parts_of_rows(direction, angular_radius_rad)
     first = np.cumsum([0, *(rows * parts).tolist()])
     strip_v_px, share, omega, is_known = _strips(
         first, rows, parts, outlines_px, direction, across, down, angular_radius_rad
@@ -77,6 +74,14 @@ def disc_rows(
     if not is_known.all():
         strips = _with_points(strips, is_known, u_px, v_px, direction, angular_radius_rad, calibration, finer)
     return strips if moved_px is None else along_lines(strips, moved_px / smooth_px)
+
+
+def parts_of_rows(direction: Array, angular_radius_rad: Array) -> NDArray[np.int64]:
+    """Return in how many parts, along each of which light is a parabola, rows of each cap are laid out."""
+    # cos⁴ θ, as light falls off, bends so much more away from the axis.
+    bend = np.sqrt(3.0 / direction[:, 2] ** 2 - 2.0)
+    parts = np.clip(np.ceil(angular_radius_rad * bend / _SMOOTH_RAD), 1.0, _MOST_PARTS)
+    return np.asarray(parts.astype(np.int64))
 
 
 def light_from(omega: Array, calibration: Calibration) -> Array:
@@ -123,13 +128,10 @@ def _strips(
         omega[first[cap] : first[cap + 1]] = direction[cap]
         if angular_radius_rad[cap] == 0.0:
             continue
-        of_u, of_v = series_of(outlines_px[cap, :, 0]), series_of(outlines_px[cap, :, 1])
-        last = np.abs(of_u[HARMONICS]).max() + np.abs(of_v[HARMONICS]).max()
-        is_known[cap] = last <= LEFT_OUT * np.abs(of_v[1]).max()  # not if it is not a number
+        of_u, of_v, highest, lowest = outline_of(outlines_px[cap])
+        is_known[cap] = math.isfinite(highest + lowest)
         if not is_known[cap]:
             continue
-        lowest = extreme(of_v, math.atan2(of_v[1, 1], of_v[1, 0]))
-        highest = extreme(of_v, math.atan2(-of_v[1, 1], -of_v[1, 0]))
         bottom, top = value_at(of_v, lowest)[0], value_at(of_v, highest)[0]
         one_way = (highest - lowest) % (2.0 * math.pi)
         other_way = one_way - 2.0 * math.pi

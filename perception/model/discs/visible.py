@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.bearing import direction_camera
-from perception.model.discs.outline import AROUND, HARMONICS, crossing, extreme, rims_of, series_of, value_at
-from perception.model.discs.rows import LEFT_OUT, SMOOTH_RAD, light_from
+from perception.model.discs.nodes import smoothing_px
+from perception.model.discs.outline import AROUND, HARMONICS, crossing, extreme, outline_of, rims_of, value_at
+from perception.model.discs.rows import light_from, parts_of_rows
 from perception.model.lens import project
 from perception.types import Calibration
 
@@ -26,7 +27,6 @@ Array = NDArray[np.float64]
 _ROWS_BASE, _ROWS_SLOPE = 5.0, 4.0
 _MOST_ROWS = 64  # more are of several heights
 _LEAST_HEIGHT_PX = 1e-4
-_MOST_PARTS = 8
 _SIMPSON: Array = np.array([1.0, 4.0, 1.0]) / 6.0
 _LEAST_COSINE = 1e-4  # of an edge's direction: along a row it would end everywhere at once
 NO_LIMB, EDGE = -1, -2
@@ -109,16 +109,14 @@ def seen_of_discs(
         A place u, v, a direction from there, in rad from u towards v, and how far that way a straight edge
         lies, at a right angle to it, beyond which nothing is seen of any; by default none.
     """
-    smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
+    smooth_px = smoothing_px(calibration)
     if abs(math.cos(edge[2])) < _LEAST_COSINE:
         cosine, sine = math.copysign(_LEAST_COSINE, math.cos(edge[2])), math.sin(edge[2])
         edge = np.array([edge[0], edge[1], math.atan2(sine, cosine), edge[3]])
     rims, across, down = rims_of(direction, radius_rad)
     with np.errstate(invalid="ignore", divide="ignore"):
         outlines_px = project(rims.reshape(-1, 3), calibration).reshape(-1, AROUND, 2)
-    # cos⁴ θ, as light falls off, bends so much more away from the axis.
-    bend = np.sqrt(np.maximum(3.0 / direction[:, 2] ** 2 - 2.0, 0.0))
-    parts = np.clip(np.ceil(radius_rad * bend / SMOOTH_RAD), 1.0, _MOST_PARTS).astype(np.int64)
+    parts = parts_of_rows(direction, radius_rad)
     row_disc, of_rows, row, of_pieces, limb, is_known = _pieces(
         outlines_px, direction, across, down, radius_rad, hides, edge, parts, smooth_px
     )
@@ -302,11 +300,7 @@ def _pieces(
     of_u, of_v = np.empty((discs, 1 + HARMONICS, 2)), np.empty((discs, 1 + HARMONICS, 2))
     turns, is_known = np.empty((discs, 2)), True
     for disc in range(discs):
-        of_u[disc], of_v[disc] = series_of(outlines_px[disc, :, 0]), series_of(outlines_px[disc, :, 1])
-        last = np.abs(of_u[disc, HARMONICS]).max() + np.abs(of_v[disc, HARMONICS]).max()
-        is_known &= last <= LEFT_OUT * np.abs(of_v[disc, 1]).max()  # not if it is not a number
-        turn = math.atan2(of_v[disc, 1, 1], of_v[disc, 1, 0])
-        turns[disc] = extreme(of_v[disc], turn + math.pi), extreme(of_v[disc], turn)
+        of_u[disc], of_v[disc], turns[disc, 0], turns[disc, 1] = outline_of(outlines_px[disc])
         is_known &= math.isfinite(turns[disc].sum())
     row_disc, of_rows = [0][:0], [0.0][:0]
     piece_row, of_pieces, limbs = [0][:0], [0.0][:0], [0][:0]

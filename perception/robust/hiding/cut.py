@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import image_radius_px
-from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera
+from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit
 from perception.robust.hiding.climb import Climb, good_ones
 from perception.robust.hiding.eclipse import is_as_bright, lit_pixels
 from perception.robust.hiding.spheres import expectation_of_spheres
-from perception.robust.motion import AT_REST, LEAST_PX, asked_motions
+from perception.robust.motion import AT_REST, asked_motions, moves
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import NO_RIVAL, likelier
@@ -165,9 +165,9 @@ class _Cut(Climb):
         ((u_px, v_px, log_range),) = at_rest.starts
         turn, edge_px = self._values[-2:].tolist()
         edge_px += (self._from[0] - u_px) * math.cos(turn) + (self._from[1] - v_px) * math.sin(turn)
-        guess, moving = (u_px, v_px, log_range, turn, edge_px), replace(self._camera, motion_px=MOTION_PX)
+        guess, moving = (u_px, v_px, log_range, turn, edge_px), self._camera.moving
         moved = _Cut(at_rest.window, at_rest.background_e, guess, moving, motions)._likeliest(most_cost)
-        if moved is None or not LEAST_PX <= moved.most_motion_px <= MOST_MOTION_PX:
+        if moved is None or not moves(moved):
             return at_rest
         return likelier(at_rest, moved)
 

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from perception.model.flare import image_radius_px
 from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.ranging import brightness_e
-from perception.model.window import MOST_MOTION_PX, MOTION_PX, Camera
+from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.hiding.climb import good_ones
 from perception.robust.hiding.covered import shows_its_size
 from perception.robust.hiding.outlines import discs_by_outline
 from perception.robust.hiding.spheres import Spheres
-from perception.robust.motion import AT_REST, LEAST_PX, asked_motions
+from perception.robust.motion import AT_REST, asked_motions, moves
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
@@ -158,12 +158,10 @@ def _moved(pile: Solution, camera: Camera) -> Solution | None:
     if all(motion == AT_REST for motion in motions):
         return None
     problem = Problem(pile.window, pile.starts, pile.background_e, motions)
-    moving = replace(camera, motion_px=MOTION_PX)
+    moving = camera.moving
     most_cost = pile.cost + NO_RIVAL if _is_good(pile, camera) else math.inf
     moved = Spheres(problem, moving).solution(most_cost)
-    if moved is None or not _is_good(moved, moving):
-        return None
-    return moved if LEAST_PX <= moved.most_motion_px <= MOST_MOTION_PX else None
+    return moved if moved is not None and _is_good(moved, moving) and moves(moved) else None
 
 
 def _believed(pile: Solution, camera: Camera) -> Solution | None:
@@ -220,7 +218,7 @@ def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
         inwards = float(pile.radius_at_rest_px[far]) * (math.exp(far_log - log_range) - 1.0) / apart_px
         place = far_u + inwards * (near_u - far_u), far_v + inwards * (near_v - far_v)
         starts[far] = (*place, log_range)
-        moving = camera if pile.motions is None else replace(camera, motion_px=MOTION_PX)
+        moving = camera if pile.motions is None else camera.moving
         climb = Spheres(Problem(pile.window, starts, pile.background_e, pile.motions), moving)
         other = climb.solution(pile.cost + _RIVAL)
         # One that goes on without an end is not excluded where it has come as far as the pair.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
-from perception.model.discs.nodes import line_rule
+from perception.model.discs.nodes import line_rule, smoothing_px
 from perception.model.discs.visible import NO_EDGE, Seen, seen_of_discs
 from perception.model.flare import is_before
 from perception.model.window import Camera, log_flux_at_1_m
@@ -101,8 +101,7 @@ def _line_rule_of(motion_px: Array, calibration: Calibration) -> tuple[Array, Ar
     """Return at which parts of their motions spheres are looked at, and the weight of each."""
     if not motion_px.any():
         return np.zeros(1), np.ones(1)
-    smooth_px = math.sqrt(calibration.psf_sigma_px**2 + 1.0 / 12.0)
-    return line_rule(float(np.hypot(*motion_px.T).max()) / smooth_px)
+    return line_rule(float(np.hypot(*motion_px.T).max()) / smoothing_px(calibration))
 
 
 def _hides(axis: Array, radius_rad: Array) -> NDArray[np.int64]:
