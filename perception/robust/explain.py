@@ -39,7 +39,7 @@ from perception.robust.overlap.deblend import (
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import is_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
-from perception.robust.overlap.rivals import beside_rival, better, to_beat, weighed
+from perception.robust.overlap.rivals import against, beside_rival, better, to_beat, weighed
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
@@ -101,12 +101,11 @@ def _piles(
             pile = pile_of(cluster, camera)
             if pile is not None and pile.left_over.is_nothing:
                 piles[index] = pile
-    lone = [one if index in piles else None for index, one in enumerate(plain)]
-    least = {
-        index: pile.deviance + _GOOD_SIGMAS * math.sqrt(2.0 * pile.expected_e.size)
-        for index, pile in piles.items()
-    }
-    for index, line in moving(lone, camera, least).items():
+    lone: list[Solution | None] = [None] * len(plain)
+    for index, pile in piles.items():
+        one, most = plain[index], pile.deviance + _GOOD_SIGMAS * math.sqrt(2.0 * pile.expected_e.size)
+        lone[index] = None if one is None else to_beat(one, most)
+    for index, line in moving(lone, camera).items():
         if line.motion_px is not None and line.left_over.is_good:
             del piles[index]
     return piles
@@ -120,7 +119,8 @@ def _explained(
     camera: Camera,
 ) -> list[Solution | None]:
     """Explain windows by more than a flare for each blob, as by `piles`, where that explains them better."""
-    chosen = list(solved)
+    # Of what spheres explain entirely all else is worth a look only as far as it may matter beside them.
+    chosen = against(solved, piles)
     lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
     on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}
     # What light fog throws forward goes by a flux that an edge no longer leads astray.
@@ -154,7 +154,7 @@ def _explained(
         few = {
             k: more for k, more in parted.items() if (one := plain[k]) is None or more.count <= one.count + 1
         }
-        known = _take_lines(chosen, plain, halos, spilled, to_beat(few), camera)
+        known = _take_lines(chosen, plain, halos, spilled, few, camera)
         _drop_beside_lines(chosen, parted, halos, prepared.shape, camera, cut_short)
     retry_without_spill(chosen, parted, prepared, camera)
     uneven_e = [0.0 if one is None else one.left_over.structure_e for one in chosen]
@@ -176,7 +176,8 @@ def _explained(
     if prepared.frame.line_time_s == 0.0:
         highlit = _beside_highlights(found, at_rest, chosen, parted, prepared.shape, camera)
         _adopt(likelier_beside_highlights(highlit, chosen, parted), chosen, parted, uneven_e)
-    retry_on_uneven_ground(chosen, uneven_e, to_beat(parted), camera)
+    chosen = against(chosen, parted)
+    retry_on_uneven_ground(chosen, uneven_e, camera)
     for index, more in parted.items():
         chosen[index] = better(more, chosen[index])
     for index, pair in rivals.items():
@@ -203,7 +204,7 @@ def _take_lines(
     plain: Sequence[Solution | None],
     halos: dict[int, Solution],
     without_spill: Mapping[int, Solution],
-    least: Mapping[int, float],
+    few: Mapping[int, Solution],
     camera: Camera,
 ) -> list[Solution | None]:
     """Choose flares that move where they explain more than flares at rest; both with their halos, if any.
@@ -212,7 +213,7 @@ def _take_lines(
     are those of what is returned: of lines where these were chosen, else of `plain`.
     """
     known = list(plain)
-    lines = moving(plain, camera, least)
+    lines = moving(against(plain, few), camera)
     tried = {index: one for index, one in lines.items() if one.motion_px is not None and index in halos}
     of_lines = with_halo(tried, camera)
     for index, line in lines.items():

@@ -18,7 +18,6 @@ class Fit:
 
     def __init__(self, problem: Problem, camera: Camera) -> None:
         window = problem.window
-        self.to_beat = problem.to_beat
         self.window, self.known = window, camera.known(window.clip_e)
         self.structure = window.beside
         self.layout = self.known.layout(len(problem.starts), len(self.structure.columns))
@@ -76,7 +75,7 @@ class Fit:
         """Go on to the greatest likelihood, with images as laid out, of so large radii."""
         self.deviance, self.log_information = maximise(
             self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
-            self.to_beat, self.values, self.covariance, self.expected_e.ravel(),
+            self.window.to_beat, self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
         self.converged = math.isfinite(self.deviance)
         growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))

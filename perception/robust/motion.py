@@ -1,7 +1,7 @@
 """Flares that are drawn out, as they move while they are exposed: rivals of round ones and of pairs."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +32,13 @@ AT_REST = (0.0, 0.0)
 
 
 def moving(
-    solutions: Sequence[Solution | None], camera: Camera, to_beat: Mapping[int, float] | None = None
+    solutions: Sequence[Solution | None], camera: Camera
 ) -> dict[int, Solution]:
     """Fit flares that are longer than wide as moving ones, and return by index the likelier of both.
 
     Lone ones where the residual says so; of several in one window, where it asks for more. The sigmas of what
-    is returned know of the other. None that is sure to be less likely than `to_beat` says, −2 ln L by index.
+    is returned know of the other.
     """
-    least = to_beat or {}
     tried: list[tuple[int, Solution]] = []
     problems = []
     for index, solution in enumerate(solutions):
@@ -50,10 +49,7 @@ def moving(
         motions = asked_motions(solution, camera)
         if any(motion != AT_REST for motion in motions):
             tried.append((index, solution))
-            window, background_e = solution.window, solution.background_e
-            problems.append(
-                Problem(window, solution.starts, background_e, motions, least.get(index, math.inf))
-            )
+            problems.append(Problem(solution.window, solution.starts, solution.background_e, motions))
     fits = solve(problems, camera)
     return {
         index: weighed(fit, at_rest) if fit.cost < at_rest.cost else weighed(at_rest, fit)

@@ -42,6 +42,8 @@ class Window:
         what is not known of it, which lies on top of any structure; None where nothing is.
     features
         Straight edges or highlights on the background, with what is not known of them; None where none are.
+    to_beat
+        −2 ln L of a fit that is worth no further step if it is sure to be less likely.
     """
 
     box: PixelBox
@@ -56,6 +58,7 @@ class Window:
     known_e: Array | None = None
     unsure: Structure | None = None
     features: Structure | None = None
+    to_beat: float = math.inf
 
     @cached_property
     def view(self) -> View:
@@ -80,13 +83,9 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A window, first guesses of its flares, of its background, and of how each moves; None: none does.
-
-    `to_beat` is −2 ln L of a fit that is worth no further step if it is sure to be less likely.
-    """
+    """A window, first guesses of its flares, of its background, and of how each moves; None: none does."""
 
     window: Window
     starts: Sequence[Start]
     background_e: float
     motions: Sequence[Motion] | None = None
-    to_beat: float = math.inf

@@ -136,9 +136,9 @@ class Solution:
         own = np.column_stack([self.u_px, self.v_px, self.log_photometric_range])
         return [(u, v, log_range) for u, v, log_range in own.tolist()]
 
-    def again(self, window: Window | None = None, to_beat: float = math.inf) -> Problem:
+    def again(self, window: Window | None = None) -> Problem:
         """Return the problem of fitting these flares again, or to another view of their window."""
-        return Problem(window or self.window, self.starts, self.background_e, self.motions, to_beat)
+        return Problem(window or self.window, self.starts, self.background_e, self.motions)
 
     @property
     def most_motion_px(self) -> float:

@@ -1,7 +1,7 @@
 """Flares fitted again where what is left over has no shape: uneven ground, charge that was spilled."""
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,12 +31,12 @@ _WIDTHS_OF_DISC = (0.5, 1.0)
 
 
 def retry_on_uneven_ground(
-    best: list[Solution | None], uneven_e: Sequence[float], to_beat: Mapping[int, float], camera: Camera
+    best: list[Solution | None], uneven_e: Sequence[float], camera: Camera
 ) -> None:
     """Fit again where something lies around the flares: edges, of the strength that plain fits leave over.
 
-    What is too sharp even for them counts as noise of the window. Nothing is left of what is sure to be less
-    likely than `to_beat` says, −2 ln L by index.
+    What is too sharp even for them counts as noise of the window. Nothing is left of what its window says is
+    not worth it (`Window.to_beat`).
     """
     for is_noise in (False, True):
         tried, problems = [], []
@@ -53,7 +53,7 @@ def retry_on_uneven_ground(
             else:
                 continue
             tried.append(index)
-            problems.append(solution.again(window, to_beat.get(index, math.inf)))
+            problems.append(solution.again(window))
         for index, again in zip(tried, solve(problems, camera), strict=True):
             best[index] = again
 

@@ -183,7 +183,11 @@ def _believed(pile: Solution, camera: Camera) -> Solution | None:
 def _by_both_ends(
     cluster: Cluster, one: Solution | None, more: Solution | None, camera: Camera, *, may_be: bool
 ) -> list[Solution]:
-    """Explain a window by two discs at both ends of what is lit, or where two flares were before."""
+    """Explain a window by two discs at both ends of what is lit, or where two flares were before.
+
+    As far as that may matter beside what explains the window already.
+    """
+    most_cost = math.inf if one is None else one.window.to_beat
     of_layouts = knows_layouts(camera)
     guesses: list[list[Start]] = []
     if of_layouts and one is not None and one.count > 1 and asks_for_more(one):
@@ -199,7 +203,7 @@ def _by_both_ends(
     fits = [Spheres(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
     fits.sort(key=lambda fit: fit.objective)
     fits = [Spheres(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
-    return good_ones((fit.solution() for fit in fits), partial(_is_good, camera=camera), _TRIED)
+    return good_ones((fit.solution(most_cost) for fit in fits), partial(_is_good, camera=camera), _TRIED)
 
 
 def _is_good(pile: Solution, camera: Camera) -> bool:

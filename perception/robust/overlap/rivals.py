@@ -1,7 +1,7 @@
 """Of two explanations the likelier one, its sigmas wider by what differs in the other."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,12 +39,20 @@ def likelier(one: Solution | None, other: Solution | None) -> Solution | None:
     return weighed(other, one) if other.cost < one.cost else weighed(one, other)
 
 
-def to_beat(parted: Mapping[int, Solution]) -> dict[int, float]:
-    """Return by index what a rival of what explains a window must not pass, to matter: its cost, or more.
+def against(solutions: Sequence[Solution | None], rivals: Mapping[int, Solution]) -> list[Solution | None]:
+    """Return solutions whose further fits are given up where they are sure to matter nothing beside rivals.
 
-    As −2 ln L, which is less than a cost by what flares and structure cost.
+    Rivals by index. A cost is bounded as −2 ln L, which is less by what flares and structure cost.
     """
-    return {index: more.cost + NO_RIVAL for index, more in parted.items()}
+    return [
+        to_beat(one, rivals[index].cost + NO_RIVAL) if one is not None and index in rivals else one
+        for index, one in enumerate(solutions)
+    ]
+
+
+def to_beat(one: Solution, most: float) -> Solution:
+    """Return a solution whose further fits are given up where −2 ln L is sure to exceed that."""
+    return replace(one, window=replace(one.window, to_beat=most))
 
 
 def better(pair: Solution, other: Solution | None) -> Solution:
