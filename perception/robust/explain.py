@@ -98,7 +98,8 @@ def _piles(
         return piles
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if one is None or may_be_other_shape(one, camera):
-            pile = pile_of(cluster, camera)
+            is_lone = one is not None and one.count == 1 and one.window is cluster.window
+            pile = pile_of(cluster, camera, one if is_lone else None)
             if pile is not None and pile.left_over.is_nothing:
                 piles[index] = pile
     lone: list[Solution | None] = [None] * len(plain)

@@ -72,14 +72,19 @@ class Fit:
         return unlikeliness(self.window.view, sources, self.structure, self.known, self.prior, guesses)
 
     def climb(self, sources: Sources, reach_px: Array) -> None:
-        """Go on to the greatest likelihood, with images as laid out, of so large radii."""
+        """Go on to the greatest likelihood, with images as laid out, of so large radii.
+
+        Where it converges, and the images are not larger than the window.
+        """
         self.deviance, self.log_information = maximise(
             self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
             self.window.to_beat, self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
-        self.converged = math.isfinite(self.deviance)
         growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
         self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
+        # Of what is wider than its window no limb is seen: even ground, that may be as near as it likes.
+        shows_limb = float(self.image_radius_px.max()) < math.hypot(*self.window.image_e.shape)
+        self.converged = math.isfinite(self.deviance) and shows_limb
 
 
 def log_range_by_size(own: Array, fit: Fit) -> Array:

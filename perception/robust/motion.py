@@ -31,9 +31,7 @@ AT_REST = (0.0, 0.0)
 """A fit that begins so stays so: to first order a motion changes nothing."""
 
 
-def moving(
-    solutions: Sequence[Solution | None], camera: Camera
-) -> dict[int, Solution]:
+def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
     """Fit flares that are longer than wide as moving ones, and return by index the likelier of both.
 
     Lone ones where the residual says so; of several in one window, where it asks for more. The sigmas of what

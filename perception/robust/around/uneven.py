@@ -30,9 +30,7 @@ _WIDTHS_OF_DISC = (0.5, 1.0)
 """Of what is clipped, first guesses: a disc is as wide, the image of a point is so by its point spread."""
 
 
-def retry_on_uneven_ground(
-    best: list[Solution | None], uneven_e: Sequence[float], camera: Camera
-) -> None:
+def retry_on_uneven_ground(best: list[Solution | None], uneven_e: Sequence[float], camera: Camera) -> None:
     """Fit again where something lies around the flares: edges, of the strength that plain fits leave over.
 
     What is too sharp even for them counts as noise of the window. Nothing is left of what its window says is

@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 _MOST_STEPS = 30  # what is of another shape goes on without an end
 _SETTLED = 0.002  # in −2 ln L: a twentieth of a standard deviation
+_SETTLED_SHARE = 0.001  # of what χ² is beyond noise, where that is so much that more is wanted
+_NOISE_SIGMAS = 5.0  # of χ²
 _MOST_GIVEN_UP = 3  # guesses, from the likeliest on, after which none of the others comes to anything
 
 
@@ -87,12 +89,13 @@ class Climb(ABC):
         """Go on to the greatest likelihood, and write it into the fit; tell whether it is reached.
 
         It is not where what is ahead has a greater cost than `most_cost`, or is no good explanation. One that
-        `may_be_bad` need not be, and is taken as far as it has come.
+        `may_be_bad` need not be, and is taken as far as it has come; not far where it stays bad.
         """
         layout, size = self._fit.layout, len(self._values)
         gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
         damped = np.empty((size, size))
         damping, is_new, is_there = FIRST_DAMPING, True, True
+        pixels = int(np.count_nonzero(self._view.state))
         for done in range(_MOST_STEPS):
             if is_new:
                 variance = self._variance(self._expected)
@@ -101,12 +104,13 @@ class Climb(ABC):
                 if math.isnan(self._fit.log_information):
                     return False
                 self.to_gain = float(gradient @ inverse @ gradient)
-                if self.to_gain < _SETTLED:
+                before = self._objective(self._values, self._expected, variance)
+                beyond_noise = before - pixels - _NOISE_SIGMAS * math.sqrt(2.0 * pixels)
+                if self.to_gain < max(_SETTLED, _SETTLED_SHARE * beyond_noise if may_be_bad else 0.0):
                     break
                 is_judged = done >= JUDGED_AFTER and not may_be_bad
                 if is_judged and not self._is_promising(inverse, most_cost):
                     return False
-                before = self._objective(self._values, self._expected, variance)
             np.copyto(damped, fisher)
             np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))
             if math.isnan(inverted(damped, damped)):
@@ -129,8 +133,8 @@ class Climb(ABC):
             is_there = False
         if not (is_there or may_be_bad):
             return False
-        # A trial that was none may have been laid out last.
-        self._expected, self._jacobian = self._expectation(self._values)
+        if not is_new:  # a trial that was none has been laid out last
+            self._expected, self._jacobian = self._expectation(self._values)
         self._slopes(self._variance(self._expected), gradient, fisher, of_average=True)
         self._fit.log_information = inverted(fisher, inverse)
         self._write(inverse)

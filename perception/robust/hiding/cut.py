@@ -18,7 +18,7 @@ from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit
 from perception.robust.hiding.climb import Climb, good_ones
-from perception.robust.hiding.eclipse import is_as_bright, lit_pixels
+from perception.robust.hiding.eclipse import differing, is_as_bright, lit_pixels
 from perception.robust.hiding.spheres import expectation_of_spheres
 from perception.robust.motion import AT_REST, asked_motions, moves
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
@@ -70,13 +70,12 @@ def cut_discs(
         if cluster.is_in_crowd or not may_be[index]:
             continue
         window, background_e = cluster.window, cluster.background_e
-        fits = [_Cut(window, background_e, guess, camera) for guess in _guesses(cluster, camera)]
-        fits.sort(key=lambda fit: fit.objective)
-        if fits and one is not None and one.count == 1:
-            fits.insert(0, _Cut(window, background_e, _where_light_lacks(one), camera))
+        guesses = _guesses(cluster, camera)
+        if guesses and one is not None and one.count == 1:
+            guesses.insert(0, _where_light_lacks(one))
         most_cost = parted[index].cost + NO_RIVAL if index in parted else math.inf
-        cut = (fit.solution(most_cost) for fit in fits[:_TRIED])
-        good = good_ones(cut, partial(_explains_more, one), _GOOD)
+        fits = (_Cut(window, background_e, guess, camera) for guess in guesses[:_TRIED])
+        good = good_ones((fit.solution(most_cost) for fit in fits), partial(_explains_more, one), _GOOD)
         if good:
             cuts[index] = min(good, key=lambda cut: cut.cost)
     return cuts
@@ -98,7 +97,7 @@ def _where_light_lacks(one: Solution) -> Guess:
 
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
-    """Return first guesses for lines of all directions.
+    """Return first guesses for lines of all directions, the likeliest first.
 
     Of what is lit, the extent across the line is the diameter if more than half of the disc is seen, else a
     chord; that along it the height of the piece.
@@ -114,7 +113,8 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
     most_e = math.inf if cluster.is_clipped else level_e
     if not at_1_m_px > 0.0 or not is_as_bright(level_e, most_e, (u_px, v_px), camera):
         return []
-    guesses = []
+    guesses: list[tuple[int, Guess]] = []
+    rows, columns = np.indices(cluster.window.image_e.shape)
     for turn in np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS):
         away, beside = np.array([math.cos(turn), math.sin(turn)]), np.array([-math.sin(turn), math.cos(turn)])
         along, across = (places - middle) @ away, (places - middle) @ beside
@@ -125,8 +125,11 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
         at = float(along.min()) - 0.5 + radius_px
         place = corner + middle + at * away + 0.5 * (float(across.max()) + float(across.min())) * beside
         edge_px = float(along.max()) + 0.5 - at
-        guesses.append((*place.tolist(), math.log(at_1_m_px / radius_px), float(turn), edge_px))
-    return guesses
+        off_u, off_v = columns + corner[0] - place[0], rows + corner[1] - place[1]
+        shown = (np.hypot(off_u, off_v) < radius_px) & (off_u * away[0] + off_v * away[1] < edge_px)
+        guess = (*place.tolist(), math.log(at_1_m_px / radius_px), float(turn), edge_px)
+        guesses.append((differing(shown, cluster.window, places), guess))
+    return [guess for _, guess in sorted(guesses, key=lambda each: each[0])]
 
 
 class _Cut(Climb):

@@ -39,7 +39,7 @@ from perception.robust.overlap.pairs import (
     meeting,
 )
 from perception.robust.overlap.rivals import NO_RIVAL, likelier
-from perception.robust.problem import Problem, Start
+from perception.robust.problem import Problem, Start, Window
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
@@ -104,11 +104,14 @@ def eclipses(
     return pairs, rivals
 
 
-def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> Solution | None:
+def pile_of(
+    cluster: Cluster, camera: Camera, lone: Solution | None = None, most_more: int = _MOST_MORE
+) -> Solution | None:
     """Explain a window by the spheres that its outline shows, some partly behind others; None if they do not.
 
     Blobs that lie beside these are flares of their own. Where something is left, it may be up to `most_more`
-    flares of which too little is seen for an outline: then who knows what it is.
+    flares of which too little is seen for an outline: then who knows what it is. `lone` is what a single
+    flare makes of the window, if that is known.
     """
     if cluster.is_in_crowd:
         return None
@@ -130,8 +133,10 @@ def pile_of(cluster: Cluster, camera: Camera, most_more: int = _MOST_MORE) -> So
         return None
     shown, likeliest = len(starts), None
     for more in range(1 + most_more):
-        climb = Spheres(Problem(cluster.window, starts, cluster.background_e), camera)
-        pile = climb.solution(may_be_bad=more < max(most_more, 1))
+        pile = lone
+        if len(starts) > 1 or lone is None:
+            climb = Spheres(Problem(cluster.window, starts, cluster.background_e), camera)
+            pile = climb.solution(may_be_bad=more < max(most_more, 1))
         if pile is None:
             break
         if pile.count > 1:
@@ -200,9 +205,8 @@ def _by_both_ends(
         for each in (one, more)
         if each is not None and (of_layouts or each.count == 2) and is_near(each, least_radius_px(camera))
     ]
-    fits = [Spheres(Problem(cluster.window, two, cluster.background_e), camera) for two in guesses]
-    fits.sort(key=lambda fit: fit.objective)
-    fits = [Spheres(Problem(cluster.window, two, cluster.background_e), camera) for two in of_two] + fits
+    problems = (Problem(cluster.window, starts, cluster.background_e) for starts in of_two + guesses)
+    fits = (Spheres(problem, camera) for problem in problems)
     return good_ones((fit.solution(most_cost) for fit in fits), partial(_is_good, camera=camera), _TRIED)
 
 
@@ -237,7 +241,7 @@ def _may_be_other(pile: Solution, near: int, far: int, camera: Camera) -> bool:
 
 
 def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
-    """Return first guesses of two discs: at both ends of what is lit, the wider one at either."""
+    """Return first guesses of two discs, the likeliest first: at both ends of what is lit."""
     lit = lit_pixels(cluster)
     if lit is None:
         return []
@@ -256,19 +260,21 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
         return []
     if not is_as_bright(level_e, most_e, (u_px, v_px), camera):
         return []
-    guesses = []
+    guesses: list[tuple[int, list[Start]]] = []
+    away = tuple(reversed(np.indices(window.image_e.shape) - middle[::-1, None, None]))
     for sign in (1.0, -1.0):
         end_px, start_px = sign * float((sign * along).max()), sign * float((sign * along).min())
         for size in _SIZES:
-            starts = []
+            starts, shown = [], np.zeros(window.image_e.shape, dtype=np.bool_)
             for at_px, radius_px in (
                 (end_px - sign * (near_px - 0.5), near_px),
                 (start_px + sign * (size * near_px - 0.5), size * near_px),
             ):
-                u, v = (corner + middle + at_px * axes[:, 1]).tolist()
-                starts.append((u, v, math.log(at_1_m_px / radius_px)))
-            guesses.append(starts)
-    return guesses
+                off_u, off_v = (at_px * axes[:, 1]).tolist()
+                starts.append((u_px + off_u, v_px + off_v, math.log(at_1_m_px / radius_px)))
+                shown |= np.hypot(away[0] - off_u, away[1] - off_v) < radius_px
+            guesses.append((differing(shown, window, places), starts))
+    return [starts for _, starts in sorted(guesses, key=lambda guess: guess[0])]
 
 
 def _guesses_beside(cluster: Cluster, several: Solution, camera: Camera) -> list[list[Start]]:
@@ -300,6 +306,14 @@ def lit_pixels(cluster: Cluster) -> tuple[float, Array] | None:
     level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
     rows, columns = np.nonzero(excess_e > 0.5 * level_e)
     return level_e, np.column_stack([columns, rows]).astype(np.float64)
+
+
+def differing(shown: NDArray[np.bool_], window: Window, lit_places: Array) -> int:
+    """Return how many pixels are lit (`lit_pixels`) that a guess does not show, or shown that are not."""
+    lit = np.zeros(shown.shape, dtype=np.bool_)
+    columns, rows = lit_places.astype(np.int64).T
+    lit[rows, columns] = True
+    return int(np.count_nonzero((lit != shown) & window.usable))
 
 
 def is_as_bright(least_e: float, most_e: float, place: tuple[float, float], camera: Camera) -> bool:
