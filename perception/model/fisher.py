@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox, image_radius_px
 from perception.model.layout import Layout, Structure, View, even
-from perception.model.pixels import expectation
+from perception.model.likelihood.pixels import expectation
 from perception.model.ranging import angular_radius_rad
 from perception.model.sensor import clip_level_e, noise_floor_e2, pixel_variance_e2
 from perception.model.window import Camera, lay_out

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.layout import Sources
-from perception.model.pixels import maximise, unlikeliness
+from perception.model.likelihood.maximum import maximise
+from perception.model.likelihood.pixels import unlikeliness
 from perception.model.window import Camera
 from perception.robust.problem import Problem
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE
-from perception.model.pixels import dot
+from perception.model.likelihood.products import dot
 
 Array = NDArray[np.float64]
 

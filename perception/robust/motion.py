@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import PixelBox
-from perception.model.pixels import MORE_TO_GAIN, TIMES_TO_GAIN
+from perception.model.likelihood.maximum import MORE_TO_GAIN, TIMES_TO_GAIN
 from perception.model.window import MOST_MOTION_PX, Camera, is_usual_motion, motion_price
 from perception.robust.goodness import drawn_out
 from perception.robust.overlap.deblend import asks_for_more

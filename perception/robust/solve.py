@@ -1,7 +1,7 @@
 """Flares are fitted to windows: the maximum-likelihood fit of any number of them in each.
 
-What is maximised is the likelihood of `model.pixels`, with the λ and the priors of `model.window`. Images are
-laid out for all windows at once, and anew where a size, or a large disc, has moved far from where they were.
+What is maximised is that of `model.likelihood`, with the λ and the priors of `model.window`. Images are laid
+out for all windows at once, and anew where a size, or a large disc, has moved far from where they were.
 """
 
 import math

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import SEEN
-from perception.model.pixels import dot
+from perception.model.likelihood.products import dot
 from perception.model.window import Camera
 from perception.robust.around.edge import gain_around, leaves_something
 from perception.robust.around.turns import (

@@ -1,7 +1,7 @@
 """The way from a first guess to the greatest likelihood, where a part of a sphere is hidden.
 
-As `model.pixels.maximise`, but images are laid out anew at each step: what is hidden changes with them. One
-that has come so far, and explains too little, is given up.
+As `model.likelihood.maximum`, but images are laid out anew at each step: what is hidden changes with them.
+One that has come so far, and explains too little, is given up.
 """
 
 import math
@@ -11,19 +11,16 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.pixels import (
+from perception.model.likelihood.maximum import (
     FIRST_DAMPING,
     JUDGED_AFTER,
     LEAST_DAMPING,
     MORE_TO_GAIN,
     MOST_DAMPING,
     TIMES_TO_GAIN,
-    inverted,
-    is_inside,
-    log_variances,
-    objective,
-    slopes,
 )
+from perception.model.likelihood.pixels import is_inside, log_variances, objective, slopes
+from perception.model.likelihood.products import inverted
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera
 from perception.robust.fit import Fit
@@ -160,7 +157,7 @@ class Climb(ABC):
     def _slopes(self, variance: Array, gradient: Array, fisher: Array, *, of_average: bool) -> None:
         slopes(
             self._view, self._values, self._expected, self._jacobian, variance, self._prior,
-            self._fit.known.clip_e, of_average, gradient, fisher,
+            self._fit.known.clip_e, of_average, len(gradient), gradient, fisher,
         )  # fmt: skip
 
     def _variance(self, expected: Array) -> Array:

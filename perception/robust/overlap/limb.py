@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.bearing import pixel_turn
 from perception.model.layout import SEEN
+from perception.model.likelihood.products import add_information, inverted
 from perception.model.normal import shares
-from perception.model.pixels import add_information, inverted
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
@@ -100,7 +100,7 @@ def _gain(
     images[count - 2], images[count - 1] = flares_e, 1.0
     by, flat_weight, residual = images.reshape(count, -1), weight.ravel(), left_e.ravel()
     information, inverse = np.zeros((count, count)), np.empty((count, count))
-    add_information(by, flat_weight, information)
+    add_information(by, flat_weight, len(by), information)
     if math.isnan(inverted(information, inverse)):
         return math.nan
     pull = np.zeros(count)

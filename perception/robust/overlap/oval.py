@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, Sources
+from perception.model.likelihood.maximum import JUDGED_AFTER, MORE_TO_GAIN, TIMES_TO_GAIN
 from perception.model.normal import shares, strip_shares
-from perception.model.pixels import JUDGED_AFTER, MORE_TO_GAIN, TIMES_TO_GAIN
 from perception.model.spread import LEAST_STRIP
 from perception.model.window import Camera, lay_out
 from perception.robust.goodness import MODEL_ERROR, is_likely, residual_e

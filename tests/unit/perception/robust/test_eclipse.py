@@ -154,7 +154,7 @@ def test_slopes_are_those_of_what_is_expected(more: list[Place], *, moves: bool)
     starts = [(u, v, math.log(range_m)) for u, v, range_m in places]
     seen: list[Cluster] = []
 
-    def look(cluster: Cluster, _: object) -> None:
+    def look(cluster: Cluster, *_: object) -> None:
         seen.append(cluster)
 
     mean_e_per_s = union_e_per_s(places)

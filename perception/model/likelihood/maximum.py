@@ -1,0 +1,171 @@
+"""Where what a window shows is likeliest: Fisher scoring, with Levenberg's damping."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.layout import CLIPPED, SEEN, Known, Sources, Structure, View
+from perception.model.likelihood.pixels import expectation, is_inside, log_variances, objective, slopes
+from perception.model.likelihood.products import inverted
+
+Array = NDArray[np.float64]
+
+SETTLED_SIGMAS = 0.01
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
+MOST_STEPS = 50
+# Whether a climb is hopeless is judged after so many steps: ahead is, in -2 ln L, at most so much more than
+# so many times what is to be had to first order.
+JUDGED_AFTER, MORE_TO_GAIN, TIMES_TO_GAIN = 4, 10.0, 3.0
+
+
+@compiled
+def _add_bend(
+    view: View, expected: Array, jacobian: Array, variance: Array, motion: int, into: Array
+) -> None:
+    """Add to a lone flare's information how ln L bends with its motion beside it, where that is downwards.
+
+    A motion m adds ∂ᵢ∂ⱼ(F S) mᵢ mⱼ / 24 to a flare's light: of that first order in m's square Fisher's
+    information knows nothing across a short m, and steps by it alone go to and fro. For the steps alone:
+    second derivatives are differences of first ones. `motion` is the index of the first of both unknowns.
+    """
+    columns, uu, uv, vv = view.image_e.shape[1], 0.0, 0.0, 0.0
+    image, state = view.image_e.ravel(), view.state.ravel()
+    for pixel in range(columns + 1, len(expected) - columns - 1):
+        if state[pixel] != SEEN:
+            continue
+        pull = (image[pixel] - expected[pixel]) / (24.0 * variance[pixel])
+        uu += pull * (jacobian[0, pixel + 1] - jacobian[0, pixel - 1])
+        vv += pull * (jacobian[1, pixel + columns] - jacobian[1, pixel - columns])
+        uv += pull * (jacobian[0, pixel + columns] - jacobian[0, pixel - columns])
+    # Of the two bends along the axes of a symmetric matrix those that are positive.
+    mean, half = 0.5 * (uu + vv), math.hypot(0.5 * (uu - vv), uv)
+    larger, smaller = max(mean + half, 0.0), max(mean - half, 0.0)
+    cosine, sine = (0.5 * (uu - vv) / half, uv / half) if half > 0.0 else (1.0, 0.0)
+    even, odd = 0.5 * (larger + smaller), 0.5 * (larger - smaller)
+    into[motion, motion] += even + odd * cosine
+    into[motion + 1, motion + 1] += even - odd * cosine
+    into[motion, motion + 1] += odd * sine
+    into[motion + 1, motion] += odd * sine
+
+
+@compiled
+def is_settled(inverse: Array, gradient: Array, count: int) -> bool:
+    """Tell whether a step of Fisher scoring moves the first unknowns hardly at all, by their sigmas."""
+    for one in range(count):
+        step = 0.0
+        for other in range(len(gradient)):
+            step += inverse[one, other] * gradient[other]
+        if abs(step) > SETTLED_SIGMAS * math.sqrt(inverse[one, one]):
+            return False
+    return True
+
+
+@compiled
+def maximise(
+    view: View, sources: Sources, structure: Structure, known: Known, precision: Array, most_step: Array,
+    to_beat: float, values: Array, covariance: Array, expected: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """Find the unknowns that make what a window shows likeliest, by Fisher scoring with Levenberg's damping.
+
+    Parameters
+    ----------
+    view, sources, structure, known
+        The window, and what is in it.
+    precision, most_step
+        Of the unknowns: a priori, shape (unknowns, unknowns), and how far they may move at once, shape
+        (unknowns,) (`layout.Layout`).
+    to_beat
+        -2 ln L: where all that is ahead is sure to be less likely, the climb is given up.
+    values
+        First values, shape (unknowns,); the estimates are written there.
+    covariance, expected
+        Shape (unknowns, unknowns) and (pixels,): the inverse of information and priors, and λ, are written.
+
+    Returns
+    -------
+    −2 ln L, priors included, but for a constant of the data, and ln of the determinant of information and
+    priors; both infinite where no step below a hundredth of a standard deviation was reached, or none tried.
+    """
+    size, pixels, count = len(values), len(expected), len(sources.log_range_at)
+    step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
+    jacobian, new_jacobian = np.empty((size, pixels)), np.empty((size, pixels))
+    new_expected, variance, new_variance = np.empty(pixels), np.empty(pixels), np.empty(pixels)
+    gradient, trial, clip_e = np.empty(size), np.empty(size), known.clip_e
+    fisher, inverse, damped = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
+    damping, is_new, log_det, before, taken = FIRST_DAMPING, True, 0.0, 0.0, 0
+    held = size
+    expectation(values, view, sources, structure, known, expected, jacobian, variance)
+    for _ in range(MOST_STEPS):
+        if is_new:
+            slopes(
+                view, values, expected, jacobian, variance, precision, clip_e, False, held, gradient, fisher
+            )
+            log_det = inverted(fisher, inverse)
+            if held < size and (math.isnan(log_det) or is_settled(inverse, gradient, count * step)):
+                slopes(
+                    view,
+                    values,
+                    expected,
+                    jacobian,
+                    variance,
+                    precision,
+                    clip_e,
+                    False,
+                    size,
+                    gradient,
+                    fisher,
+                )
+                log_det = inverted(fisher, inverse)
+            if math.isnan(log_det):
+                return math.inf, math.inf
+            if is_settled(inverse, gradient, count * step):
+                break
+            # What the ground's waves tell of each other takes longest to sum, and hardly goes by the flares.
+            held = size - len(structure.columns)
+            to_gain = 0.0
+            for one in range(size):
+                for other in range(size):
+                    to_gain += gradient[one] * inverse[one, other] * gradient[other]
+            before = objective(view, values, expected, variance, precision, clip_e)
+            if taken >= JUDGED_AFTER and math.isfinite(to_beat):
+                ahead = MORE_TO_GAIN + TIMES_TO_GAIN * to_gain
+                if before + log_variances(view, variance) - ahead > to_beat:
+                    return math.inf, math.inf
+        for one in range(size):
+            damped[one] = fisher[one]
+            damped[one, one] *= 1.0 + damping
+        if known.motion_px > 0.0 and count == 1:
+            _add_bend(view, expected, jacobian, variance, step - 2, damped)
+        if math.isnan(inverted(damped, damped)):
+            return math.inf, math.inf
+        for one in range(size):
+            shift = 0.0
+            for other in range(size):
+                shift += damped[one, other] * gradient[other]
+            trial[one] = values[one] + min(max(shift, -most_step[one]), most_step[one])
+        is_new = False
+        if is_inside(trial, view, count, step):
+            expectation(trial, view, sources, structure, known, new_expected, new_jacobian, new_variance)
+            after = objective(view, trial, new_expected, variance, precision, clip_e)
+            is_new = after <= before + 1e-9 * abs(before) + 1e-9
+        if is_new:
+            values[:], expected[:] = trial, new_expected
+            jacobian, new_jacobian = new_jacobian, jacobian
+            variance, new_variance = new_variance, variance
+            damping, taken = max(0.1 * damping, LEAST_DAMPING), taken + 1
+        else:
+            damping *= 10.0
+            if not damping < MOST_DAMPING:
+                return math.inf, math.inf
+    else:
+        return math.inf, math.inf
+    if (view.state == CLIPPED).any():
+        slopes(view, values, expected, jacobian, variance, precision, clip_e, True, size, gradient, fisher)
+        log_det = inverted(fisher, inverse)
+        if math.isnan(log_det):
+            return math.inf, math.inf
+    covariance[:] = inverse
+    chi2 = objective(view, values, expected, variance, precision, clip_e)
+    return chi2 + log_variances(view, variance), log_det

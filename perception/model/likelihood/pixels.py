@@ -1,0 +1,179 @@
+"""What the pixels of a window expect of its sources, and how likely is what they show.
+
+Each pixel counts as x + σ² ~ Poisson(λ + σ²), σ² the variance of a dark pixel (Snyder et al., J. Opt. Soc.
+Am. A 12, 272, 1995), widened by the spread of the pixels' responses; its score is (x - λ) / variance. A
+clipped pixel says only that x is c or more: its score is φ(z) / (σ Q(z)), z = (c - λ) / σ. Variances come
+from the model, not from the data: weights from the data would favour pixels that came out low. All that is
+here is compiled, one window at a time; `model.window` says what the unknowns are.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.compiled import compiled
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View, part_of
+from perception.model.likelihood.products import add_information, dot
+from perception.model.normal import log_upper_tail, of_clipped
+from perception.model.spread import spread_nodes
+
+Array = NDArray[np.float64]
+
+LOG_RANGE_BOUND, MOTION_BOUND_PX = 12.0, 30.0
+
+
+@compiled
+def expectation(
+    values: Array, view: View, sources: Sources, structure: Structure, known: Known, expected: Array,
+    jacobian: Array, variance: Array,
+) -> None:  # fmt: skip
+    """Compute λ, its derivatives, and the variance of pixels.
+
+    Parameters
+    ----------
+    values
+        Unknowns, in the order of `layout.Layout`.
+    view, sources, structure, known
+        The window, of which all but what it shows counts, and what is in it.
+    expected, jacobian, variance
+        Shape (pixels,), (unknowns, pixels) and (pixels,): written; the last as `sensor.pixel_variance_e2`.
+    """
+    count, has_slack, moves = len(sources.log_range_at), known.tie_spread > 0.0, known.motion_px > 0.0
+    step = 3 + has_slack + 2 * moves
+    width = count * step
+    background = width + (1 if known.width_spread > 0.0 else 0)
+    sigma_px = known.psf_sigma_px
+    if known.width_spread > 0.0:
+        sigma_px *= math.exp(known.width_spread * values[width])
+        jacobian[width] = 0.0
+    expected[:], jacobian[background] = values[background], 1.0
+    expected += view.known_e.ravel()
+    for wave in range(len(structure.columns)):
+        expected += values[background + 1 + wave] * structure.columns[wave]
+        jacobian[background + 1 + wave] = structure.columns[wave]
+    image = np.empty((7 if moves else 5, *view.image_e.shape))
+    flat = image.reshape(len(image), -1)
+    motion = (0.0, 0.0)
+    for source in range(count):
+        at = source * step
+        by_size = values[at + 2]
+        if has_slack:
+            by_size -= known.tie_spread * values[at + 3]
+        if moves:
+            motion = (values[at + step - 2], values[at + step - 1])
+        image[:] = 0.0
+        place = (values[at] - view.left, values[at + 1] - view.top)
+        growth = math.exp(sources.log_range_at[source] - by_size)
+        spread_nodes(sources, source, place, growth, motion, sigma_px, image)
+        flux = math.exp(sources.log_flux_at_1_m[source] - 2.0 * values[at + 2])
+        for pixel in range(len(expected)):
+            expected[pixel] += flux * flat[0, pixel]
+            jacobian[at, pixel] = flux * flat[1, pixel]
+            jacobian[at + 1, pixel] = flux * flat[2, pixel]
+            jacobian[at + 2, pixel] = -flux * (2.0 * flat[0, pixel] + flat[3, pixel])
+        if has_slack:
+            jacobian[at + 3] = known.tie_spread * flux * flat[3]
+        if moves:
+            jacobian[at + step - 2], jacobian[at + step - 1] = flux * flat[5], flux * flat[6]
+        if known.width_spread > 0.0:
+            jacobian[width] += known.width_spread * flux * flat[4]
+    for pixel in range(len(expected)):
+        lit_e = max(expected[pixel], 0.0)
+        variance[pixel] = lit_e + (known.prnu * lit_e) ** 2 + view.floor_e2
+
+
+@compiled
+def slopes(
+    view: View, values: Array, expected: Array, jacobian: Array, variance: Array,
+    precision: Array, clip_e: float, of_average: bool, held: int, gradient: Array, information: Array,
+) -> None:  # fmt: skip
+    """Write the gradient of ln L and the information, priors included.
+
+    The information is what these very pixels give, or, `of_average`, what such pixels give on average. That
+    of the unknowns from `held` on among each other stays as it was.
+    """
+    image, state = view.image_e.ravel(), view.state.ravel()
+    pull, weight = np.zeros(len(expected)), np.zeros(len(expected))
+    for pixel in range(len(expected)):
+        if state[pixel] == UNUSABLE:
+            continue
+        weight[pixel] = 1.0 / variance[pixel]
+        if state[pixel] == SEEN and not of_average:
+            pull[pixel] = (image[pixel] - expected[pixel]) / variance[pixel]
+        elif math.isfinite(clip_e):
+            sigma = math.sqrt(variance[pixel])
+            mills, curvature, kept = of_clipped((clip_e - expected[pixel]) / sigma)
+            pull[pixel] = mills / sigma
+            weight[pixel] *= kept if of_average else curvature
+    information[:held], information[held:, :held] = precision[:held], precision[held:, :held]
+    add_information(jacobian, weight, held, information)
+    for one in range(len(values)):
+        total = dot(jacobian[one], pull)
+        for other in range(len(values)):
+            total -= precision[one, other] * values[other]
+        gradient[one] = total
+
+
+@compiled
+def objective(
+    view: View, values: Array, expected: Array, variance: Array, precision: Array, clip_e: float
+) -> float:
+    """Return −2 ln L of an expectation with given variances, priors included, without Σ ln variance."""
+    image, state = view.image_e.ravel(), view.state.ravel()
+    total = 0.0
+    for pixel in range(len(expected)):
+        if state[pixel] == SEEN:
+            total += (image[pixel] - expected[pixel]) ** 2 / variance[pixel]
+        elif state[pixel] == CLIPPED:
+            z = (clip_e - expected[pixel]) / math.sqrt(variance[pixel])
+            total -= 2.0 * log_upper_tail(min(max(z, -38.0), 1e4))
+    for one in range(len(values)):
+        for other in range(len(values)):
+            total += values[one] * precision[one, other] * values[other]
+    return total
+
+
+@compiled
+def log_variances(view: View, variance: Array) -> float:
+    """Return Σ ln variance of the pixels that are seen."""
+    state, total = view.state.ravel(), 0.0
+    for pixel in range(len(variance)):
+        if state[pixel] == SEEN:
+            total += math.log(variance[pixel])
+    return total
+
+
+@compiled
+def unlikeliness(
+    view: View, sources: Sources, structure: Structure, known: Known, precision: Array, guesses: Array
+) -> Array:
+    """Return −2 ln L of guesses of the unknowns, as `maximise` of the likeliest; infinite where none can be.
+
+    The arguments are as for that; `guesses` has the shape (guesses, unknowns), `sources` are those of all.
+    """
+    pixels, unknowns = view.image_e.size, guesses.shape[1]
+    count = len(sources.log_range_at) // len(guesses)
+    step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
+    expected, variance, jacobian = np.empty(pixels), np.empty(pixels), np.empty((unknowns, pixels))
+    totals = np.full(len(guesses), math.inf)
+    for guess in range(len(guesses)):
+        if is_inside(guesses[guess], view, count, step):
+            own = part_of(sources, guess * count, (guess + 1) * count)
+            expectation(guesses[guess], view, own, structure, known, expected, jacobian, variance)
+            totals[guess] = objective(view, guesses[guess], expected, variance, precision, known.clip_e)
+            totals[guess] += log_variances(view, variance)
+    return totals
+
+
+@compiled
+def is_inside(values: Array, view: View, count: int, step: int) -> bool:
+    """Tell whether all sources are on the window's pixels, at ranges and motions that can be."""
+    rows, columns = view.image_e.shape
+    for at in range(0, count * step, step):
+        column, row = values[at] - view.left, values[at + 1] - view.top
+        on_pixels = -0.5 < column < columns - 0.5 and -0.5 < row < rows - 0.5
+        near = step < 5 or math.hypot(values[at + step - 2], values[at + step - 1]) < MOTION_BOUND_PX
+        if not (on_pixels and near and abs(values[at + 2]) < LOG_RANGE_BOUND):
+            return False
+    return bool(np.isfinite(values).all())
