@@ -205,7 +205,8 @@ def _by_both_ends(
         for each in (one, more)
         if each is not None and (of_layouts or each.count == 2) and is_near(each, least_radius_px(camera))
     ]
-    problems = (Problem(cluster.window, starts, cluster.background_e) for starts in of_two + guesses)
+    tried = of_two + (guesses[:_TRIED] if math.isfinite(most_cost) else guesses)
+    problems = (Problem(cluster.window, starts, cluster.background_e) for starts in tried)
     fits = (Spheres(problem, camera) for problem in problems)
     return good_ones((fit.solution(most_cost) for fit in fits), partial(_is_good, camera=camera), _TRIED)
 
