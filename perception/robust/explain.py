@@ -120,7 +120,8 @@ def _explained(
     camera: Camera,
 ) -> list[Solution | None]:
     """Explain windows by more than a flare for each blob, as by `piles`, where that explains them better."""
-    # Of what spheres explain entirely all else is worth a look only as far as it may matter beside them.
+    # Where spheres explain all that is seen, all else is worth a look only as far as it may matter then.
+    piles = {index: pile for index, pile in piles.items() if _explains_all(pile, prepared.shape)}
     chosen = against(solved, piles)
     lone = {k: one for k, one in enumerate(chosen) if one is not None and not found[k].is_in_crowd}
     on_structure = {k for k in lone if prepared.is_structured(found[k].members[0].blob.box)}

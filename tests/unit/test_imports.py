@@ -54,7 +54,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.robust": ("large", "around", "hiding", "overlap", "search"),
     "perception.files": (),
     "perception.causes": (),
-    "perception.model": ("discs",),
+    "perception.model": ("likelihood", "discs"),
     "perception.odometry": (),
     "perception.own_code": (),
     "perception.compiled": (),

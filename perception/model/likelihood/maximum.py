@@ -15,7 +15,6 @@ Array = NDArray[np.float64]
 SETTLED_SIGMAS = 0.01
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 MOST_STEPS = 50
-_AS_PROMISED = 0.5
 # Whether a climb is hopeless is judged after so many steps: ahead is, in -2 ln L, at most so much more than
 # so many times what is to be had to first order.
 JUDGED_AFTER, MORE_TO_GAIN, TIMES_TO_GAIN = 4, 10.0, 3.0
@@ -52,23 +51,6 @@ def _add_bend(
 
 
 @compiled
-def _ahead(inverse: Array, gradient: Array, count: int) -> tuple[bool, float]:
-    """Return whether a step of Fisher scoring moves the first unknowns hardly at all, by their sigmas.
-
-    And what it gains, in 2 Δ ln L.
-    """
-    settled, to_gain = True, 0.0
-    for one in range(len(gradient)):
-        step = 0.0
-        for other in range(len(gradient)):
-            step += inverse[one, other] * gradient[other]
-        if one < count:
-            settled &= abs(step) <= SETTLED_SIGMAS * math.sqrt(inverse[one, one])
-        to_gain += step * gradient[one]
-    return settled, to_gain
-
-
-@compiled
 def maximise(
     view: View, sources: Sources, structure: Structure, known: Known, precision: Array, most_step: Array,
     to_beat: float, values: Array, covariance: Array, expected: Array,
@@ -100,35 +82,22 @@ def maximise(
     new_expected, variance, new_variance = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     gradient, trial, clip_e = np.empty(size), np.empty(size), known.clip_e
     fisher, inverse, damped = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
-    damping, is_new, log_det, before, to_gain = FIRST_DAMPING, True, 0.0, 0.0, 0.0
-    held, taken = size, 0
+    damping, is_new, log_det, before, taken = FIRST_DAMPING, True, 0.0, 0.0, 0
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
     for _ in range(MOST_STEPS):
         if is_new:
-            slopes(
-                view, values, expected, jacobian, variance, precision, clip_e, False, held, gradient, fisher
-            )
+            slopes(view, values, expected, jacobian, variance, precision, clip_e, False, gradient, fisher)
             log_det = inverted(fisher, inverse)
-            settled, to_gain = _ahead(inverse, gradient, count * step)
-            if held < size and (settled or math.isnan(log_det)):
-                held = size
-                slopes(
-                    view,
-                    values,
-                    expected,
-                    jacobian,
-                    variance,
-                    precision,
-                    clip_e,
-                    False,
-                    held,
-                    gradient,
-                    fisher,
-                )
-                log_det = inverted(fisher, inverse)
-                settled, to_gain = _ahead(inverse, gradient, count * step)
             if math.isnan(log_det):
                 return math.inf, math.inf
+            settled, to_gain = True, 0.0
+            for one in range(size):
+                free_step = 0.0
+                for other in range(size):
+                    free_step += inverse[one, other] * gradient[other]
+                if one < count * step:
+                    settled &= abs(free_step) <= SETTLED_SIGMAS * math.sqrt(inverse[one, one])
+                to_gain += free_step * gradient[one]
             if settled:
                 break
             before = objective(view, values, expected, variance, precision, clip_e)
@@ -154,9 +123,6 @@ def maximise(
             after = objective(view, trial, new_expected, variance, precision, clip_e)
             is_new = after <= before + 1e-9 * abs(before) + 1e-9
         if is_new:
-            # What the ground's waves tell of each other takes longest to sum, and hardly goes by the flares
-            # where a step gains what it promises.
-            held = size - len(structure.columns) if before - after > _AS_PROMISED * to_gain else size
             values[:], expected[:] = trial, new_expected
             jacobian, new_jacobian = new_jacobian, jacobian
             variance, new_variance = new_variance, variance
@@ -168,7 +134,7 @@ def maximise(
     else:
         return math.inf, math.inf
     if (view.state == CLIPPED).any():
-        slopes(view, values, expected, jacobian, variance, precision, clip_e, True, size, gradient, fisher)
+        slopes(view, values, expected, jacobian, variance, precision, clip_e, True, gradient, fisher)
         log_det = inverted(fisher, inverse)
         if math.isnan(log_det):
             return math.inf, math.inf

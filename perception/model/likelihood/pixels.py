@@ -86,12 +86,11 @@ def expectation(
 @compiled
 def slopes(
     view: View, values: Array, expected: Array, jacobian: Array, variance: Array,
-    precision: Array, clip_e: float, of_average: bool, held: int, gradient: Array, information: Array,
+    precision: Array, clip_e: float, of_average: bool, gradient: Array, information: Array,
 ) -> None:  # fmt: skip
     """Write the gradient of ln L and the information, priors included.
 
-    The information is what these very pixels give, or, `of_average`, what such pixels give on average. That
-    of the unknowns from `held` on among each other stays as it was.
+    The information is what these very pixels give, or, `of_average`, what such pixels give on average.
     """
     image, state = view.image_e.ravel(), view.state.ravel()
     pull, weight = np.zeros(len(expected)), np.zeros(len(expected))
@@ -106,8 +105,8 @@ def slopes(
             mills, curvature, kept = of_clipped((clip_e - expected[pixel]) / sigma)
             pull[pixel] = mills / sigma
             weight[pixel] *= kept if of_average else curvature
-    information[:held], information[held:, :held] = precision[:held], precision[held:, :held]
-    add_information(jacobian, weight, held, information)
+    information[:] = precision
+    add_information(jacobian, weight, information)
     for one in range(len(values)):
         total = dot(jacobian[one], pull)
         for other in range(len(values)):

@@ -44,25 +44,24 @@ def _four_dots(x: Array, p: Array, q: Array, r: Array, s: Array) -> tuple[float,
 
 
 @compiled
-def add_information(jacobian: Array, weight: Array, held: int, into: Array) -> None:
-    """Add J W Jᵀ, but for the block of the last unknowns, from `held` on."""
+def add_information(jacobian: Array, weight: Array, into: Array) -> None:
+    """Add J W Jᵀ."""
     size, pixels = jacobian.shape
     weighted, totals = np.empty(pixels), np.empty(size)
     for one in range(size):
         for pixel in range(pixels):
             weighted[pixel] = jacobian[one, pixel] * weight[pixel]
-        end = min(one + 1, held)
-        fours = end // 4 * 4
+        fours = (one + 1) // 4 * 4
         for at in range(0, fours, 4):
             totals[at], totals[at + 1], totals[at + 2], totals[at + 3] = _four_dots(
                 weighted, jacobian[at], jacobian[at + 1], jacobian[at + 2], jacobian[at + 3]
             )
-        for at in range(fours, end):
+        for at in range(fours, one + 1):
             totals[at] = dot(weighted, jacobian[at])
-        for other in range(end):
+        into[one, one] += totals[one]
+        for other in range(one):
             into[one, other] += totals[other]
-            if other < one:
-                into[other, one] += totals[other]
+            into[other, one] += totals[other]
 
 
 @compiled

@@ -157,7 +157,7 @@ class Climb(ABC):
     def _slopes(self, variance: Array, gradient: Array, fisher: Array, *, of_average: bool) -> None:
         slopes(
             self._view, self._values, self._expected, self._jacobian, variance, self._prior,
-            self._fit.known.clip_e, of_average, len(gradient), gradient, fisher,
+            self._fit.known.clip_e, of_average, gradient, fisher,
         )  # fmt: skip
 
     def _variance(self, expected: Array) -> Array:

@@ -100,7 +100,7 @@ def _gain(
     images[count - 2], images[count - 1] = flares_e, 1.0
     by, flat_weight, residual = images.reshape(count, -1), weight.ravel(), left_e.ravel()
     information, inverse = np.zeros((count, count)), np.empty((count, count))
-    add_information(by, flat_weight, len(by), information)
+    add_information(by, flat_weight, information)
     if math.isnan(inverted(information, inverse)):
         return math.nan
     pull = np.zeros(count)

@@ -134,7 +134,7 @@ def _cluster(mean_e: Array, exposure_s: float, key: int) -> tuple[Cluster, Camer
     """Return the window of a frame's only cluster."""
     seen: list[tuple[Cluster, Camera]] = []
 
-    def look(cluster: Cluster, camera: Camera) -> None:
+    def look(cluster: Cluster, camera: Camera, *_: object) -> None:
         seen.append((cluster, camera))
 
     with pytest.MonkeyPatch.context() as patch:
