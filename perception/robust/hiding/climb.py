@@ -82,11 +82,14 @@ class Climb(ABC):
         """Logarithms of the sources' ranges where it stands, as their fluxes say."""
         return self._fit.layout.of_sources(self._values[: self._fit.layout.size])[:, 2]
 
-    def _reach(self, most_cost: float = math.inf, *, may_be_bad: bool = False) -> bool:
+    def _reach(
+        self, most_cost: float = math.inf, *, may_be_bad: bool = False, begins_near: bool = False
+    ) -> bool:
         """Go on to the greatest likelihood, and write it into the fit; tell whether it is reached.
 
         It is not where what is ahead has a greater cost than `most_cost`, or is no good explanation. One that
-        `may_be_bad` need not be, and is taken as far as it has come; not far where it stays bad.
+        `may_be_bad` need not be, and is taken as far as it has come; not far where it stays bad. One that
+        `begins_near` a maximum is judged from the first step on.
         """
         layout, size = self._fit.layout, len(self._values)
         gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
@@ -105,7 +108,7 @@ class Climb(ABC):
                 beyond_noise = before - pixels - _NOISE_SIGMAS * math.sqrt(2.0 * pixels)
                 if self.to_gain < max(_SETTLED, _SETTLED_SHARE * beyond_noise if may_be_bad else 0.0):
                     break
-                is_judged = done >= JUDGED_AFTER and not may_be_bad
+                is_judged = (begins_near or done >= JUDGED_AFTER) and not may_be_bad
                 if is_judged and not self._is_promising(inverse, most_cost):
                     return False
             np.copyto(damped, fisher)

@@ -164,8 +164,9 @@ def _moved(pile: Solution, camera: Camera) -> Solution | None:
         return None
     problem = Problem(pile.window, pile.starts, pile.background_e, motions)
     moving = camera.moving
-    most_cost = pile.cost + NO_RIVAL if _is_good(pile, camera) else math.inf
-    moved = Spheres(problem, moving).solution(most_cost)
+    is_good = _is_good(pile, camera)
+    most_cost = pile.cost + NO_RIVAL if is_good else math.inf
+    moved = Spheres(problem, moving).solution(most_cost, begins_near=is_good)
     return moved if moved is not None and _is_good(moved, moving) and moves(moved) else None
 
 

@@ -29,12 +29,14 @@ class Spheres(Climb):
         fit = Fit(problem, camera)
         super().__init__(fit, camera, fit.values.copy(), fit.layout.most_step, fit.prior)
 
-    def solution(self, most_cost: float = math.inf, *, may_be_bad: bool = False) -> Solution | None:
+    def solution(
+        self, most_cost: float = math.inf, *, may_be_bad: bool = False, begins_near: bool = False
+    ) -> Solution | None:
         """Return what is likeliest; None where there is no maximum, or no good one unless it `may_be_bad`.
 
-        Nor where its cost would be greater than `most_cost`.
+        Nor where its cost would be greater than `most_cost`: told at once of what `begins_near` a maximum.
         """
-        if not self._reach(most_cost, may_be_bad=may_be_bad):
+        if not self._reach(most_cost, may_be_bad=may_be_bad, begins_near=begins_near):
             return None
         return solutions_of([self._fit], self._camera)[0]
 
