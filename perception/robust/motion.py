@@ -68,6 +68,20 @@ def asked_motions(solution: Solution, camera: Camera) -> list[Motion]:
     return [_seen(solution, *_drawn_out(solution, k), camera) for k in range(solution.count)]
 
 
+def share_asked(solution: Solution) -> float:
+    """Return how much of the χ² beyond noise that flares at rest leave the motions it asks for explain.
+
+    To first order, and more than all of it where what is left is small beside the model's errors.
+    """
+    left = solution.left_over
+    asked = (
+        [solution.drawn_out]
+        if solution.count == 1
+        else [_drawn_out(solution, k) for k in range(solution.count)]
+    )
+    return sum(chi2 for chi2, *_ in asked) / max(left.seen_chi2 - left.seen_pixels, 1.0)
+
+
 def is_long_clutter(solution: Solution, index: int, camera: Camera) -> bool:
     """Tell whether a flare on texture or edges moves as no robot does: leaves, seams and slits are long, too.
 
@@ -87,7 +101,8 @@ def _seen(
     One that costs more than it may gain, by so much that it would not be weighed in, is none.
     """
     length_px = math.hypot(along_u, along_v)
-    if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
+    # Of several one seems to by chance so much more often.
+    if not (chi2 > SEEMS_CHI2 + 2.0 * math.log(solution.count) and LEAST_PX < length_px < math.inf):
         return AT_REST
     # To first order a residual may ask for a motion that is too long, and longer ones cost more.
     price = motion_price(np.array([0.5 * length_px]), solution.log_range, camera)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.flare import image_radius_px
-from perception.model.layout import CLIPPED, UNUSABLE
+from perception.model.layout import UNUSABLE
 from perception.model.ranging import brightness_e
 from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
@@ -23,7 +23,7 @@ from perception.robust.hiding.climb import good_ones
 from perception.robust.hiding.covered import shows_its_size
 from perception.robust.hiding.outlines import discs_by_outline
 from perception.robust.hiding.spheres import Spheres
-from perception.robust.motion import AT_REST, asked_motions, moves
+from perception.robust.motion import AT_REST, asked_motions, moves, share_asked
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
@@ -50,7 +50,9 @@ _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first gu
 _TRIED = 2
 _BESIDE_PX = 2.0
 _NEARLY = 1.0  # of 2 Δ ln L: what has more to gain goes on without an end
-_MOST_MOVED = 0.15  # of the light: so much those at rest may leave of ones that move, if nothing clips
+# Of the χ² that those at rest leave, by motions: of what moves 1 to 3 px it is .8 and more, of what lacks one
+# sphere .1 to .5.
+_LEAST_ASKED = 0.6
 _MOST_MORE = 2  # flares than outline and blobs show
 # Of what is lit, over the brightness of sources: where clipped it seems dimmer.
 _DIMMEST, _BRIGHTEST = 0.5, 1.5
@@ -156,15 +158,14 @@ def pile_of(
 
 def _moved(pile: Solution, camera: Camera) -> Solution | None:
     """Return spheres that move while they are exposed, if the residual of those at rest asks for that."""
-    is_clipped = bool((pile.window.state == CLIPPED).any())
-    if not is_clipped and pile.left_over.share > _MOST_MOVED:
+    is_good = _is_good(pile, camera)
+    if not is_good and share_asked(pile) < _LEAST_ASKED:
         return None
     motions = asked_motions(pile, camera)
     if all(motion == AT_REST for motion in motions):
         return None
     problem = Problem(pile.window, pile.starts, pile.background_e, motions)
     moving = camera.moving
-    is_good = _is_good(pile, camera)
     most_cost = pile.cost + NO_RIVAL if is_good else math.inf
     moved = Spheres(problem, moving).solution(most_cost, begins_near=is_good)
     return moved if moved is not None and _is_good(moved, moving) and moves(moved) else None
