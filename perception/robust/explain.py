@@ -147,7 +147,7 @@ def _explained(
         ]
         halos = with_halo(dict(enumerate(plain)), camera)
         parted = _parted(divisible, halos, prepared.shape, camera, cut_short)
-        pairs, rivals = eclipses(found, plain, {**parted, **piles}, may_be, camera)
+        pairs, rivals = eclipses(found, plain, parted, piles, may_be, camera)
         for several in (piles, pairs):
             _take_up(several, parted, prepared.shape)
         _take_up(cut_discs(found, plain, parted, may_be, camera), parted, prepared.shape)

@@ -75,7 +75,7 @@ class Fit:
     def climb(self, sources: Sources, reach_px: Array) -> None:
         """Go on to the greatest likelihood, with images as laid out, of so large radii.
 
-        Where it converges, and the images are not larger than the window.
+        It converges where images are no wider than the window's diagonal.
         """
         self.deviance, self.log_information = maximise(
             self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
@@ -83,7 +83,7 @@ class Fit:
         )  # fmt: skip
         growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
         self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
-        # Of what is wider than its window no limb is seen: even ground, that may be as near as it likes.
+        # Of larger ones no limb is seen: they are even ground, and may be as near as they like.
         shows_limb = float(self.image_radius_px.max()) < math.hypot(*self.window.image_e.shape)
         self.converged = math.isfinite(self.deviance) and shows_limb
 

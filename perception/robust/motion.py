@@ -71,7 +71,8 @@ def asked_motions(solution: Solution, camera: Camera) -> list[Motion]:
 def share_asked(solution: Solution) -> float:
     """Return how much of the χ² beyond noise that flares at rest leave the motions it asks for explain.
 
-    To first order, and more than all of it where what is left is small beside the model's errors.
+    To first order. χ² of the motions knows of noise alone, the other of the model's errors, too: of bright
+    flares it is more than all of it.
     """
     left = solution.left_over
     asked = (
@@ -101,8 +102,7 @@ def _seen(
     One that costs more than it may gain, by so much that it would not be weighed in, is none.
     """
     length_px = math.hypot(along_u, along_v)
-    # Of several one seems to by chance so much more often.
-    if not (chi2 > SEEMS_CHI2 + 2.0 * math.log(solution.count) and LEAST_PX < length_px < math.inf):
+    if not (chi2 > SEEMS_CHI2 and LEAST_PX < length_px < math.inf):
         return AT_REST
     # To first order a residual may ask for a motion that is too long, and longer ones cost more.
     price = motion_price(np.array([0.5 * length_px]), solution.log_range, camera)

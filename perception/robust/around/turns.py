@@ -131,13 +131,15 @@ def fit_in_turns(
     known = dict(tried)
     best: dict[int, tuple[Solution, list[Kind]]] = {}
     current = dict(solutions)
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         for index in known:
             known[index] = _climbed(current[index], plain[index].window, known[index], camera)
         windows = {
             index: replace(plain[index].window, features=_structure(features, current[index], camera))
             for index, features in known.items()
         }
+        if turn == 0:  # features have not moved to where they belong: nothing is told of what lies ahead
+            windows = {index: replace(window, to_beat=math.inf) for index, window in windows.items()}
         problems = [current[index].again(windows[index]) for index in known]
         for index, again in zip(list(known), solve(problems, camera), strict=True):
             if again is None:

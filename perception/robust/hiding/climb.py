@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.layout import SEEN
 from perception.model.likelihood.maximum import (
     FIRST_DAMPING,
     JUDGED_AFTER,
@@ -30,7 +31,7 @@ Array = NDArray[np.float64]
 
 _MOST_STEPS = 30  # what is of another shape goes on without an end
 _SETTLED = 0.002  # in −2 ln L: a twentieth of a standard deviation
-_SETTLED_SHARE = 0.001  # of what χ² is beyond noise, where that is so much that more is wanted
+_SETTLED_SHARE = 0.001  # of what χ² is beyond noise, where that is too much for it to be good
 _NOISE_SIGMAS = 5.0  # of χ²
 _MOST_GIVEN_UP = 3  # guesses, from the likeliest on, after which none of the others comes to anything
 
@@ -95,7 +96,7 @@ class Climb(ABC):
         gradient, fisher, inverse = np.empty(size), np.empty((size, size)), np.empty((size, size))
         damped = np.empty((size, size))
         damping, is_new, is_there = FIRST_DAMPING, True, True
-        pixels = int(np.count_nonzero(self._view.state))
+        pixels = int(np.count_nonzero(self._view.state == SEEN))
         for done in range(_MOST_STEPS):
             if is_new:
                 variance = self._variance(self._expected)
@@ -105,11 +106,14 @@ class Climb(ABC):
                     return False
                 self.to_gain = float(gradient @ inverse @ gradient)
                 before = self._objective(self._values, self._expected, variance)
-                beyond_noise = before - pixels - _NOISE_SIGMAS * math.sqrt(2.0 * pixels)
-                if self.to_gain < max(_SETTLED, _SETTLED_SHARE * beyond_noise if may_be_bad else 0.0):
+                if self.to_gain < _SETTLED:
                     break
+                beyond_noise = before - pixels - _NOISE_SIGMAS * math.sqrt(2.0 * pixels)
+                stays = may_be_bad and self.to_gain < _SETTLED_SHARE * beyond_noise
                 is_judged = (begins_near or done >= JUDGED_AFTER) and not may_be_bad
-                if is_judged and not self._is_promising(inverse, most_cost):
+                if (stays or is_judged) and not self._is_promising(inverse, most_cost):
+                    if may_be_bad:
+                        break
                     return False
             np.copyto(damped, fisher)
             np.fill_diagonal(damped, np.diagonal(fisher) * (1.0 + damping))

@@ -50,8 +50,8 @@ _SIZES = (0.45, 0.7, 0.95)  # of the one behind, relative to the other: first gu
 _TRIED = 2
 _BESIDE_PX = 2.0
 _NEARLY = 1.0  # of 2 Δ ln L: what has more to gain goes on without an end
-# Of the χ² that those at rest leave, by motions: of what moves 1 to 3 px it is .8 and more, of what lacks one
-# sphere .1 to .5.
+# Of the χ² that those at rest leave, by motions: of what moves mostly more, of what lacks one sphere mostly
+# less; these are tried last.
 _LEAST_ASKED = 0.6
 _MOST_MORE = 2  # flares than outline and blobs show
 # Of what is lit, over the brightness of sources: where clipped it seems dimmer.
@@ -65,6 +65,7 @@ def eclipses(
     found: Sequence[Cluster],
     plain: Sequence[Solution | None],
     parted: Mapping[int, Solution],
+    piles: Mapping[int, Solution],
     may_be: Sequence[bool],
     camera: Camera,
 ) -> tuple[dict[int, Solution], dict[int, Solution]]:
@@ -79,6 +80,8 @@ def eclipses(
         The clusters.
     plain, parted
         What explains each so far: a flare for each blob, None where nothing does; and, by index, more.
+    piles
+        By index spheres that explain a window, but maybe others do, too.
     may_be
         Which may be of another shape (`limb.may_be_other_shape`): of the others only pairs are tried.
     camera
@@ -93,7 +96,8 @@ def eclipses(
     for index, (cluster, one) in enumerate(zip(found, plain, strict=True)):
         if cluster.is_in_crowd:
             continue
-        good = _by_both_ends(cluster, one, parted.get(index), camera, may_be=may_be[index])
+        several = [each[index] for each in (parted, piles) if index in each]
+        good = _by_both_ends(cluster, one, several, camera, may_be=may_be[index])
         if not good:
             continue
         likeliest = min(good, key=lambda pair: pair.cost)
@@ -133,7 +137,7 @@ def pile_of(
     ]
     if not reach_px or len(starts) + most_more < 2:
         return None
-    shown, likeliest = len(starts), None
+    shown, likeliest, late = len(starts), None, []
     for more in range(1 + most_more):
         pile = lone
         if len(starts) > 1 or lone is None:
@@ -143,30 +147,38 @@ def pile_of(
             break
         if pile.count > 1:
             is_there = climb.to_gain < _NEARLY and _is_good(pile, camera)
+            likeliest = likelier(likeliest, pile if is_there else None)
             # Of what clips, more that move than its outline shows fill any patch.
-            moved = None if more > 0 and cluster.is_clipped else _moved(pile, camera)
-            for each in (pile if is_there else None, moved):
-                likeliest = likelier(likeliest, each)
+            if more == 0 or not cluster.is_clipped:
+                if _is_good(pile, camera) or share_asked(pile) >= _LEAST_ASKED:
+                    likeliest = likelier(likeliest, _moved(pile, camera))
+                else:
+                    late.append(pile)
         # Ones that move may explain what another flare does far better.
         explained = pile if likeliest is None or likeliest.motion_px is not None else likeliest
         asking = (pile.left_over.peak_sigmas, explained.left_over.peak_sigmas)
         if more == most_more or not min(asking) > RESIDUAL_SIGMAS:
             break
         starts = with_one_more(pile)[0]
+    for pile in late:
+        if likeliest is None or (likeliest.motion_px is None and likeliest.count > pile.count):
+            likeliest = likelier(likeliest, _moved(pile, camera, likeliest))
     return None if likeliest is None else _believed(replace(likeliest, by_outline=shown), camera)
 
 
-def _moved(pile: Solution, camera: Camera) -> Solution | None:
-    """Return spheres that move while they are exposed, if the residual of those at rest asks for that."""
+def _moved(pile: Solution, camera: Camera, rival: Solution | None = None) -> Solution | None:
+    """Return spheres that move while they are exposed, if the residual of those at rest asks for that.
+
+    Nothing where that is sure not to matter beside a rival, or those at rest if they are good.
+    """
     is_good = _is_good(pile, camera)
-    if not is_good and share_asked(pile) < _LEAST_ASKED:
-        return None
     motions = asked_motions(pile, camera)
     if all(motion == AT_REST for motion in motions):
         return None
     problem = Problem(pile.window, pile.starts, pile.background_e, motions)
     moving = camera.moving
-    most_cost = pile.cost + NO_RIVAL if is_good else math.inf
+    rival = pile if is_good and rival is None else rival
+    most_cost = math.inf if rival is None else rival.cost + NO_RIVAL
     moved = Spheres(problem, moving).solution(most_cost, begins_near=is_good)
     return moved if moved is not None and _is_good(moved, moving) and moves(moved) else None
 
@@ -188,7 +200,7 @@ def _believed(pile: Solution, camera: Camera) -> Solution | None:
 
 
 def _by_both_ends(
-    cluster: Cluster, one: Solution | None, more: Solution | None, camera: Camera, *, may_be: bool
+    cluster: Cluster, one: Solution | None, several: Sequence[Solution], camera: Camera, *, may_be: bool
 ) -> list[Solution]:
     """Explain a window by two discs at both ends of what is lit, or where two flares were before.
 
@@ -204,10 +216,10 @@ def _by_both_ends(
         guesses = _guesses(cluster, camera)
     of_two = [
         each.starts
-        for each in (one, more)
+        for each in (one, *several)
         if each is not None and (of_layouts or each.count == 2) and is_near(each, least_radius_px(camera))
     ]
-    tried = of_two + (guesses[:_TRIED] if math.isfinite(most_cost) else guesses)
+    tried = of_two + (guesses[:_TRIED] if of_two and math.isfinite(most_cost) else guesses)
     problems = (Problem(cluster.window, starts, cluster.background_e) for starts in tried)
     fits = (Spheres(problem, camera) for problem in problems)
     return good_ones((fit.solution(most_cost) for fit in fits), partial(_is_good, camera=camera), _TRIED)

@@ -13,6 +13,7 @@ import numpy as np
 
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR
+from perception.robust.overlap.rivals import to_beat
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution, solve
 
@@ -131,18 +132,24 @@ def asks_for_more(solution: Solution) -> bool:
 
 
 def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
-    """Fit flares through a point spread that may be wider or narrower than the calibration says."""
+    """Fit flares through a point spread that may be wider or narrower than the calibration says.
+
+    However unlikely: by that it is decided about others.
+    """
     if not solutions:
         return []
-    return solve([one.again() for one in solutions], _with_spread(camera, "psf_sigma_px", _WIDTH_FREE))
+    return solve(
+        [to_beat(one, math.inf).again() for one in solutions],
+        _with_spread(camera, "psf_sigma_px", _WIDTH_FREE),
+    )
 
 
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
-    """Fit lone flares whose size may be any, whatever their flux says."""
+    """Fit lone flares whose size may be any, whatever their flux says; however unlikely."""
     if not solutions:
         return []
     free = _with_spread(camera, "range_constant_dn_m2_per_s", 8.0)
-    return solve([solution.again() for solution in solutions], free)
+    return solve([to_beat(solution, math.inf).again() for solution in solutions], free)
 
 
 def _with_spread(camera: Camera, name: str, spread: float) -> Camera:
