@@ -74,6 +74,24 @@ def test_each_is_ranged_while_they_move(
 
 
 @pytest.mark.parametrize(
+    ("places", "ways_px"),
+    [
+        ([(31.3, 31.6, 2.1), (27.05, 32.33, 2.82)], [(0.18, 1.87), (1.46, -0.62)]),
+        ([(31.3, 31.6, 1.4), (27.85, 38.61, 1.95)], [(1.77, 0.64), (-0.28, -0.5)]),
+        ([(31.3, 31.6, 2.03), (38.23, 26.69, 3.35), (27.5, 34.83, 3.46)], [(2.74, 2.98)] * 3),
+    ],
+)
+def test_those_are_told_whose_residual_hardly_asks_for_their_motions(
+    places: list[Place], ways_px: list[tuple[float, float]]
+) -> None:
+    """Motions explain a third to a half of what those at rest leave; where one is missing they do, too."""
+    found = _told_while_moving(places, ways_px, 0.6, 60)
+    assert len(found) == len(places)
+    for place, told in zip(places, found, strict=True):
+        assert np.abs(_pulls(place, told)).max() < 4.5
+
+
+@pytest.mark.parametrize(
     ("places", "way_px"),
     [([(31.83, 31.14, 19.6), (31.38, 28.26, 24.0)], (-0.33, 4.62)), ([(31.9, 32.0, 27.7), (29.0, 32.2, 34.6)], (-2.1, 2.8))],
 )  # fmt: skip
