@@ -232,3 +232,26 @@ def test_a_fit_that_nothing_determines() -> None:
         problem = Problem(window, [(*PLACE_PX, math.log(5.0))], 0.0)
         (solution,) = solve([problem], Camera(SMALL, 1e-3, 1.0))
         assert solution is None or not solution.log_range_sigma[0] < 1.0
+
+
+def _of_lit(lit: Array, to_beat: float = math.inf) -> Solution | None:
+    """Return the fit of one flare to a window, of each pixel of which a part is as bright as a source."""
+    case = CASES["1 m"]
+    level_e, camera = float(case.light_e().max()), Camera(case.known, case.exposure_s, 1.0)
+    image_e = level_e * lit + case.background_e
+    (window,) = windows_of(case, image_e[None], np.zeros((1, *lit.shape), dtype=np.bool_), case.camera)
+    start = (*PLACE_PX, math.log(1.5))
+    return solve([Problem(replace(window, to_beat=to_beat), [start], case.background_e)], camera)[0]
+
+
+def test_what_is_sure_to_be_less_likely_is_given_up() -> None:
+    """A disc for what is lit as an oval; where it may matter it is the same, to the bit."""
+    side = CASES["1 m"].corner_px[2]
+    rows, columns = np.indices((side, side)) - 0.5 * side
+    oval = np.clip(5.0 - np.hypot(columns, 1.5 * rows), 0.0, 1.0)
+    one = _of_lit(oval)
+    assert one is not None
+    same = _of_lit(oval, one.deviance + 1.0)
+    assert same is not None
+    assert (same.deviance, same.u_px[0], same.log_range[0]) == (one.deviance, one.u_px[0], one.log_range[0])
+    assert _of_lit(oval, one.deviance - 100.0) is None
