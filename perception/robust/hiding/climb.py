@@ -66,7 +66,6 @@ class Climb(ABC):
         self._fit, self._camera, self._view = fit, camera, fit.window.view
         self._values, self._most_step, self._prior = values, most_step, prior
         self._expected, self._jacobian = self._expectation(values)
-        self.objective = self._objective(values, self._expected)
         self.to_gain = math.inf
 
     @abstractmethod

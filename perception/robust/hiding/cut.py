@@ -18,7 +18,7 @@ from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Cluster
 from perception.robust.fit import Fit
 from perception.robust.hiding.climb import Climb, good_ones
-from perception.robust.hiding.eclipse import differing, is_as_bright, lit_pixels
+from perception.robust.hiding.eclipse import is_as_bright, lit_pixels
 from perception.robust.hiding.spheres import expectation_of_spheres
 from perception.robust.motion import AT_REST, asked_motions, moves
 from perception.robust.overlap.deblend import LEAST_GAIN, gain
@@ -105,7 +105,8 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
     lit = lit_pixels(cluster)
     if lit is None:
         return []
-    level_e, places = lit
+    level_e, is_lit = lit
+    places = np.argwhere(is_lit)[:, ::-1].astype(np.float64)
     middle = places.mean(axis=0)
     corner = np.array([cluster.window.box.left, cluster.window.box.top], dtype=np.float64)
     u_px, v_px = (corner + middle).tolist()
@@ -128,7 +129,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[Guess]:
         off_u, off_v = columns + corner[0] - place[0], rows + corner[1] - place[1]
         shown = (np.hypot(off_u, off_v) < radius_px) & (off_u * away[0] + off_v * away[1] < edge_px)
         guess = (*place.tolist(), math.log(at_1_m_px / radius_px), float(turn), edge_px)
-        guesses.append((differing(shown, cluster.window, places), guess))
+        guesses.append((int(np.count_nonzero((is_lit != shown) & cluster.window.usable)), guess))
     return [guess for _, guess in sorted(guesses, key=lambda each: each[0])]
 
 

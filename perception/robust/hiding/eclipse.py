@@ -39,7 +39,7 @@ from perception.robust.overlap.pairs import (
     meeting,
 )
 from perception.robust.overlap.rivals import NO_RIVAL, likelier
-from perception.robust.problem import Problem, Start, Window
+from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution
 
 Array = NDArray[np.float64]
@@ -146,11 +146,11 @@ def pile_of(
         if pile is None:
             break
         if pile.count > 1:
-            is_there = climb.to_gain < _NEARLY and _is_good(pile, camera)
-            likeliest = likelier(likeliest, pile if is_there else None)
+            is_good = _is_good(pile, camera)
+            likeliest = likelier(likeliest, pile if is_good and climb.to_gain < _NEARLY else None)
             # Of what clips, more that move than its outline shows fill any patch.
             if more == 0 or not cluster.is_clipped:
-                if _is_good(pile, camera) or share_asked(pile) >= _LEAST_ASKED:
+                if is_good or share_asked(pile) >= _LEAST_ASKED:
                     likeliest = likelier(likeliest, _moved(pile, camera))
                 else:
                     late.append(pile)
@@ -260,7 +260,8 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
     lit = lit_pixels(cluster)
     if lit is None:
         return []
-    window, (level_e, places) = cluster.window, lit
+    window, (level_e, is_lit) = cluster.window, lit
+    places = np.argwhere(is_lit)[:, ::-1].astype(np.float64)
     middle = places.mean(axis=0)
     _, axes = np.linalg.eigh((places - middle).T @ (places - middle))
     along, across = (places - middle) @ axes[:, 1], (places - middle) @ axes[:, 0]
@@ -288,7 +289,7 @@ def _guesses(cluster: Cluster, camera: Camera) -> list[list[Start]]:
                 off_u, off_v = (at_px * axes[:, 1]).tolist()
                 starts.append((u_px + off_u, v_px + off_v, math.log(at_1_m_px / radius_px)))
                 shown |= np.hypot(away[0] - off_u, away[1] - off_v) < radius_px
-            guesses.append((differing(shown, window, places), starts))
+            guesses.append((int(np.count_nonzero((is_lit != shown) & window.usable)), starts))
     return [starts for _, starts in sorted(guesses, key=lambda guess: guess[0])]
 
 
@@ -309,26 +310,17 @@ def _guesses_beside(cluster: Cluster, several: Solution, camera: Camera) -> list
     return [[*two, *rest] for two in _guesses(alone, camera)]
 
 
-def lit_pixels(cluster: Cluster) -> tuple[float, Array] | None:
+def lit_pixels(cluster: Cluster) -> tuple[float, NDArray[np.bool_]] | None:
     """Return how bright the brighter half of a cluster's light is, and which pixels have half of that.
 
-    The pixels by column and row in the window, shape (pixels, 2); None where nothing is lit.
+    The pixels as a mask of the window; None where nothing is lit.
     """
     window = cluster.window
     excess_e = np.where(window.usable, window.image_e - cluster.background_e, 0.0)
     if not excess_e.max() > 0.0:
         return None
     level_e = float(np.median(excess_e[excess_e >= 0.5 * excess_e.max()]))
-    rows, columns = np.nonzero(excess_e > 0.5 * level_e)
-    return level_e, np.column_stack([columns, rows]).astype(np.float64)
-
-
-def differing(shown: NDArray[np.bool_], window: Window, lit_places: Array) -> int:
-    """Return how many pixels are lit (`lit_pixels`) that a guess does not show, or shown that are not."""
-    lit = np.zeros(shown.shape, dtype=np.bool_)
-    columns, rows = lit_places.astype(np.int64).T
-    lit[rows, columns] = True
-    return int(np.count_nonzero((lit != shown) & window.usable))
+    return level_e, excess_e > 0.5 * level_e
 
 
 def is_as_bright(least_e: float, most_e: float, place: tuple[float, float], camera: Camera) -> bool:
