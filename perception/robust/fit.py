@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from perception.model.layout import Sources
 from perception.model.likelihood.maximum import maximise
-from perception.model.likelihood.pixels import unlikeliness
 from perception.model.window import Camera
 from perception.robust.problem import Problem
 
@@ -61,16 +60,6 @@ class Fit:
     def prior(self) -> Array:
         """Precision of the unknowns a priori."""
         return self.layout.prior(self.structure, self.known.motion_px)
-
-    def unlikeliness(self, sources: Sources, starts: Array) -> Array:
-        """Return −2 ln L but for a constant of first guesses, with images as laid out for these.
-
-        Shape (guesses, sources of each, 3) → (guesses,).
-        """
-        guesses = np.tile(self.values, (len(starts), 1))
-        own = guesses[:, : self.layout.width].reshape(*starts.shape[:2], self.layout.per_source)
-        own[:, :, :3] = starts
-        return unlikeliness(self.window.view, sources, self.structure, self.known, self.prior, guesses)
 
     def climb(self, sources: Sources, reach_px: Array) -> None:
         """Go on to the greatest likelihood, with images as laid out, of so large radii.

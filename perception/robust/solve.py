@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.layout import Sources, part_of
+from perception.model.likelihood.first_guesses import Views, unlikeliness
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
@@ -225,21 +226,25 @@ def start_costs(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[l
     """
     if not problems:
         return []
-    starts = [np.array([each.starts for each in of_one]) for of_one in problems]
-    counts = [each.shape[0] * each.shape[1] for each in starts]
-    all_starts = np.concatenate([each.reshape(-1, 3) for each in starts])
+    windows = [of_one[0].window for of_one in problems]
+    background_e = np.array([of_one[0].background_e for of_one in problems])
+    guesses = [each.starts for of_one in problems for each in of_one]
+    window = np.repeat(np.arange(len(problems)), [len(of_one) for of_one in problems])
+    flares = [len(starts) for starts in guesses]
+    first_source = np.cumsum([0, *flares])
+    all_starts = np.array([start for starts in guesses for start in starts])
     u_px, v_px, log_range = np.ascontiguousarray(all_starts.T)
     hidden_e = camera.hidden_px_at_1_m(all_starts[:, :2])
     if hidden_e is not None:
-        hidden_e *= np.repeat([max(of_one[0].background_e, 0.0) for of_one in problems], counts)
+        hidden_e *= np.repeat(np.maximum(background_e, 0.0)[window], flares)
     laid, imaged = lay_out(camera, u_px, v_px, log_range, hidden_e, None, np.full(len(u_px), _OF_STARTS))
-    costs, first = [], 0
-    for of_one, own, count in zip(problems, starts, counts, strict=True):
-        here = slice(first, first := first + count)
-        each = Fit(of_one[0], camera).unlikeliness(part_of(laid, here.start, here.stop), own)
-        is_image = imaged[here].reshape(own.shape[:2]).all(axis=1)
-        costs.append(np.where(is_image, each, math.inf).tolist())
-    return costs
+    costs = unlikeliness(
+        Views.of([each.view for each in windows]), laid, camera.known(windows[0].clip_e), all_starts,
+        background_e, window, first_source,
+    )  # fmt: skip
+    costs[~np.logical_and.reduceat(imaged, first_source[:-1])] = math.inf
+    ends = np.cumsum([len(of_one) for of_one in problems]).tolist()
+    return [costs[first:end].tolist() for first, end in zip([0, *ends], ends, strict=False)]
 
 
 def likely_starts(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple[int, Problem]]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View, part_of
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
 from perception.model.likelihood.products import add_information, dot
 from perception.model.normal import log_upper_tail, of_clipped
 from perception.model.spread import spread_nodes
@@ -141,28 +141,6 @@ def log_variances(view: View, variance: Array) -> float:
         if state[pixel] == SEEN:
             total += math.log(variance[pixel])
     return total
-
-
-@compiled
-def unlikeliness(
-    view: View, sources: Sources, structure: Structure, known: Known, precision: Array, guesses: Array
-) -> Array:
-    """Return −2 ln L of guesses of the unknowns, as `maximise` of the likeliest; infinite where none can be.
-
-    The arguments are as for that; `guesses` has the shape (guesses, unknowns), `sources` are those of all.
-    """
-    pixels, unknowns = view.image_e.size, guesses.shape[1]
-    count = len(sources.log_range_at) // len(guesses)
-    step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
-    expected, variance, jacobian = np.empty(pixels), np.empty(pixels), np.empty((unknowns, pixels))
-    totals = np.full(len(guesses), math.inf)
-    for guess in range(len(guesses)):
-        if is_inside(guesses[guess], view, count, step):
-            own = part_of(sources, guess * count, (guess + 1) * count)
-            expectation(guesses[guess], view, own, structure, known, expected, jacobian, variance)
-            totals[guess] = objective(view, guesses[guess], expected, variance, precision, known.clip_e)
-            totals[guess] += log_variances(view, variance)
-    return totals
 
 
 @compiled
