@@ -10,6 +10,7 @@ from perception.messages.pair import decode_pair
 from perception.messages.uart import encode, packet_levels
 from perception.model.fisher import flare_limit
 from perception.model.flare import PixelBox, flare_image
+from perception.model.lens import unproject
 from perception.model.ranging import brightness_e
 from perception.pairs import inseparable
 from perception.photometry import Expected, sample_at
@@ -40,6 +41,8 @@ def warm_up_frames() -> None:
     flare_limit(calibration, 40.3, 60.2, 4.0, 9e3, 20.0)
     flare_image(40.3, 60.2, 0.0025, PixelBox(50, 30, 21, 21), calibration)
     _measure_brightness(frame, calibration)
+    bent = replace(calibration, lens_model="brown_conrady", distortion=(-0.1, 0.0, 0.0, 0.0))
+    unproject(np.array([(40.3, 60.2)]), bent)
 
 
 def warm_up_sets() -> None:

@@ -24,6 +24,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.brown_conrady import undistorted
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
@@ -38,7 +39,6 @@ _RIGHT_ANGLE = 0.5 * math.pi
 _TABLE = 4097
 _WIDEST_RAD = _RIGHT_ANGLE - 1e-6
 _MOST_STEPS, _LAST_STEP = 40, 1e-9  # a step of 1e-9 leaves an error of its square
-_RESIDUAL = 1e-12
 _SCAN_ANGLES, _SCAN_AZIMUTHS = 901, 72
 
 
@@ -89,11 +89,7 @@ def stretch(direction: Array, calibration: Calibration) -> Array:
     focal_px = (calibration.fx_px, calibration.fy_px)
     if calibration.lens_model == "rectilinear":
         return np.asarray(max(focal_px) / direction[:, 2] ** 2)  # along the radius; across it by 1 / cos θ
-    lens, most = distortion_of(calibration), np.full(len(direction), np.nan)
-    for index in np.flatnonzero(~np.isnan(direction).any(axis=1)):
-        slope = np.diag(focal_px) @ lens.derivative(direction[index])
-        most[index] = np.linalg.norm(slope, ord=2)
-    return most
+    return _greatest(distortion_of(calibration).derivative(direction) * np.reshape(focal_px, (2, 1)))
 
 
 def distortion_of(calibration: Calibration) -> "Distortion":
@@ -185,28 +181,32 @@ class Distortion:
         )
         return np.asarray(cosine**3 / (xx * yy - xy**2))
 
-    def stretch(self, direction: Array) -> float:
-        """Return how far the image moves, at most, per radian of a direction before the fold, shape (3,)."""
+    def stretch(self, direction: Array) -> Array:
+        """Return how far the image moves, at most, per radian of directions before the fold, shape (...)."""
         if self.model == "rectilinear":
-            return 1.0 / float(_field_angle(direction)[0]) ** 2
-        if self.model == "fisheye":
-            return max(self._fisheye_slopes(direction))
-        return float(np.linalg.norm(self.derivative(direction), ord=2))
+            return np.asarray(1.0 / _field_angle(direction)[0] ** 2)
+        return _greatest(self.derivative(direction))
 
     def derivative(self, direction: Array) -> Array:
-        """Differentiate (x, y) by the direction, in radians outwards and around the axis, shape (2, 2).
+        """Differentiate (x, y) by the direction, in radians outwards and around the axis, shape (..., 2, 2).
 
-        At one direction before the fold, shape (3,), of a lens with distortion.
+        At unit directions before the fold, shape (..., 3), of a lens with distortion.
         """
-        cosine, sine, _ = (float(value) for value in _field_angle(direction))
-        outward = direction[:2] / sine if sine > 1e-9 else np.array([1.0, 0.0])
-        around = np.array([-outward[1], outward[0]])
+        cosine, sine, angle = _field_angle(direction)
+        aside = np.where(sine > 1e-9, sine, 1.0)
+        out_x = np.where(sine > 1e-9, direction[..., 0] / aside, 1.0)
+        out_y = np.where(sine > 1e-9, direction[..., 1] / aside, 0.0)
         if self.model == "fisheye":
-            slope_outward, slope_around = self._fisheye_slopes(direction)
-            return np.stack([outward * slope_outward, around * slope_around], axis=1)
-        xx, xy, yy = (float(value) for value in self._jacobian(*(direction[:2] / direction[2])))
-        frame = np.array([outward / cosine**2, around / cosine])
-        return np.asarray(np.array([[xx, xy], [xy, yy]]) @ frame.T)
+            outwards = self._fisheye_slope(angle)
+            around = np.where(sine > 1e-9, self.image_height(angle) / aside, 1.0)
+            xx, xy, yx, yy = out_x * outwards, -out_y * around, out_y * outwards, out_x * around
+        else:
+            aa, ab, bb = self._jacobian(
+                direction[..., 0] / direction[..., 2], direction[..., 1] / direction[..., 2]
+            )
+            xx, yx = (aa * out_x + ab * out_y) / cosine**2, (ab * out_x + bb * out_y) / cosine**2
+            xy, yy = (ab * out_x - aa * out_y) / cosine, (bb * out_x - ab * out_y) / cosine
+        return np.stack([np.stack([xx, xy], axis=-1), np.stack([yx, yy], axis=-1)], axis=-2)
 
     @cached_property
     def fold_rad(self) -> float:
@@ -259,12 +259,14 @@ class Distortion:
         return np.polynomial.Polynomial([1.0, k1, k2, k3]), np.polynomial.Polynomial([1.0, k4, k5, k6])
 
     @cached_property
-    def _ratio_slopes(self) -> tuple[Array, Array]:
-        """Coefficients of the derivatives of numerator and denominator of g by r²."""
+    def _of_ratio(self) -> tuple[Array, Array, Array, Array]:
+        """Coefficients of numerator and denominator of g, and of their derivatives by r²."""
         over, under = self._ratio
-        return np.asarray(over.deriv().coef, dtype=np.float64), np.asarray(
-            under.deriv().coef, dtype=np.float64
+        of_these = (each.coef for each in (over, under, over.deriv(), under.deriv()))
+        first, second, third, fourth = (
+            np.asarray(coefficients, dtype=np.float64) for coefficients in of_these
         )
+        return first, second, third, fourth
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
@@ -272,11 +274,17 @@ class Distortion:
         angle_rad = np.linspace(0.0, self._end_rad, _TABLE)
         return angle_rad, self.image_height(angle_rad)
 
+    @cached_property
+    def _tangents(self) -> tuple[Array, Array]:
+        """Image heights up to the end, and tangents of the field angles there."""
+        angle_rad, heights = self._table
+        return heights, np.tan(angle_rad)
+
     def _radial(self, square: Array) -> tuple[Array, Array]:
         """Return g and dg/d(r²) at r²."""
-        (over, under), (over_slope, under_slope) = self._ratio, self._ratio_slopes
-        below = _polyval(square, under.coef)
-        gain = _polyval(square, over.coef) / below
+        over, under, over_slope, under_slope = self._of_ratio
+        below = _polyval(square, under)
+        gain = _polyval(square, over) / below
         slope = _polyval(square, over_slope) - gain * _polyval(square, under_slope)
         return gain, slope / below
 
@@ -298,24 +306,14 @@ class Distortion:
 
     def _undistort(self, point: Array) -> Array:
         """Return (a, b) of brown_conrady, shape (..., 2), by Newton's method."""
-        angle_rad, heights = self._table
-        height = np.hypot(point[..., 0], point[..., 1])
-        start = np.interp(height, heights, np.tan(angle_rad))
-        scale = start / np.where(height > 0.0, height, 1.0)
-        a, b = point[..., 0] * scale, point[..., 1] * scale
-        for _ in range(_MOST_STEPS):
-            x, y = self._distort(a, b)
-            x, y = x - point[..., 0], y - point[..., 1]
-            xx, xy, yy = self._jacobian(a, b)
-            area = np.where(xx * yy == xy**2, np.nan, xx * yy - xy**2)
-            step_a, step_b = (yy * x - xy * y) / area, (xx * y - xy * x) / area
-            a, b = a - step_a, b - step_b
-            if not (np.hypot(step_a, step_b) > _LAST_STEP * (1.0 + np.hypot(a, b))).any():
-                break
-        x, y = self._distort(a, b)
-        found = np.hypot(x - point[..., 0], y - point[..., 1]) <= _RESIDUAL * (1.0 + height)
-        found &= np.hypot(a, b) <= math.tan(self._end_rad)
-        return np.where(found[..., None], np.stack([a, b], axis=-1), np.nan)
+        heights, tangents = self._tangents
+        height = np.hypot(point[..., 0], point[..., 1]).ravel()
+        start = np.interp(height, heights, tangents) / np.where(height > 0.0, height, 1.0)
+        found = undistorted(
+            np.ascontiguousarray(point.reshape(-1, 2)), start, *self._of_ratio,
+            float(self.coefficients[2]), float(self.coefficients[3]), math.tan(self._end_rad),
+        )  # fmt: skip
+        return found.reshape(point.shape)
 
     def _fisheye_direction(self, point: Array) -> Array:
         angle_rad, heights = self._table
@@ -332,12 +330,6 @@ class Distortion:
         scale = np.sin(angle) / np.where(height > 0.0, height, 1.0)
         return np.stack([point[..., 0] * scale, point[..., 1] * scale, np.cos(angle)], axis=-1)
 
-    def _fisheye_slopes(self, direction: Array) -> tuple[float, float]:
-        """Return how far the image moves per radian outwards and around the axis."""
-        _, sine, angle = (float(value) for value in _field_angle(direction))
-        around = float(self.image_height(np.array(angle))) / sine if sine > 1e-9 else 1.0
-        return float(self._fisheye_slope(np.array(angle))), around
-
     def _fisheye_slope(self, angle_rad: Array) -> Array:
         """Return dθ_d/dθ before the fold."""
         return np.asarray(_polyval(angle_rad**2, self._equidistant[1].coef))
@@ -353,8 +345,17 @@ def _distortion(model: LensModel, coefficients: tuple[float, ...]) -> Distortion
 
 
 def _polyval(at: Array, coefficients: NDArray[Any]) -> Array:
-    """Return the polynomial's value; NumPy loads its polynomials at their first use."""
-    return np.asarray(np.polynomial.polynomial.polyval(at, coefficients))
+    """Return the polynomial's value, by Horner's rule."""
+    value = np.asarray(coefficients[-1] + 0.0 * at)
+    for coefficient in coefficients[-2::-1]:
+        value = coefficient + value * at
+    return value
+
+
+def _greatest(slopes: Array) -> Array:
+    """Return the greatest that matrices stretch anything, shape (..., 2, 2) → (...)."""
+    (a, b), (c, d) = np.moveaxis(slopes, (-2, -1), (0, 1))
+    return np.asarray(0.5 * (np.hypot(a + d, b - c) + np.hypot(a - d, b + c)))
 
 
 def _first_root(polynomial: "np.polynomial.Polynomial") -> float:

@@ -58,7 +58,7 @@ class Intrinsics:
         if direction[2] < 0.05:
             sine = math.hypot(direction[0], direction[1])
             direction = np.array([*(direction[:2] / sine * math.sqrt(1.0 - 0.05**2)), 0.05])
-        stretch = self.distortion.stretch(direction)
+        stretch = float(self.distortion.stretch(direction))
         return max(self.fx_px, self.fy_px) * math.tan(min(angular_radius_rad, 1.5)) * stretch
 
     @property

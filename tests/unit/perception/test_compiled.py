@@ -65,6 +65,7 @@ def test_after_warming_up_no_frame_waits_for_the_compiler() -> None:
     counts = np.frombuffer(random(72).poisson(80.0, (96, 128)).astype(np.uint16).tobytes(), np.uint16)
     rich = calibration(width_px=128, height_px=96, cx_px=60.0, cy_px=50.0)
     plain = replace(rich, psf_sigma_px=1, prnu=0, response_angle_rad=[0, 1.1], response_relative=[1, 1])  # type: ignore[arg-type]
+    bent = replace(rich, lens_model="brown_conrady", distortion=(-0.1, 0, 0, 0))
     for data in (
         counts.reshape(96, 128),
         counts.reshape(96, 128)[::-1],
@@ -74,7 +75,7 @@ def test_after_warming_up_no_frame_waits_for_the_compiler() -> None:
         brighter[40:44, 60:64] += 900
         brighter.setflags(write=False)
         for shown in (data, brighter):
-            for one in (rich, plain):
+            for one in (rich, plain, bent):
                 perception.detect(RawFrame(rich.camera, 0, 0.0, 1e-3, shown, 64.0), one)
     assert sum(len(function.signatures) for function in _functions()) == known
 

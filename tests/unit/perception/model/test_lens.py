@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from perception.model.bearing import direction_camera
 from perception.model.fisher import flare_limit
 from perception.model.flare import PixelBox, flare_image, has_image, image_radius_px
-from perception.model.lens import distortion_of, project
+from perception.model.lens import distortion_of, project, stretch
 from perception.types import Calibration
 from tests.unit.perception.simulation import calibration
 
@@ -84,6 +84,21 @@ def test_a_sphere_is_imaged_as_cap_of_directions(name: str) -> None:
         assert (share * at[axis]).sum() == pytest.approx(mean, abs=1e-3)
         spread = weight @ (spots[:, axis] - mean) ** 2 + smoothing
         assert (share * (at[axis] - mean) ** 2).sum() == pytest.approx(spread, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_how_far_the_image_moves_is_that_of_small_turns(name: str) -> None:
+    """To 1e-6: the greatest of 720 turns of 1e-5 rad, at many directions and on the axis; nothing where there is none."""
+    camera = CAMERAS[name]
+    direction = np.concatenate([direction_camera(_grid(camera)[::97], camera), [[0.0, 0.0, 1.0]]])
+    across = np.cross(direction, [0.6, 0.0, 0.8])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    turn = np.linspace(0.0, np.pi, 720)[:, None, None]
+    aside = 1e-5 * (np.cos(turn) * across + np.sin(turn) * np.cross(direction, across))
+    moved_px = [project((direction + sign * aside).reshape(-1, 3), camera) for sign in (1.0, -1.0)]
+    by_px = np.hypot(*(moved_px[0] - moved_px[1]).T).reshape(720, -1).max(axis=0)
+    np.testing.assert_allclose(stretch(direction, camera), by_px / 2e-5, rtol=1e-5)
+    assert np.isnan(stretch(np.full((1, 3), np.nan), camera)).all()
 
 
 def test_beyond_the_image_circle_there_is_no_direction() -> None:
