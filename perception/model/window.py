@@ -20,6 +20,7 @@ from perception.model.bearing import direction_camera
 from perception.model.discs.rows import disc_rows
 from perception.model.flare import is_before
 from perception.model.layout import Known, Sources
+from perception.model.lens import stretch
 from perception.model.ranging import (
     LEAST_LEFT,
     angular_radius_rad,
@@ -156,6 +157,7 @@ def lay_out(
     hidden_e: Array | None = None,
     moved_px: Array | None = None,
     finer: Array | None = None,
+    most_radius_px: Array | None = None,
 ) -> tuple[Sources, NDArray[np.bool_]]:
     """Lay sources out, all of them at once, in strips where their images are known in these.
 
@@ -172,16 +174,21 @@ def lay_out(
         How far each moves at most during the exposure, shape (sources,). By default nothing does.
     finer
         As for `disc_rows`.
+    most_radius_px
+        The radius of the largest image that is wanted, shape (sources,). By default any is.
 
     Returns
     -------
-    The sources, and which of them have an image; the others are laid out as points on the axis.
+    The sources, and which of them have an image that is wanted; the others are laid out as points on the
+    axis.
     """
     calibration = camera.calibration
     direction = direction_camera(np.column_stack([u_px, v_px]), calibration)
     log_flux = log_flux_at_1_m(camera, direction, hidden_e)
     radius_rad = angular_radius_rad(np.exp(log_range), camera.radius_m)
     imaged = is_before(direction, radius_rad)
+    if most_radius_px is not None:
+        imaged &= ~(np.tan(radius_rad) * stretch(direction, calibration) > most_radius_px)
     if not imaged.all():
         u_px, v_px = np.where(imaged, u_px, calibration.cx_px), np.where(imaged, v_px, calibration.cy_px)
         direction = np.where(imaged[:, None], direction, (0.0, 0.0, 1.0))

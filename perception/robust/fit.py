@@ -73,7 +73,7 @@ class Fit:
         growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
         self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
         # Of larger ones no limb is seen: they are even ground, and may be as near as they like.
-        shows_limb = float(self.image_radius_px.max()) < math.hypot(*self.window.image_e.shape)
+        shows_limb = float(self.image_radius_px.max()) < self.window.diagonal_px
         self.converged = math.isfinite(self.deviance) and shows_limb
 
 

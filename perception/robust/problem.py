@@ -76,6 +76,11 @@ class Window:
         return even(self.image_e.size) if whole is None else whole
 
     @property
+    def diagonal_px(self) -> float:
+        """How far apart its corners are; images of larger radii show no limb in it."""
+        return math.hypot(*self.image_e.shape)
+
+    @property
     def usable(self) -> NDArray[np.bool_]:
         """Which pixels count, clipped ones too."""
         return np.not_equal(self.state, UNUSABLE)

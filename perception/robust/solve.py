@@ -311,7 +311,8 @@ def _laid_out(
     hidden_px = camera.hidden_px_at_1_m(own[:, :2])
     hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
     by_size = log_range_by_size(own, fits[0])
-    return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px), hidden_px
+    most_px = np.concatenate([np.full(fit.layout.sources, fit.window.diagonal_px) for fit in fits])
+    return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px, None, most_px), hidden_px
 
 
 def _motion_px(own: Array, fit: Fit) -> Array | None:

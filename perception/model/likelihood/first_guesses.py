@@ -1,4 +1,4 @@
-"""How likely first guesses of flares are: of all windows in one call, their images as laid out, nothing fitted."""
+"""How likely first guesses of flares are, by images as laid out: of all windows in one call."""
 
 import math
 from collections.abc import Sequence

@@ -1,12 +1,18 @@
 """First guesses of clipped flares: those followed lead to where the best of all leads."""
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 
 from perception import Detection, detect
+from perception.model.flare import PixelBox
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE
+from perception.model.window import Camera
 from perception.robust import explain
-from perception.robust.problem import Problem
+from perception.robust.problem import Problem, Window
+from perception.robust.solve import solve, start_costs
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 CAMERA = calibration(width_px=320, height_px=256, cx_px=159.5, cy_px=127.5, sigma={})
@@ -47,3 +53,40 @@ def test_the_likeliest_guesses_lead_where_all_lead(key: int, monkeypatch: pytest
         assert one.v_px == pytest.approx(other.v_px, abs=0.1 * other.v_sigma_px, nan_ok=True)
         assert one.range_m == pytest.approx(other.range_m, abs=0.1 * other.range_sigma_m, nan_ok=True)
         assert one.range_sigma_m == pytest.approx(other.range_sigma_m, rel=1e-3, nan_ok=True)
+
+
+def test_first_guesses_are_as_likely_as_their_images_say() -> None:
+    """Two windows, of one flare and of two, one pixel clipped and one unusable: by hand, images by brute force."""
+    known, problems = Camera(CAMERA, 1e-4, 1.0), []
+    clip_e, floor_e2 = 900.0, 100.0
+    for key, places in enumerate([[(90.3, 70.2, 2.0)], [(100.1, 120.7, 1.5), (108.6, 117.2, 3.0)]]):
+        box = PixelBox(round(places[0][1]) - 20, round(places[0][0]) - 20, 41, 41)
+        whole_e = expected_e(CAMERA, places, 1e-4, 9.0)[box.slices]
+        image_e = np.minimum(random(92, key).poisson(whole_e) + 0.0, clip_e)
+        state = np.where(image_e < clip_e, SEEN, CLIPPED).astype(np.uint8)
+        state[3, 4] = UNUSABLE
+        starts = [(u + 0.2, v, math.log(1.1 * range_m)) for u, v, range_m in places]
+        window = Window(box, image_e, state, floor_e2, clip_e, 0.0)
+        beyond = [(u + 50.0, v, log_range) for u, v, log_range in starts]
+        problems.append([Problem(window, starts, 9.0), Problem(window, beyond, 9.0)])
+    told = start_costs(problems, known)
+    for (problem, _), costs in zip(problems, told, strict=True):
+        window = problem.window
+        places = [(u, v, math.exp(log_range)) for u, v, log_range in problem.starts]
+        mean_e = expected_e(CAMERA, places, 1e-4, 9.0)[window.box.slices]
+        variance = mean_e + floor_e2
+        seen, clipped = window.state == SEEN, window.state == CLIPPED
+        cost = float(((window.image_e - mean_e) ** 2 / variance + np.log(variance))[seen].sum())
+        sigmas = (clip_e - mean_e[clipped]) / np.sqrt(variance[clipped])
+        cost -= 2.0 * sum(math.log(0.5 * math.erfc(z * math.sqrt(0.5))) for z in sigmas.tolist())
+        assert clipped.sum() > 5
+        assert costs[0] == pytest.approx(cost, rel=2e-4)
+        assert costs[1] == math.inf
+
+
+def test_what_is_larger_than_its_window_is_no_guess() -> None:
+    """A ball of 1 cm at 7 mm, or at 12, of which a million points would be laid out: neither is climbed from."""
+    box = PixelBox(50, 60, 21, 21)
+    window = Window(box, np.full((21, 21), 9.0), np.full((21, 21), SEEN, dtype=np.uint8), 100.0, 900.0, 0.0)
+    problems = [Problem(window, [(70.0, 60.0, math.log(range_m))], 9.0) for range_m in (0.007, 0.012)]
+    assert solve(problems, Camera(CAMERA, 1e-4, 1.0)) == [None, None]
