@@ -86,12 +86,14 @@ def share_asked(solution: Solution) -> float:
 def is_long_clutter(solution: Solution, index: int, camera: Camera) -> bool:
     """Tell whether a flare on texture or edges moves as no robot does: leaves, seams and slits are long, too.
 
-    On an even ground something else that is long is as rare as a robot that is so quick.
+    On an even ground something else that is long is as rare as a robot that is so quick. A disc that seems to
+    move by less than its radius is not long: it may be not quite as round, or as even, as it should.
     """
     if solution.motion_px is None or not (solution.window.on_edges or solution.window.structure_e > 0.0):
         return False
     length_px, log_range = np.hypot(*solution.motion_px.T), solution.log_range
-    return not is_usual_motion(length_px, log_range, camera)[index]
+    is_long = length_px[index] > solution.radius_at_rest_px[index]
+    return bool(is_long) and not is_usual_motion(length_px, log_range, camera)[index]
 
 
 def _seen(
