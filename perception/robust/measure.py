@@ -29,6 +29,8 @@ from perception.robust.verdict import (
 MOST_LEFT_ON_EDGES = 0.1
 
 _IN_VIEW_PX = 1000  # farther than any window reaches
+# Flares for each blob: so many fill any patch, and where one of them is the patch's border others are, too.
+_MOST_BESIDE_BORDERS = 4
 
 
 def measure(
@@ -152,11 +154,12 @@ def _judged(
     if solution.count != len(blobs) or solution.window.features is not None:
         wanted = range(solution.count)
         blobs = divide([member.blob for member in cluster.members], solution.u_px, solution.v_px)
+    of_border = {k: is_border(solution, k, prepared.shape) for k in wanted}
+    if solution.count > _MOST_BESIDE_BORDERS * len(cluster.members) and any(of_border.values()):
+        return []
     return [
         (blob, measured_flare(solution, k, blob, misfit, prepared))
         for k in wanted
         # What nothing lit belongs to only helps to explain what lies around.
-        if (blob := blobs[k]) is not None
-        and not is_border(solution, k, prepared.shape)
-        and not is_long_clutter(solution, k, camera)
+        if (blob := blobs[k]) is not None and not of_border[k] and not is_long_clutter(solution, k, camera)
     ]

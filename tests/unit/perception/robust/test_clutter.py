@@ -39,6 +39,11 @@ def test_the_edge_of_a_lit_patch_is_no_chain_of_flares() -> None:
     assert sum(patches(frames=1, first=frame)["false_alarms"] for frame in told) == 0
 
 
+def test_the_end_of_a_stripe_at_the_frame_s_border_is_no_flare() -> None:
+    """Eight flares explain it on uneven ground, three of which are its borders; two others were told."""
+    assert ROWS["empty, blinds"](frames=1, first=222)["false_alarms"] == 0
+
+
 @pytest.mark.parametrize("frame", [pytest.param(8, marks=pytest.mark.verify), 43])
 def test_a_clipped_lamp_is_no_source(frame: int) -> None:
     """An oval of 44 px bounds no flux (σ of 1e13 times it); beside clipped columns one may move along them at will."""
