@@ -23,7 +23,7 @@ from perception.robust.hiding.climb import good_ones
 from perception.robust.hiding.covered import shows_its_size
 from perception.robust.hiding.outlines import discs_by_outline
 from perception.robust.hiding.spheres import Spheres
-from perception.robust.motion import AT_REST, asked_motions, moves, share_asked
+from perception.robust.motion import AT_REST, asked_motions, moves, moving, share_asked
 from perception.robust.overlap.deblend import LEAST_GAIN, RESIDUAL_SIGMAS, asks_for_more, with_one_more
 from perception.robust.overlap.oval import fit_oval
 from perception.robust.overlap.pairs import (
@@ -138,6 +138,7 @@ def pile_of(
     if not reach_px or len(starts) + most_more < 2:
         return None
     shown, likeliest, late = len(starts), None, []
+    moves_alone: bool | None = None
     for more in range(1 + most_more):
         pile = lone
         if len(starts) > 1 or lone is None:
@@ -150,7 +151,9 @@ def pile_of(
             likeliest = likelier(likeliest, pile if is_good and climb.to_gain < _NEARLY else None)
             # Of what clips, more that move than its outline shows fill any patch.
             if more == 0 or not cluster.is_clipped:
-                if is_good or share_asked(pile) >= _LEAST_ASKED:
+                if not is_good and moves_alone is None:
+                    moves_alone = _moves_alone(lone, camera)
+                if is_good or (share_asked(pile) >= _LEAST_ASKED and not moves_alone):
                     likeliest = likelier(likeliest, _moved(pile, camera))
                 else:
                     late.append(pile)
@@ -160,10 +163,16 @@ def pile_of(
         if more == most_more or not min(asking) > RESIDUAL_SIGMAS:
             break
         starts = with_one_more(pile)[0]
-    for pile in late:
+    for pile in late if not moves_alone else []:
         if likeliest is None or (likeliest.motion_px is None and likeliest.count > pile.count):
             likeliest = likelier(likeliest, _moved(pile, camera, likeliest))
     return None if likeliest is None else _believed(replace(likeliest, by_outline=shown), camera)
+
+
+def _moves_alone(lone: Solution | None, camera: Camera) -> bool:
+    """Tell whether one flare that moves explains a window: then it takes no several that do."""
+    line = moving([lone], camera).get(0)
+    return line is not None and line.motion_px is not None and line.left_over.is_good
 
 
 def _moved(pile: Solution, camera: Camera, rival: Solution | None = None) -> Solution | None:
