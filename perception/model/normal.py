@@ -36,6 +36,9 @@ def _table() -> NDArray[np.float64]:
 
 
 NORMAL = _table()
+# At the reach: the shares below either end, and the density.
+_NONE, _ALL = float(NORMAL[2, 0]), float(NORMAL[-1, 0])
+_LAST = float(NORMAL[2, 4])
 
 
 @compiled
@@ -68,6 +71,20 @@ def shares(at_px: float, count: int, sigma_px: float, into: Array) -> tuple[int,
 
 
 @compiled
+def _below(away_px: float, sigma_px: float) -> tuple[float, float]:
+    """Return the share of a Gaussian below a place, and σ² times its density there."""
+    if away_px >= REACH_SIGMAS * sigma_px:
+        return _ALL, sigma_px * _LAST
+    if away_px <= -REACH_SIGMAS * sigma_px:
+        return _NONE, sigma_px * _LAST
+    place = (away_px / sigma_px + (REACH_SIGMAS + 2.0 * STEP)) / STEP
+    step = int(place)
+    cubic, t = NORMAL[step], place - step
+    below = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
+    return below, sigma_px * (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7])))
+
+
+@compiled
 def strip_shares(
     at_px: float, half_px: float, shading: tuple[float, float], off_px: float, count: int, sigma_px: float,
     into: Array,
@@ -89,16 +106,8 @@ def strip_shares(
     for edge in range(first, end + 1):
         # From the strip's middle; u runs along it from -h to h.
         x = edge - 0.5 - at_px
-        place = (min(max((x + h) / s, -REACH_SIGMAS), REACH_SIGMAS) + (REACH_SIGMAS + 2.0 * STEP)) / STEP
-        step = int(place)
-        cubic, t = NORMAL[step], place - step
-        below_a = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
-        slope_a = s * (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7])))
-        place = (min(max((x - h) / s, -REACH_SIGMAS), REACH_SIGMAS) + (REACH_SIGMAS + 2.0 * STEP)) / STEP
-        step = int(place)
-        cubic, t = NORMAL[step], place - step
-        below_b = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
-        slope_b = s * (cubic[4] + t * (cubic[5] + t * (cubic[6] + t * cubic[7])))
+        below_a, slope_a = _below(x + h, s)
+        below_b, slope_b = _below(x - h, s)
         # ∫ N(x - u) du and ∫ u N du, by parts; ∫ Φ du; σ² times the slope of the first.
         zeroth = below_a - below_b
         first_moment = x * zeroth + slope_a - slope_b

@@ -15,7 +15,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=tests.hard_frames.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"any of: {', '.join(ROWS)}")
+    parser.add_argument(
+        "rows", nargs="*", metavar="ROW", help=f"any of: {', '.join(ROWS).replace('%', '%%')}"
+    )
     parser.add_argument("--estimator", default="robust")
     parser.add_argument("--frames", type=int, help="frames of each row, in place of its own number")
     given = parser.parse_args()
