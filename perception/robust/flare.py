@@ -69,15 +69,17 @@ def measured_flare(
     widening = math.sqrt(max(left.chi2 / max(left.pixels, 1), 1.0)) if misfit else 1.0
     u_px, v_px = float(solution.u_px[index]), float(solution.v_px[index])
     flux_e = float(solution.flux_e[index])
-    flux_sigma_e = float(solution.flux_sigma_e[index]) * widening
+    # Of range and flux also what is wrong with the model; it says nothing of whether a flare stands out.
+    of_range = max(widening, left.widens_range)
+    flux_sigma_e = float(solution.flux_sigma_e[index]) * of_range
     hidden = hidden_log_range(solution, index)
     doubt = math.hypot(hidden / math.sqrt(3.0), solution.log_range_of_two)
-    of_one = math.hypot(float(solution.log_range_sigma[index]) * widening, hidden / math.sqrt(3.0))
+    of_one = math.hypot(float(solution.log_range_sigma[index]) * of_range, hidden / math.sqrt(3.0))
     of_background = float(solution.log_range_hidden[index])
     # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.
     range_m = math.nan
     if solution.ranged[index]:
-        relative = min(flux_sigma_e / flux_e, 1.0)
+        relative = min(float(solution.flux_sigma_e[index]) * widening / flux_e, 1.0)
         range_m = math.exp(float(solution.log_range[index])) / (1.0 + 0.375 * relative**2)
     saturated = bool((blob.pixels & prepared.clipped_in(blob.box)).any())
     told_sigma = of_one  # that it may be two does not make a clipped one a bound
