@@ -36,7 +36,7 @@ def test_what_a_wrong_size_leaves_over_widens_the_sigma_of_a_range(size: float) 
     for u, v, range_m in PLACES:
         (near,) = (one for one in told if math.hypot(one.u_px - u, one.v_px - v) < 2.0)
         assert abs(near.range_m - range_m) > 0.02 * range_m
-        assert abs(near.range_m - range_m) < 4.0 * near.range_sigma_m < 0.2 * range_m
+        assert abs(near.range_m - range_m) < 7.0 * near.range_sigma_m < 0.2 * range_m
         assert abs(near.u_px - u) < 4.5 * near.u_sigma_px
         assert abs(near.v_px - v) < 4.5 * near.v_sigma_px
 
