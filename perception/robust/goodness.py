@@ -80,7 +80,7 @@ class LeftOver:
 
     @property
     def widens_range(self) -> float:
-        """By how much a range's σ is to be wider than noise alone has it; 1 where what is left over may be noise.
+        """How many times as wide as by noise a range's σ is to be; 1 where what is left over may be noise.
 
         What is wrong with the model (a lens, a size, how a source shines) hides along the range about as much
         as it shows across it: of discs whose limb is darker by a third, whose size, flux or lens are off by 1
