@@ -175,7 +175,8 @@ def lay_out(
     finer
         As for `disc_rows`.
     most_radius_px
-        The radius of the largest image that is wanted, shape (sources,). By default any is.
+        The radius of the largest image that is wanted, shape (sources,), as the lens stretches it most in its
+        middle. By default any is.
 
     Returns
     -------

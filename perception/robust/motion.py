@@ -23,6 +23,7 @@ SEEMS_CHI2 = 6.0
 LEAST_PX = 0.2
 """A flare that seems to move less is taken to rest: it changes its flux by less than a thousandth."""
 
+_LONG = 0.2  # radii by which a disc moves: it is a tenth longer than wide
 
 MOST_TOGETHER = 4
 """More flares in one window are not tried as moving ones."""
@@ -87,12 +88,12 @@ def is_long_clutter(solution: Solution, index: int, camera: Camera) -> bool:
     """Tell whether a flare on texture or edges moves as no robot does: leaves, seams and slits are long, too.
 
     On an even ground something else that is long is as rare as a robot that is so quick. A disc that seems to
-    move by less than its radius is not long: it may be not quite as round, or as even, as it should.
+    move by less than a fifth of its radius is not long: a lens that is slightly off makes it so.
     """
     if solution.motion_px is None or not (solution.window.on_edges or solution.window.structure_e > 0.0):
         return False
     length_px, log_range = np.hypot(*solution.motion_px.T), solution.log_range
-    is_long = length_px[index] > solution.radius_at_rest_px[index]
+    is_long = length_px[index] > _LONG * solution.radius_at_rest_px[index]
     return bool(is_long) and not is_usual_motion(length_px, log_range, camera)[index]
 
 

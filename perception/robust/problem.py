@@ -77,7 +77,7 @@ class Window:
 
     @property
     def diagonal_px(self) -> float:
-        """How far apart its corners are; images of larger radii show no limb in it."""
+        """How far apart its corners are: of a disc in it whose radius is larger no limb is seen."""
         return math.hypot(*self.image_e.shape)
 
     @property

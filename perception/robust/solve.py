@@ -222,7 +222,8 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
 def start_costs(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[list[float]]:
     """Return −2 ln L of each window's first guesses, all at rest, but for a constant of the window.
 
-    By coarse images: they tell apart guesses whose fluxes differ several times.
+    By coarse images: they tell apart guesses whose fluxes differ several times. The windows are of one frame,
+    in which all pixels clip at the same number of electrons.
     """
     if not problems:
         return []

@@ -121,8 +121,9 @@ def _cones(limb: Array) -> Array:
     """Return cones through the ends and middles of pieces of an outline, shape (cones, 3)."""
     count = len(limb)
     begin = np.unique(np.linspace(0, count, _BEGINNINGS, endpoint=False).astype(np.int64))
-    three = np.concatenate(
-        [limb[(begin[:, None] + (0, (arc + 1) // 2, arc)) % count] for arc in _ARCS_PX if arc < count]
+    arcs = [(0, (arc + 1) // 2, arc) for arc in _ARCS_PX if arc < count]
+    three = limb[(begin[:, None] + np.array(arcs, dtype=np.int64).reshape(-1, 1, 3)) % count].reshape(
+        -1, 3, 3
     )
     three = three[abs(np.linalg.det(three)) > _LEAST_VOLUME]
     if len(three) == 0:

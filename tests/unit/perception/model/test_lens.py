@@ -88,7 +88,7 @@ def test_a_sphere_is_imaged_as_cap_of_directions(name: str) -> None:
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_how_far_the_image_moves_is_that_of_small_turns(name: str) -> None:
-    """To 1e-6: the greatest of 720 turns of 1e-5 rad, at many directions and on the axis; nothing where there is none."""
+    """To 1e-5: the greatest of 720 turns of 1e-5 rad, at many directions and on the axis; nothing where there is none."""
     camera = CAMERAS[name]
     direction = np.concatenate([direction_camera(_grid(camera)[::97], camera), [[0.0, 0.0, 1.0]]])
     across = np.cross(direction, [0.6, 0.0, 0.8])

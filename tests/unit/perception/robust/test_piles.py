@@ -12,7 +12,7 @@ from perception import Detection, detect
 from perception.model.window import Camera
 from perception.robust import explain
 from perception.robust.clusters import Cluster
-from perception.robust.hiding.outlines import discs_by_outline
+from perception.robust.hiding.outlines import _cones, discs_by_outline
 from tests.unit.perception.robust.test_eclipse import (
     BACKGROUND_E,
     CAMERA,
@@ -190,3 +190,15 @@ def test_an_oval_lamp_is_no_pile(axes: float) -> None:
     exposure_s = 0.6 * 4000.0 / 0.74 / float(mean_e_per_s.max())
     frame = expose(mean_e_per_s * exposure_s + BACKGROUND_E, CAMERA, random(93), exposure_s)
     assert len(detect(frame, replace(CAMERA, sigma={}))) <= 1
+
+
+@pytest.mark.parametrize("places", [5, 6])
+def test_of_a_short_outline_there_are_cones_or_none(places: int) -> None:
+    """Of five places, as few as are looked at, no arc is long enough: a frame with such an outline was an error."""
+    turn = np.arange(places) * 0.3
+    limb = np.column_stack([0.02 * np.cos(turn), 0.02 * np.sin(turn), np.ones(places)])
+    limb /= np.linalg.norm(limb, axis=1, keepdims=True)
+    cones = _cones(limb)
+    assert (len(cones) > 0) == (places > 5)
+    if len(cones):
+        np.testing.assert_allclose(limb @ cones.T, 1.0, atol=1e-9)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +10,10 @@ import pytest
 from perception import Detection, detect
 from perception.model.flare import PixelBox
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE
-from perception.model.window import Camera
+from perception.model.window import Camera, lay_out
 from perception.robust import explain
 from perception.robust.problem import Problem, Window
-from perception.robust.solve import solve, start_costs
+from perception.robust.solve import start_costs
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 CAMERA = calibration(width_px=320, height_px=256, cx_px=159.5, cy_px=127.5, sigma={})
@@ -56,25 +57,32 @@ def test_the_likeliest_guesses_lead_where_all_lead(key: int, monkeypatch: pytest
 
 
 def test_first_guesses_are_as_likely_as_their_images_say() -> None:
-    """Two windows, of one flare and of two, one pixel clipped and one unusable: by hand, images by brute force."""
-    known, problems = Camera(CAMERA, 1e-4, 1.0), []
-    clip_e, floor_e2 = 900.0, 100.0
+    """Two windows, of one flare and of two, unlike in background, noise and light that is known, pixels clipped and
+    unusable, responses 3 % apart: by hand, images by brute force."""
+    known, problems = Camera(replace(CAMERA, prnu=0.03), 1e-4, 1.0), []
+    clip_e = 900.0
     for key, places in enumerate([[(90.3, 70.2, 2.0)], [(100.1, 120.7, 1.5), (108.6, 117.2, 3.0)]]):
+        background_e, floor_e2, known_e = (
+            9.0 + 40.0 * key,
+            100.0 + 80.0 * key,
+            30.0 * key + np.arange(41.0 * 41.0) / 50.0,
+        )
         box = PixelBox(round(places[0][1]) - 20, round(places[0][0]) - 20, 41, 41)
-        whole_e = expected_e(CAMERA, places, 1e-4, 9.0)[box.slices]
+        whole_e = expected_e(CAMERA, places, 1e-4, background_e)[box.slices] + known_e.reshape(41, 41)
         image_e = np.minimum(random(92, key).poisson(whole_e) + 0.0, clip_e)
         state = np.where(image_e < clip_e, SEEN, CLIPPED).astype(np.uint8)
         state[3, 4] = UNUSABLE
         starts = [(u + 0.2, v, math.log(1.1 * range_m)) for u, v, range_m in places]
-        window = Window(box, image_e, state, floor_e2, clip_e, 0.0)
+        window = Window(box, image_e, state, floor_e2, clip_e, 0.03, known_e=known_e.reshape(41, 41))
         beyond = [(u + 50.0, v, log_range) for u, v, log_range in starts]
-        problems.append([Problem(window, starts, 9.0), Problem(window, beyond, 9.0)])
+        problems.append([Problem(window, each, background_e) for each in (starts, beyond)])
     told = start_costs(problems, known)
     for (problem, _), costs in zip(problems, told, strict=True):
         window = problem.window
+        assert window.known_e is not None
         places = [(u, v, math.exp(log_range)) for u, v, log_range in problem.starts]
-        mean_e = expected_e(CAMERA, places, 1e-4, 9.0)[window.box.slices]
-        variance = mean_e + floor_e2
+        mean_e = expected_e(CAMERA, places, 1e-4, problem.background_e)[window.box.slices] + window.known_e
+        variance = mean_e + (0.03 * mean_e) ** 2 + window.floor_e2
         seen, clipped = window.state == SEEN, window.state == CLIPPED
         cost = float(((window.image_e - mean_e) ** 2 / variance + np.log(variance))[seen].sum())
         sigmas = (clip_e - mean_e[clipped]) / np.sqrt(variance[clipped])
@@ -84,9 +92,13 @@ def test_first_guesses_are_as_likely_as_their_images_say() -> None:
         assert costs[1] == math.inf
 
 
-def test_what_is_larger_than_its_window_is_no_guess() -> None:
-    """A ball of 1 cm at 7 mm, or at 12, of which a million points would be laid out: neither is climbed from."""
-    box = PixelBox(50, 60, 21, 21)
-    window = Window(box, np.full((21, 21), 9.0), np.full((21, 21), SEEN, dtype=np.uint8), 100.0, 900.0, 0.0)
-    problems = [Problem(window, [(70.0, 60.0, math.log(range_m))], 9.0) for range_m in (0.007, 0.012)]
-    assert solve(problems, Camera(CAMERA, 1e-4, 1.0)) == [None, None]
+def test_what_is_larger_than_its_window_is_not_laid_out() -> None:
+    """A ball of 1 cm at 12 mm, of a million points, and at 10 cm, of which hardly any is seen; at 1 m it is."""
+    u_px, v_px, log_range = np.full(3, 70.0), np.full(3, 60.0), np.log([0.012, 0.1, 1.0])
+    laid, imaged = lay_out(Camera(CAMERA, 1e-4, 1.0), u_px, v_px, log_range, most_radius_px=np.full(3, 30.0))
+    assert imaged.tolist() == [False, False, True]
+    assert np.diff(laid.first_node)[:2].tolist() == [1, 1]
+    _, imaged = lay_out(
+        Camera(CAMERA, 1e-4, 1.0), u_px[1:], v_px[1:], log_range[1:], most_radius_px=np.full(2, 60.0)
+    )
+    assert imaged.all()
