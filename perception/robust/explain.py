@@ -34,8 +34,8 @@ from perception.robust.overlap.deblend import (
     RESIDUAL_SIGMAS,
     asks_for_more,
     deblend,
-    of_free_width,
 )
+from perception.robust.overlap.free_fits import of_free_width
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.overlap.oval import is_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX

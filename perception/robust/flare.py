@@ -69,15 +69,14 @@ def measured_flare(
     widening = math.sqrt(max(left.chi2 / max(left.pixels, 1), 1.0)) if misfit else 1.0
     u_px, v_px = float(solution.u_px[index]), float(solution.v_px[index])
     flux_e = float(solution.flux_e[index])
-    # What is wrong with the model widens what noise leaves open of range and flux, not what rivals do; and it
-    # says nothing of whether a flare stands out.
-    of_model = (
-        math.sqrt(max(left.widens_range**2 - widening**2, 0.0)) * float(solution.flux_noise_e[index]) / flux_e
+    # What is wrong with the model says nothing of whether a flare stands out.
+    flux_sigma_e = math.hypot(
+        float(solution.flux_sigma_e[index]) * widening, float(solution.log_flux_of_model[index]) * flux_e
     )
-    flux_sigma_e = flux_e * math.hypot(float(solution.flux_sigma_e[index]) * widening / flux_e, of_model)
     hidden = hidden_log_range(solution, index)
     doubt = math.hypot(hidden / math.sqrt(3.0), solution.log_range_of_two)
-    of_fit = math.hypot(float(solution.log_range_sigma[index]) * widening, 0.5 * of_model)
+    of_model = float(solution.log_range_of_model[index])
+    of_fit = math.hypot(float(solution.log_range_sigma[index]) * widening, of_model)
     of_one = math.hypot(of_fit, hidden / math.sqrt(3.0))
     of_background = float(solution.log_range_hidden[index])
     # The flux is unbiased, so noise alone makes d too large on average, as in `range_from_flux`.

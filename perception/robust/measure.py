@@ -11,7 +11,8 @@ from perception.robust.explain import best
 from perception.robust.flare import MeasuredFlare, measured_flare
 from perception.robust.large.discs import measure_large
 from perception.robust.motion import is_long_clutter
-from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_size
+from perception.robust.overlap.deblend import RESIDUAL_SIGMAS
+from perception.robust.overlap.free_fits import of_free_size, with_model_error
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
@@ -157,8 +158,9 @@ def _judged(
     of_border = {k: is_border(solution, k, prepared.shape) for k in wanted}
     if solution.count > _MOST_BESIDE_BORDERS * len(cluster.members) and any(of_border.values()):
         return []
+    told = with_model_error(solution, camera)
     return [
-        (blob, measured_flare(solution, k, blob, misfit, prepared))
+        (blob, measured_flare(told, k, blob, misfit, prepared))
         for k in wanted
         # What nothing lit belongs to only helps to explain what lies around.
         if (blob := blobs[k]) is not None and not of_border[k] and not is_long_clutter(solution, k, camera)

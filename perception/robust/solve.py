@@ -51,6 +51,8 @@ class Solution:
     log_range, log_range_sigma, log_range_common
         Range by flux and size together, its standard deviation, and the part of that which every measurement
         of the source shares (`Camera.log_range`), same shape.
+    log_range_of_model, log_flux_of_model
+        How far ranges and fluxes may be off because the calibration is (`overlap.free_fits`), same shape.
     log_range_hidden
         Part of these that comes of the background hidden behind each, same shape.
     ranged, image_radius_px
@@ -93,6 +95,8 @@ class Solution:
     log_range: Array
     log_range_sigma: Array
     log_range_common: Array
+    log_range_of_model: Array
+    log_flux_of_model: Array
     log_range_hidden: Array
     ranged: NDArray[np.bool_]
     image_radius_px: Array
@@ -373,6 +377,8 @@ def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
                 log_range=log_range[these],
                 log_range_sigma=log_range_sigma[these],
                 log_range_common=log_range_common[these],
+                log_range_of_model=np.zeros(fit.layout.sources),
+                log_flux_of_model=np.zeros(fit.layout.sources),
                 log_range_hidden=hidden[these],
                 ranged=ranged[these],
                 image_radius_px=radius_px,

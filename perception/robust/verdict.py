@@ -9,7 +9,7 @@ from perception.compiled import compiled
 from perception.model.layout import CLIPPED, UNUSABLE
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR, noise_e2
-from perception.robust.overlap.deblend import of_free_width
+from perception.robust.overlap.free_fits import of_free_width
 from perception.robust.overlap.oval import Oval, fit_oval
 from perception.robust.solve import Solution
 

@@ -27,7 +27,8 @@ from perception.robust.around.turns import (
     sharp_px,
 )
 from perception.robust.goodness import MODEL_ERROR
-from perception.robust.overlap.deblend import LEAST_GAIN, gain, of_free_width
+from perception.robust.overlap.deblend import LEAST_GAIN, gain
+from perception.robust.overlap.free_fits import of_free_width
 from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem, Window
 from perception.robust.solve import Solution, solve

@@ -19,7 +19,8 @@ from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.hiding.eclipse import pile_of
 from perception.robust.large.aperture import mask_in, measure_by_aperture
 from perception.robust.large.outline import Outline, outline_of
-from perception.robust.overlap.deblend import RESIDUAL_SIGMAS, of_free_width
+from perception.robust.overlap.deblend import RESIDUAL_SIGMAS
+from perception.robust.overlap.free_fits import of_free_width, with_model_error
 from perception.robust.problem import Problem, Start, Window
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
@@ -70,7 +71,7 @@ def measure_large(
     rows = zip(found, outlines, discs, _whole_discs(problems, camera), strict=True)
     for cluster, of_it, wanted, solution in rows:
         if solution is not None and _is_whole_discs(solution, cluster):
-            measured += _by_disc(cluster, solution, wanted, prepared)
+            measured += _by_disc(cluster, solution, wanted, prepared, camera)
             continue
         small = [] if apart else [k for k in cluster.wanted if not cluster.members[k].is_beyond_fit]
         again += [cluster.members[k] for k in small]
@@ -232,7 +233,7 @@ def _is_whole_discs(solution: Solution, cluster: Cluster) -> bool:
 
 
 def _by_disc(
-    cluster: Cluster, solution: Solution, wanted: Sequence[int], prepared: PreparedFrame
+    cluster: Cluster, solution: Solution, wanted: Sequence[int], prepared: PreparedFrame, camera: Camera
 ) -> list[tuple[Blob, MeasuredFlare]]:
     """Turn a fit of whole large discs into measurements.
 
@@ -241,9 +242,10 @@ def _by_disc(
     """
     misfit = _is_misfit(solution)
     measured = []
+    told = with_model_error(solution, camera)
     for k in wanted:
         blob = cluster.members[k].blob
-        one = measured_flare(solution, k, blob, misfit, prepared)
+        one = measured_flare(told, k, blob, misfit, prepared)
         if misfit:
             share = 2.0 * _odd_share(solution)
             away_px = share * float(solution.image_radius_px[k])

@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR
-from perception.robust.overlap.rivals import to_beat
+from perception.robust.overlap.free_fits import of_free_size, of_free_width
 from perception.robust.problem import Problem, Start
 from perception.robust.solve import Solution, solve
 
@@ -29,7 +29,6 @@ LEAST_GAIN = 40.0
 RESIDUAL_SIGMAS = 5.5
 """Where the residual, matched to a point's image, exceeds this, another flare is tried."""
 
-_WIDTH_FREE = 0.3
 _LEAST_RADIUS_PX = 1.0
 
 
@@ -129,34 +128,6 @@ def asks_for_more(solution: Solution) -> bool:
     if left.seen_chi2 > left.seen_pixels + LEAST_GAIN - 4.0 * math.sqrt(2.0 * left.seen_pixels):
         return True
     return left.peak_sigmas > RESIDUAL_SIGMAS
-
-
-def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
-    """Fit flares through a point spread that may be wider or narrower than the calibration says.
-
-    However unlikely: by that it is decided about others.
-    """
-    if not solutions:
-        return []
-    return solve(
-        [to_beat(one, math.inf).again() for one in solutions],
-        _with_spread(camera, "psf_sigma_px", _WIDTH_FREE),
-    )
-
-
-def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
-    """Fit lone flares whose size may be any, whatever their flux says; however unlikely."""
-    if not solutions:
-        return []
-    free = _with_spread(camera, "range_constant_dn_m2_per_s", 8.0)
-    return solve([to_beat(solution, math.inf).again() for solution in solutions], free)
-
-
-def _with_spread(camera: Camera, name: str, spread: float) -> Camera:
-    """Return a camera one of whose constants is known to a relative spread only."""
-    calibration = camera.calibration
-    sigma = {**calibration.sigma, name: spread * getattr(calibration, name)}
-    return replace(camera, calibration=replace(calibration, sigma=sigma))
 
 
 def gain(one: Solution, other: Solution) -> float:
