@@ -13,9 +13,11 @@ from perception.model.discs.nodes import smoothing_px
 from perception.model.fog import loosened, may_be_in_fog, range_in_fog_m, ranged_in_fog, size_alone
 from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
+from perception.model.window import Camera
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.flare import MeasuredFlare
 from perception.robust.measure import measure
+from perception.robust.overlap.free_fits import log_range_of_calibration
 from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.hills import prominent, summit
@@ -37,6 +39,7 @@ _FEWEST_RING_PIXELS = 8
 _LEAST_DISC_PX2 = 30
 _MOSTLY_SEEN = 0.7  # of the brightness of sources
 _LEAST_OF_PART = 0.25
+_TELLS_SIZE_PX, _MOST_TESTED = 3.0, 8
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
 
@@ -100,7 +103,9 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     reported = [(blob, found) for blob, found in measured if found.stands_out]
     if not reported:
         return Detections(reason=reason_of_none(prepared, len(blobs), late=late), truncated=truncated)
-    if in_fog:
+    if not in_fog:
+        reported = _with_calibration_error(reported, prepared)
+    else:
         reported = list(_in_fog(reported, frame, calibration))
     bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
     return Detections(
@@ -125,6 +130,31 @@ def _measured(
             return measured, True
         measured += measure(by_flux[first : first + _AT_ONCE], prepared)
     return measured, False
+
+
+def _with_calibration_error(
+    found: Sequence[tuple[Blob, MeasuredFlare]], prepared: PreparedFrame
+) -> list[tuple[Blob, MeasuredFlare]]:
+    """Widen what is told of ranges and fluxes by what the largest lone discs tell of the calibration."""
+    lone = [one.alone for _, one in found if one.alone is not None]
+    discs = [one for one in lone if float(one.radius_at_rest_px[0]) > _TELLS_SIZE_PX]
+    discs.sort(key=lambda one: -float(one.radius_at_rest_px[0]))
+    camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
+    spread = log_range_of_calibration(discs[:_MOST_TESTED], camera)
+    if spread == 0.0:
+        return list(found)
+    return [
+        (
+            blob,
+            replace(
+                one,
+                flux_sigma_e=math.hypot(one.flux_sigma_e, 2.0 * spread * one.flux_e),
+                range_sigma_m=math.hypot(one.range_sigma_m, spread * one.range_m),
+                range_sigma_common_m=math.hypot(one.range_sigma_common_m, spread * one.range_m),
+            ),
+        )
+        for blob, one in found
+    ]
 
 
 def _in_fog(

@@ -21,7 +21,7 @@ class MeasuredFlare:
     `flux_noise_e` is the part of the σ of its flux that its light brings, not that it may be another's.
     `log_range_doubt` is the part of the relative σ of its range that comes of what sources hide, of each
     other and of the background, and of its being two perhaps; `log_range_doubt_common` that of the background
-    alone.
+    alone. `alone` is its fit, where nothing else is seen beside it and nothing clips.
     """
 
     u_px: float
@@ -45,6 +45,7 @@ class MeasuredFlare:
     may_be_more: bool = False
     on_texture: bool = False
     on_edges: bool = False
+    alone: Solution | None = None
 
     @property
     def stands_out(self) -> bool:
@@ -90,6 +91,7 @@ def measured_flare(
         # The range that this fit states is loosely tied to the flux, which tells it in fog.
         told_sigma = math.hypot(0.5 * flux_sigma_e / flux_e, hidden / math.sqrt(3.0))
     on_edge = solution.window.features is not None
+    is_alone = solution.count == 1 and not (saturated or on_edge or solution.window.structure_e > 0.0)
     bound_only = saturated and not told_sigma < CLIPPED_RANGE_SIGMA
     return MeasuredFlare(
         u_px=u_px,
@@ -111,4 +113,5 @@ def measured_flare(
         may_be_more=solution.may_be_more,
         on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges or on_edge or left.peak_sigmas > RESIDUAL_SIGMAS,
+        alone=solution if is_alone else None,
     )

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.window import Camera
+from perception.robust.goodness import is_likely
 from perception.robust.overlap.rivals import to_beat
 from perception.robust.solve import Solution, solve
 
 _WIDTH_FREE = 0.3
 _FLUX_FREE = 8.0
+_MORE_FREE = 2  # size by itself, and width
 
 
 def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -32,10 +34,8 @@ def with_model_error(solution: Solution, camera: Camera) -> Solution:
     """Tell of flares how far their range and flux may be off where the calibration leaves something over.
 
     What no noise explains may be the source's flux, its size (a wrong lens or focal length and a limb that is
-    darker look like one), or the point spread. A lone flare is fitted with all three free: its range may
-    be that by flux alone or that by size alone, as far as these are farther from what is told than by their
-    own σ. What is still left over, or all of it where others are fitted, counts as `LeftOver.widens_range`
-    says.
+    darker look like one), or the point spread. A lone flare is fitted with all three free (`_moved`). What is
+    still left over, or all of it where others are fitted, counts as `LeftOver.widens_range` says.
     """
     widens = solution.left_over.widens_range
     if widens == 1.0:
@@ -43,13 +43,10 @@ def with_model_error(solution: Solution, camera: Camera) -> Solution:
     of_noise = 0.5 * solution.flux_noise_e / solution.flux_e
     log_range, log_flux = np.zeros(solution.count), np.zeros(solution.count)
     if solution.count == 1:
-        (free,) = _again([solution], _with_free_width(_with_free_size(camera)))
+        (free,) = _of_any([solution], camera)
         if free is not None and free.left_over.noise_chi2 < solution.left_over.noise_chi2:
             widens = free.left_over.widens_range
-            told, flux_sigma = solution.log_range, free.flux_noise_e / free.flux_e
-            by_flux = _beyond(free.log_photometric_range - told, 0.5 * flux_sigma)
-            log_range = np.maximum(by_flux, _beyond(free.log_range - told, free.log_range_sigma))
-            log_flux = abs(np.log(free.flux_e / solution.flux_e))
+            log_range, log_flux = _moved(solution, free), abs(np.log(free.flux_e / solution.flux_e))
     of_rest = math.sqrt(widens**2 - 1.0) * of_noise
     return replace(
         solution,
@@ -58,9 +55,34 @@ def with_model_error(solution: Solution, camera: Camera) -> Solution:
     )
 
 
-def _beyond(difference: NDArray[np.float64], sigma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how large differences are, but for what their σ explain."""
-    return np.sqrt(np.maximum(difference**2 - sigma**2, 0.0))
+def log_range_of_calibration(lone: Sequence[Solution], camera: Camera) -> float:
+    """Return how far the range of any flare in a frame may be off because the calibration is.
+
+    It is the same for all of them, so that they tell together what none tells alone: each lone flare is
+    fitted with flux, size and point spread free. If the likelihoods gain more by that than noise gives, it
+    is the median of how far the ranges move; else 0.
+    """
+    free = _of_any(lone, camera)
+    pairs = [(one, any_) for one, any_ in zip(lone, free, strict=True) if any_ is not None]
+    gained = sum(max(one.deviance - any_.deviance, 0.0) for one, any_ in pairs)
+    if not pairs or is_likely(_MORE_FREE * len(pairs), gained):
+        return 0.0
+    return float(np.median([_moved(one, any_) for one, any_ in pairs]))
+
+
+def _moved(told: Solution, free: Solution) -> NDArray[np.float64]:
+    """Return how far lone flares' range moves if it is that by flux alone, or by size alone, and not both.
+
+    The larger of the two, each as far as it is farther away than its own σ.
+    """
+    of_flux = 0.5 * free.flux_noise_e / free.flux_e
+    by_flux = (free.log_photometric_range - told.log_range) ** 2 - of_flux**2
+    by_size = (free.log_range - told.log_range) ** 2 - free.log_range_sigma**2
+    return np.sqrt(np.maximum(np.maximum(by_flux, by_size), 0.0))
+
+
+def _of_any(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
+    return _again(solutions, _with_free_width(_with_free_size(camera)))
 
 
 def _again(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
