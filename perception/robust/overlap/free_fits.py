@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.window import Camera
-from perception.robust.goodness import is_likely
+from perception.robust.goodness import MISFIT_PROBABILITY
 from perception.robust.overlap.rivals import to_beat
 from perception.robust.solve import Solution, solve
 
 _WIDTH_FREE = 0.3
 _FLUX_FREE = 8.0
-_MORE_FREE = 2  # size by itself, and width
 
 
 def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -58,16 +57,33 @@ def with_model_error(solution: Solution, camera: Camera) -> Solution:
 def log_range_of_calibration(lone: Sequence[Solution], camera: Camera) -> float:
     """Return how far the range of any flare in a frame may be off because the calibration is.
 
-    It is the same for all of them, so that they tell together what none tells alone: each lone flare is
-    fitted with flux, size and point spread free. If the likelihoods gain more by that than noise gives, it
-    is the median of how far the ranges move; else 0.
+    It is off for all of them, so that they tell together what none tells alone: each lone flare is fitted
+    with flux, size and point spread free. Mirror images are dimmer than sources of their size, so only the
+    half that gains the least speaks. If noise gives it so much once in a million frames, the answer is the
+    lower median of how far all the ranges move; else 0.
     """
     free = _of_any(lone, camera)
     pairs = [(one, any_) for one, any_ in zip(lone, free, strict=True) if any_ is not None]
-    gained = sum(max(one.deviance - any_.deviance, 0.0) for one, any_ in pairs)
-    if not pairs or is_likely(_MORE_FREE * len(pairs), gained):
+    half = (len(pairs) + 1) // 2
+    gains = sorted(max(one.deviance - any_.deviance, 0.0) for one, any_ in pairs)
+    if _chance_of_least(sum(gains[:half]), half, len(pairs)) > MISFIT_PROBABILITY:
         return 0.0
-    return float(np.median([_moved(one, any_) for one, any_ in pairs]))
+    return sorted(float(_moved(one, any_)[0]) for one, any_ in pairs)[half - 1]
+
+
+def _chance_of_least(total: float, least: int, count: int) -> float:
+    """Return how often the least of `count` χ² of two degrees of freedom add up to more; 1 of none.
+
+    Such χ² are exponential, of mean 2, and so are the steps from one to the next larger, of mean
+    2 / (how many are left): the sum is one of exponentials of different means (Rényi, Acta Math. Acad. Sci.
+    Hung. 4, 191, 1953).
+    """
+    if least == 0:
+        return 1.0
+    before = np.arange(least)
+    means = 2.0 * (least - before) / (count - before)
+    apart = np.where(np.eye(least), means[:, None], means[:, None] - means)
+    return float(np.sum(np.prod(means[:, None] / apart, axis=1) * np.exp(-total / means)))
 
 
 def _moved(told: Solution, free: Solution) -> NDArray[np.float64]:
