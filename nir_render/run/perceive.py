@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from statistics import median
 
 from nir_render.errors import InputError
 from nir_render.run import folder as run_folder
@@ -267,12 +268,16 @@ class _Notes:
     reasons: dict[str, Counter[str]] = field(default_factory=dict)  # by camera
     found: Counter[str] = field(default_factory=Counter)  # detections of each camera
     truncated: int = 0
+    doubts: list[float] = field(
+        default_factory=list
+    )  # of ranges, of the frames that contradict a calibration
 
     def take(self, camera: str, found: Detections) -> Detections:
         """Note what is said of a camera's frame, and return its detections."""
         self.reasons.setdefault(camera, Counter()).update([found.reason] if found.reason else [])
         self.found[camera] += len(found)
         self.truncated += found.truncated
+        self.doubts += [found.range_doubt] if found.range_doubt else []
         return found
 
     def warnings(self, name: str, total: int) -> Iterator[str]:
@@ -290,6 +295,12 @@ class _Notes:
         if self.truncated:
             frames = "one frame" if self.truncated == 1 else f"{self.truncated} frames"
             yield f"{name} saw more in {frames} than it measures: the brightest are reported and told apart"
+        if self.doubts:
+            frames = "one frame" if len(self.doubts) == 1 else f"{len(self.doubts)} frames"
+            yield (
+                f"{name} saw near sources in {frames} of which size and flux, as calibrated, contradict: "
+                f"ranges may be off by {100.0 * median(self.doubts):.2g} %, which their sigmas cover"
+            )
 
     @staticmethod
     def _nothing(name: str, whose: str, reasons: Counter[str]) -> Iterator[str]:

@@ -103,10 +103,12 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     reported = [(blob, found) for blob, found in measured if found.stands_out]
     if not reported:
         return Detections(reason=reason_of_none(prepared, len(blobs), late=late), truncated=truncated)
-    if not in_fog:
-        reported = _with_calibration_error(reported, prepared)
-    else:
+    range_doubt = 0.0
+    if in_fog:
         reported = list(_in_fog(reported, frame, calibration))
+    else:
+        range_doubt = _range_doubt([found for _, found in reported], prepared)
+        reported = [(blob, found.doubted(range_doubt)) for blob, found in reported]
     bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
     return Detections(
         (
@@ -114,6 +116,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
             for (blob, found), (x, y, z) in zip(reported, bearings, strict=True)
         ),
         truncated=truncated,
+        range_doubt=range_doubt,
     )
 
 
@@ -132,29 +135,13 @@ def _measured(
     return measured, False
 
 
-def _with_calibration_error(
-    found: Sequence[tuple[Blob, MeasuredFlare]], prepared: PreparedFrame
-) -> list[tuple[Blob, MeasuredFlare]]:
-    """Widen what is told of ranges and fluxes by what the largest lone discs tell of the calibration."""
-    lone = [one.alone for _, one in found if one.alone is not None]
+def _range_doubt(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> float:
+    """Return how far all ranges may be off because of the calibration, as its largest lone discs tell."""
+    lone = [one.alone for one in found if one.alone is not None]
     discs = [one for one in lone if float(one.radius_at_rest_px[0]) > _TELLS_SIZE_PX]
     discs.sort(key=lambda one: -float(one.radius_at_rest_px[0]))
     camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
-    spread = log_range_of_calibration(discs[:_MOST_TESTED], camera)
-    if spread == 0.0:
-        return list(found)
-    return [
-        (
-            blob,
-            replace(
-                one,
-                flux_sigma_e=math.hypot(one.flux_sigma_e, 2.0 * spread * one.flux_e),
-                range_sigma_m=math.hypot(one.range_sigma_m, spread * one.range_m),
-                range_sigma_common_m=math.hypot(one.range_sigma_common_m, spread * one.range_m),
-            ),
-        )
-        for blob, one in found
-    ]
+    return log_range_of_calibration(discs[:_MOST_TESTED], camera)
 
 
 def _in_fog(

@@ -1,7 +1,7 @@
 """A flare as it is measured: its place, flux and range, and how well they are known."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from perception.model.fog import may_be_in_fog
 from perception.robust.hiding.covered import hidden_log_range
@@ -19,6 +19,7 @@ class MeasuredFlare:
     """Place, flux and range of a flare; NaN where no claim is made. `background_e` is per pixel.
 
     `flux_noise_e` is the part of the σ of its flux that its light brings, not that it may be another's.
+    `log_range_of_model` is the part of the relative σ of its range that its own misfit brings.
     `log_range_doubt` is the part of the relative σ of its range that comes of what sources hide, of each
     other and of the background, and of its being two perhaps; `log_range_doubt_common` that of the background
     alone. `alone` is its fit, where nothing else is seen beside it and nothing clips.
@@ -37,6 +38,7 @@ class MeasuredFlare:
     range_sigma_common_m: float = math.nan
     range_by_size_m: float = math.nan
     range_by_size_sigma_m: float = math.nan
+    log_range_of_model: float = 0.0
     log_range_doubt: float = 0.0
     log_range_doubt_common: float = 0.0
     saturated: bool = False
@@ -60,6 +62,18 @@ class MeasuredFlare:
         if self.saturated:
             return not (self.misfit and self.flux_noise_e > self.flux_e)
         return self.flux_e > 0.0 and not self.flux_e < least * self.flux_noise_e
+
+    def doubted(self, log_range: float) -> "MeasuredFlare":
+        """Return it with at least so much doubt about its range, which all of a frame share."""
+        more = math.sqrt(max(log_range**2 - self.log_range_of_model**2, 0.0))
+        range_sigma_m = math.hypot(self.range_sigma_m, more * self.range_m)
+        common_m = math.hypot(self.range_sigma_common_m, log_range * self.range_m)
+        return replace(
+            self,
+            flux_sigma_e=math.hypot(self.flux_sigma_e, 2.0 * more * self.flux_e),
+            range_sigma_m=range_sigma_m,
+            range_sigma_common_m=min(common_m, range_sigma_m),
+        )
 
 
 def measured_flare(
@@ -105,6 +119,7 @@ def measured_flare(
         range_m=range_m,
         range_sigma_m=math.nan if bound_only else range_m * math.hypot(of_one, solution.log_range_of_two),
         range_sigma_common_m=math.nan if bound_only else range_m * float(solution.log_range_common[index]),
+        log_range_of_model=of_model,
         log_range_doubt=math.hypot(of_background * widening, doubt),
         log_range_doubt_common=of_background,
         saturated=saturated,

@@ -58,11 +58,21 @@ class Detections(list[Detection]):
     truncated
         Whether more was seen than was measured: time was up, or there were too many, in the frame or in one
         place. The brightest are kept.
+    range_doubt
+        How far, relatively, any of its ranges may be off because sizes and fluxes of near sources contradict
+        the calibration; 0 where none shows it. Their σ cover it.
     """
 
-    def __init__(self, found: Iterable[Detection] = (), *, reason: str = "", truncated: bool = False) -> None:
+    def __init__(
+        self,
+        found: Iterable[Detection] = (),
+        *,
+        reason: str = "",
+        truncated: bool = False,
+        range_doubt: float = 0.0,
+    ) -> None:
         super().__init__(found)
-        self.reason, self.truncated = reason, truncated
+        self.reason, self.truncated, self.range_doubt = reason, truncated, range_doubt
 
 
 Ghost = Literal["no", "possible", "yes"]

@@ -66,12 +66,12 @@ def log_range_of_calibration(lone: Sequence[Solution], camera: Camera) -> float:
     pairs = [(one, any_) for one, any_ in zip(lone, free, strict=True) if any_ is not None]
     half = (len(pairs) + 1) // 2
     gains = sorted(max(one.deviance - any_.deviance, 0.0) for one, any_ in pairs)
-    if _chance_of_least(sum(gains[:half]), half, len(pairs)) > MISFIT_PROBABILITY:
+    if chance_of_least(sum(gains[:half]), half, len(pairs)) > MISFIT_PROBABILITY:
         return 0.0
     return sorted(float(_moved(one, any_)[0]) for one, any_ in pairs)[half - 1]
 
 
-def _chance_of_least(total: float, least: int, count: int) -> float:
+def chance_of_least(total: float, least: int, count: int) -> float:
     """Return how often the least of `count` χ² of two degrees of freedom add up to more; 1 of none.
 
     Such χ² are exponential, of mean 2, and so are the steps from one to the next larger, of mean
