@@ -14,6 +14,7 @@ from perception.robust.solve import Solution, solve
 
 _WIDTH_FREE = 0.3
 _FLUX_FREE = 8.0
+_FARTHEST = 3.0
 
 
 def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -60,7 +61,7 @@ def log_range_of_calibration(lone: Sequence[Solution], camera: Camera) -> float:
     It is off for all of them, so that they tell together what none tells alone: each lone flare is fitted
     with flux, size and point spread free. Mirror images are dimmer than sources of their size, so only the
     half that gains the least speaks. If noise gives it so much once in a million frames, the answer is the
-    lower median of how far all the ranges move; else 0.
+    root of the mean square of how far all the ranges move, none more than `_FARTHEST` medians; else 0.
     """
     free = _of_any(lone, camera)
     pairs = [(one, any_) for one, any_ in zip(lone, free, strict=True) if any_ is not None]
@@ -68,7 +69,8 @@ def log_range_of_calibration(lone: Sequence[Solution], camera: Camera) -> float:
     gains = sorted(max(one.deviance - any_.deviance, 0.0) for one, any_ in pairs)
     if chance_of_least(sum(gains[:half]), half, len(pairs)) > MISFIT_PROBABILITY:
         return 0.0
-    return sorted(float(_moved(one, any_)[0]) for one, any_ in pairs)[half - 1]
+    moved = np.sort([float(_moved(one, any_)[0]) for one, any_ in pairs])
+    return float(np.sqrt(np.mean(np.minimum(moved, _FARTHEST * moved[half - 1]) ** 2)))
 
 
 def chance_of_least(total: float, least: int, count: int) -> float:

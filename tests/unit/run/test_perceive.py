@@ -121,6 +121,25 @@ def test_a_recording_without_flares_is_told_why(recording: Path) -> None:
     assert warned[-1].startswith("robust saw more in 2 frames than it measures")
 
 
+def test_a_calibration_that_near_sources_contradict_is_told(recording: Path) -> None:
+    """Of size and flux of a source at .5 m the calibration has the radius 5 % too large, in one of two cameras."""
+    near = expose(expected_e(FRONT, [(60.3, 49.8, 0.5)], 2e-5, 1.0), FRONT, random(72), 2e-5)
+    for file in recording.glob("*.png"):
+        file.write_bytes(encode_png16(near.data_dn))
+    lines = [json.loads(line) for line in (recording / "frames.jsonl").read_text().splitlines()]
+    (recording / "frames.jsonl").write_text(
+        "\n".join(json.dumps({**line, "exposure_s": near.exposure_s}) for line in lines)
+    )
+    off = dataclasses.replace(LEFT, source_radius_m=1.05 * LEFT.source_radius_m)
+    (recording / "calibration.json").write_text(json.dumps(calibration_document([FRONT, off])))
+    chosen = chosen_estimators(["robust"])
+    (said,) = perceive_run(recording, estimators=chosen, progress=lambda *_: None).warnings
+    assert said.startswith(
+        "robust saw near sources in 3 frames of which size and flux, as calibrated, contradict"
+    )
+    assert 2.0 < float(said.rpartition("off by ")[2].partition(" %")[0]) < 5.0
+
+
 def test_an_estimator_of_sets_gets_its_robot_s_odometry(recording: Path) -> None:
     (recording.parent / "own.py").write_text(
         "from perception import detect\n"

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ DISCS = [
     ],
 )
 def test_discs_tell_together_that_a_calibration_is_off(
-    changes: dict[str, float], least: float, most: float
+    changes: dict[str, Any], least: float, most: float
 ) -> None:
     """One that claims no σ. Flux and size tell 2 % of focal length, 3 % of radius, 4 % of range by flux apart.
 
