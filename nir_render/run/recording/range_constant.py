@@ -10,7 +10,7 @@ from nir_render.run.recording.document import CameraGiven, Measured, SourceGiven
 from nir_render.scene.text.units import LENGTH
 from perception import detect
 from perception.model.ranging import effective_exposure_s
-from perception.types import Calibration, Detection, RawFrame
+from perception.types import Calibration, Detection, Detections, RawFrame
 
 _H_J_S = 6.62607015e-34
 _C_M_PER_S = 299_792_458.0
@@ -20,6 +20,7 @@ _NEAR_PX = 12
 _LEAST_OTHER = 0.005  # of the brightest's light: a source so faint is fourteen times as far
 _MOST_TOLD = 6
 _MOST_SIGMAS = 3.0
+_MOST_DOUBT = 0.05  # of a range: a focal length that is known to some per cent brings that much
 _FEWEST_TO_AGREE = 3
 
 
@@ -120,6 +121,8 @@ def _by_light_alone(calibration: Calibration) -> Calibration:
 def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> Iterator[str]:
     """Yield which known ranges do not come out again, flux and size taken together, by more than their σ.
 
+    And those of which flux and size tell ranges that are more than `_MOST_DOUBT` apart.
+
     Of three or more the one that the light of all others contradicts, which agree, is told alone: it has
     moved the range constant, and with it the others.
     """
@@ -133,12 +136,14 @@ def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> It
             "source's radius; do not trust ranges before"
         )
         try:
-            hit = _flare_of(flare, calibration)
+            found = detect(flare.frame, calibration)
+            hit = _flare_of(flare, found)
         except ValueError:
             yield f"{wanted}, and nothing there looks like a source of that size at such a range. {check}"
             continue
         sigma_m = math.hypot(hit.range_sigma_m, flare.range_m.sigma)
-        if abs(hit.range_m - flare.range_m.value) > _MOST_SIGMAS * sigma_m:
+        is_off = abs(hit.range_m - flare.range_m.value) > _MOST_SIGMAS * sigma_m
+        if is_off or found.range_doubt > _MOST_DOUBT:
             yield (
                 f"{wanted}, and its flare at ({hit.u_px:.0f}, {hit.v_px:.0f}) px comes out at "
                 f"{hit.range_m:.3f} ± {hit.range_sigma_m:.3f} m: its light, its size and what other frames "
@@ -170,8 +175,8 @@ def _odd_one(flares: Sequence[KnownFlare], calibration: Calibration) -> str | No
     return told[0] if len(told) == 1 else None
 
 
-def _flare_of(flare: KnownFlare, known: Calibration) -> Detection:
-    """Return the flare that is meant.
+def _flare_of(flare: KnownFlare, detections: Detections) -> Detection:
+    """Return which of the flares found is meant.
 
     Raises
     ------
@@ -179,7 +184,7 @@ def _flare_of(flare: KnownFlare, known: Calibration) -> Detection:
         There is none, or there are several.
     """
     frame = flare.frame
-    found = [hit for hit in detect(frame, known) if math.isfinite(hit.range_sigma_m)]
+    found = [hit for hit in detections if math.isfinite(hit.range_sigma_m)]
     where = f"frame {frame.index} of {frame.camera} ({flare.name})"
     if not found:
         raise ValueError(
@@ -212,7 +217,7 @@ def _places(found: Sequence[Detection]) -> str:
 
 def _constant_of(flare: KnownFlare, known: Calibration) -> tuple[float, float]:
     """Return the K that one frame tells, and its σ."""
-    frame, hit = flare.frame, _flare_of(flare, known)
+    frame, hit = flare.frame, _flare_of(flare, detect(flare.frame, known))
     exposed_s = float(effective_exposure_s(hit.u_px, hit.v_px, frame.exposure_s, frame.gain, known))
     constant = hit.flux_dn * flare.range_m.value**2 / exposed_s
     return constant, constant * 2.0 * math.hypot(hit.range_sigma_m / hit.range_m, flare.range_m.relative)

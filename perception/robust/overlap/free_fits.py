@@ -12,8 +12,8 @@ from perception.robust.goodness import MISFIT_PROBABILITY
 from perception.robust.overlap.rivals import to_beat
 from perception.robust.solve import Solution, solve
 
-_WIDTH_FREE = 0.3
-_FLUX_FREE = 8.0
+_WIDTH_FREE, _FLUX_FREE = 0.3, 8.0  # any at all
+_WIDTH_OFF, _FLUX_OFF = 0.1, 0.2  # as calibrations are off; a flux and a size by any of these two
 _FARTHEST = 3.0
 
 
@@ -22,19 +22,19 @@ def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solutio
 
     However unlikely: by that it is decided about others.
     """
-    return _again(solutions, _with_free_width(camera))
+    return _again(solutions, _with_spread(camera, "psf_sigma_px", _WIDTH_FREE))
 
 
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     """Fit lone flares whose size may be any, whatever their flux says; however unlikely."""
-    return _again(solutions, _with_free_size(camera))
+    return _again(solutions, _with_spread(camera, "range_constant_dn_m2_per_s", _FLUX_FREE))
 
 
 def with_model_error(solution: Solution, camera: Camera) -> Solution:
     """Tell of flares how far their range and flux may be off where the calibration leaves something over.
 
     What no noise explains may be the source's flux, its size (a wrong lens or focal length and a limb that is
-    darker look like one), or the point spread. A lone flare is fitted with all three free (`_moved`). What is
+    darker look like one), or the point spread. A lone flare is fitted with all three open (`_moved`). What is
     still left over, or all of it where others are fitted, counts as `LeftOver.widens_range` says.
     """
     widens = solution.left_over.widens_range
@@ -59,7 +59,7 @@ def log_range_of_calibration(lone: Sequence[Solution], camera: Camera) -> float:
     """Return how far the range of any flare in a frame may be off because the calibration is.
 
     It is off for all of them, so that they tell together what none tells alone: each lone flare is fitted
-    with flux, size and point spread free. Mirror images are dimmer than sources of their size, so only the
+    with flux, size and point spread open. Mirror images are dimmer than sources of their size, so only the
     half that gains the least speaks. If noise gives it so much once in a million frames, the answer is the
     root of the mean square of how far all the ranges move, none more than `_FARTHEST` medians; else 0.
     """
@@ -100,19 +100,13 @@ def _moved(told: Solution, free: Solution) -> NDArray[np.float64]:
 
 
 def _of_any(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
-    return _again(solutions, _with_free_width(_with_free_size(camera)))
+    """Fit flares as calibrations are off: 10 % of width and of range by flux, unless what is seen says more."""
+    of_width = _with_spread(camera, "psf_sigma_px", _WIDTH_OFF)
+    return _again(solutions, _with_spread(of_width, "range_constant_dn_m2_per_s", _FLUX_OFF))
 
 
 def _again(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     return solve([to_beat(one, math.inf).again() for one in solutions], camera)
-
-
-def _with_free_width(camera: Camera) -> Camera:
-    return _with_spread(camera, "psf_sigma_px", _WIDTH_FREE)
-
-
-def _with_free_size(camera: Camera) -> Camera:
-    return _with_spread(camera, "range_constant_dn_m2_per_s", _FLUX_FREE)
 
 
 def _with_spread(camera: Camera, name: str, spread: float) -> Camera:
