@@ -100,7 +100,7 @@ def _moved(told: Solution, free: Solution) -> NDArray[np.float64]:
 
 
 def _of_any(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
-    """Fit flares as calibrations are off: 10 % of width and of range by flux, unless what is seen says more."""
+    """Fit flares as calibrations are off: by 10 % of width and of range by flux, or as far as light insists."""
     of_width = _with_spread(camera, "psf_sigma_px", _WIDTH_OFF)
     return _again(solutions, _with_spread(of_width, "range_constant_dn_m2_per_s", _FLUX_OFF))
 
@@ -110,7 +110,8 @@ def _again(solutions: Sequence[Solution], camera: Camera) -> list[Solution | Non
 
 
 def _with_spread(camera: Camera, name: str, spread: float) -> Camera:
-    """Return a camera one of whose constants is known to a relative spread only."""
+    """Return a camera one of whose constants is known to such a relative spread at best."""
     calibration = camera.calibration
-    sigma = {**calibration.sigma, name: spread * getattr(calibration, name)}
+    claimed = calibration.sigma.get(name, 0.0)
+    sigma = {**calibration.sigma, name: max(spread * getattr(calibration, name), claimed)}
     return replace(camera, calibration=replace(calibration, sigma=sigma))
