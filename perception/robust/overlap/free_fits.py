@@ -100,7 +100,7 @@ def _moved(told: Solution, free: Solution) -> NDArray[np.float64]:
 
 
 def _of_any(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
-    """Fit flares as calibrations are off: by 10 % of width and of range by flux, or as far as light insists."""
+    """Fit flares as calibrations are off: by 10 % of width and range by flux, or as light insists."""
     of_width = _with_spread(camera, "psf_sigma_px", _WIDTH_OFF)
     return _again(solutions, _with_spread(of_width, "range_constant_dn_m2_per_s", _FLUX_OFF))
 
