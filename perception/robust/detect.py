@@ -16,6 +16,7 @@ from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
 from perception.robust.flare import MeasuredFlare
+from perception.robust.goodness import is_likely
 from perception.robust.measure import measure
 from perception.robust.overlap.free_fits import log_range_of_calibration
 from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
@@ -24,6 +25,7 @@ from perception.robust.search.hills import prominent, summit
 from perception.robust.search.near import most_brightness
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
+from perception.robust.solve import Solution
 from perception.types import Calibration, Detection, Detections, RawFrame
 
 CONTRAST_SIGMAS = 6.03
@@ -107,8 +109,14 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     if in_fog:
         reported = list(_in_fog(reported, frame, calibration))
     else:
-        range_doubt = _range_doubt([found for _, found in reported], prepared)
-        reported = [(blob, found.doubted(range_doubt)) for blob, found in reported]
+        discs = _telling_discs([found for _, found in reported], prepared)
+        camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
+        range_doubt = log_range_of_calibration(discs, camera)
+        # One disc may be a mirror image, and says nothing of others.
+        reported = [
+            (blob, found.doubted(range_doubt) if len(discs) > 1 or found.alone in discs else found)
+            for blob, found in reported
+        ]
     bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
     return Detections(
         (
@@ -135,13 +143,17 @@ def _measured(
     return measured, False
 
 
-def _range_doubt(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> float:
-    """Return how far all ranges may be off because of the calibration, as its largest lone discs tell."""
+def _telling_discs(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> list[Solution]:
+    """Return the largest lone discs: their flux and their size tell of the calibration.
+
+    Behind a rolling shutter motion draws them out, and is not fitted.
+    """
     lone = [one.alone for one in found if one.alone is not None]
     discs = [one for one in lone if float(one.radius_at_rest_px[0]) > _TELLS_SIZE_PX]
+    if prepared.frame.line_time_s > 0.0:
+        discs = [one for one in discs if is_likely(2, one.drawn_out[0])]
     discs.sort(key=lambda one: -float(one.radius_at_rest_px[0]))
-    camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
-    return log_range_of_calibration(discs[:_MOST_TESTED], camera)
+    return discs[:_MOST_TESTED]
 
 
 def _in_fog(

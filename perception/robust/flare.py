@@ -68,8 +68,10 @@ class MeasuredFlare:
         more = math.sqrt(max(log_range**2 - self.log_range_of_model**2, 0.0))
         range_sigma_m = math.hypot(self.range_sigma_m, more * self.range_m)
         common_m = math.hypot(self.range_sigma_common_m, log_range * self.range_m)
+        is_bound = math.isnan(range_sigma_m) and self.saturated
         return replace(
             self,
+            range_m=self.range_m * (1.0 + log_range) if is_bound else self.range_m,
             flux_sigma_e=math.hypot(self.flux_sigma_e, 2.0 * more * self.flux_e),
             range_sigma_m=range_sigma_m,
             range_sigma_common_m=min(common_m, range_sigma_m),

@@ -59,8 +59,9 @@ class Detections(list[Detection]):
         Whether more was seen than was measured: time was up, or there were too many, in the frame or in one
         place. The brightest are kept.
     range_doubt
-        How far, relatively, any of its ranges may be off because sizes and fluxes of near sources contradict
-        the calibration; 0 where none shows it. Their σ cover it.
+        How far, relatively, its ranges may be off because sizes and fluxes of near sources contradict the
+        calibration; 0 where none shows it, and where fog is not excluded. Their σ cover it, of a single
+        such source its own; upper bounds are so much farther.
     """
 
     def __init__(

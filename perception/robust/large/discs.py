@@ -98,8 +98,9 @@ def _piles(
             others.append(cluster)
             continue
         blobs = divide([member.blob for member in cluster.members], pile.u_px, pile.v_px)
+        told = with_model_error(pile, camera)
         measured += [
-            (blob, measured_flare(pile, k, blob, False, prepared))
+            (blob, measured_flare(told, k, blob, False, prepared))
             for k, blob in enumerate(blobs)
             if blob is not None and not is_border(pile, k, prepared.shape)
         ]

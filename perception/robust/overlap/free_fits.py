@@ -15,6 +15,8 @@ from perception.robust.solve import Solution, solve
 _WIDTH_FREE, _FLUX_FREE = 0.3, 8.0  # any at all
 _WIDTH_OFF, _FLUX_OFF = 0.1, 0.2  # as calibrations are off; a flux and a size by any of these two
 _FARTHEST = 3.0
+_FEWER_AT_RANDOM = 6.0  # other pixels may count; fits of another width than this may have been better
+_CLAIMED = 4.0
 
 
 def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -46,7 +48,7 @@ def with_model_error(solution: Solution, camera: Camera) -> Solution:
         (free,) = _of_any([solution], camera)
         if free is not None and free.left_over.noise_chi2 < solution.left_over.noise_chi2:
             widens = free.left_over.widens_range
-            log_range, log_flux = _moved(solution, free), abs(np.log(free.flux_e / solution.flux_e))
+            log_range, log_flux = _moved(solution, free, camera), abs(np.log(free.flux_e / solution.flux_e))
     of_rest = math.sqrt(widens**2 - 1.0) * of_noise
     return replace(
         solution,
@@ -63,14 +65,33 @@ def log_range_of_calibration(lone: Sequence[Solution], camera: Camera) -> float:
     half that gains the least speaks. If noise gives it so much once in a million frames, the answer is the
     root of the mean square of how far all the ranges move, none more than `_FARTHEST` medians; else 0.
     """
-    free = _of_any(lone, camera)
-    pairs = [(one, any_) for one, any_ in zip(lone, free, strict=True) if any_ is not None]
-    half = (len(pairs) + 1) // 2
-    gains = sorted(max(one.deviance - any_.deviance, 0.0) for one, any_ in pairs)
-    if chance_of_least(sum(gains[:half]), half, len(pairs)) > MISFIT_PROBABILITY:
+    gains, moved = [], []
+    for one, any_ in zip(lone, _of_any(lone, camera), strict=True):
+        if any_ is not None and (gain := _gained(one, any_, camera)) > -_FEWER_AT_RANDOM:
+            gains.append(max(gain, 0.0))
+            moved.append(float(_moved(one, any_, camera)[0]))
+    half = (len(gains) + 1) // 2
+    if chance_of_least(sum(sorted(gains)[:half]), half, len(gains)) > MISFIT_PROBABILITY:
         return 0.0
-    moved = np.sort([float(_moved(one, any_)[0]) for one, any_ in pairs])
-    return float(np.sqrt(np.mean(np.minimum(moved, _FARTHEST * moved[half - 1]) ** 2)))
+    most = _FARTHEST * sorted(moved)[half - 1]
+    return float(np.sqrt(np.mean(np.minimum(moved, most) ** 2)))
+
+
+def _gained(told: Solution, free: Solution, camera: Camera) -> float:
+    """Return by how much better a lone flare is explained, as χ² of two degrees of freedom.
+
+    What is claimed to be uncertain of flux and size is the same for all flares, and no chance of each: so far
+    as it explains that they tell two ranges, up to `_CLAIMED` of its σ, that counts for nothing.
+    """
+    before, after = told.left_over, free.left_over
+    gained = (before.noise_chi2 - before.pixels) - (after.noise_chi2 - after.pixels)
+    if camera.tie_spread == 0.0:
+        return gained
+    by_flux = 0.5 * max(_FLUX_OFF, camera.flux_spread)
+    lean = by_flux**2 / (by_flux**2 + camera.radius_spread**2)  # of flux, as `Camera.log_range` has it
+    apart = abs(float(free.log_photometric_range[0] - free.log_range[0])) / lean
+    sigma = math.hypot(float(free.log_range_sigma[0]), 0.5 * float(free.flux_noise_e[0] / free.flux_e[0]))
+    return max(gained, (max(apart - _CLAIMED * camera.tie_spread, 0.0) / sigma) ** 2)
 
 
 def chance_of_least(total: float, least: int, count: int) -> float:
@@ -88,12 +109,12 @@ def chance_of_least(total: float, least: int, count: int) -> float:
     return float(np.sum(np.prod(means[:, None] / apart, axis=1) * np.exp(-total / means)))
 
 
-def _moved(told: Solution, free: Solution) -> NDArray[np.float64]:
+def _moved(told: Solution, free: Solution, camera: Camera) -> NDArray[np.float64]:
     """Return how far lone flares' range moves if it is that by flux alone, or by size alone, and not both.
 
-    The larger of the two, each as far as it is farther away than its own σ.
+    The larger of the two, each as far as it is farther away than its own σ and what the calibration claims.
     """
-    of_flux = 0.5 * free.flux_noise_e / free.flux_e
+    of_flux = 0.5 * np.hypot(free.flux_noise_e / free.flux_e, camera.flux_spread)
     by_flux = (free.log_photometric_range - told.log_range) ** 2 - of_flux**2
     by_size = (free.log_range - told.log_range) ** 2 - free.log_range_sigma**2
     return np.sqrt(np.maximum(np.maximum(by_flux, by_size), 0.0))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from perception import detect
 from perception.robust.overlap.free_fits import chance_of_least
@@ -105,3 +106,55 @@ def test_the_least_of_several_gains_are_as_likely_as_drawn_ones(least: int, coun
     for total in (1.0, 4.0, 8.0):
         chance = chance_of_least(total, least, count)
         assert np.mean(gains > total) == pytest.approx(chance, abs=4.5 * math.sqrt(chance / len(gains)))
+
+
+@pytest.mark.parametrize(("sigmas", "is_told"), [(3.0, False), (12.0, True)])
+def test_what_a_calibration_claims_is_no_contradiction(sigmas: float, is_told: bool) -> None:
+    """K claimed to 1 %: of what it is off by all discs have their share, so it is no chance of each of them."""
+    constant = CAMERA.range_constant_dn_m2_per_s / (1.0 + 0.01 * sigmas)
+    claimed = replace(
+        CAMERA, range_constant_dn_m2_per_s=constant, sigma={"range_constant_dn_m2_per_s": 0.01 * constant}
+    )
+    mean_e = expected_e(CAMERA, DISCS, EXPOSURE_S, BACKGROUND_E)
+    told = detect(expose(mean_e, CAMERA, random(98), EXPOSURE_S), claimed)
+    assert (told.range_doubt > 0.0) == is_told
+    near = [one for one in told if one.range_m < 2.0]
+    assert len(near) == len(DISCS) - 1
+    assert (max(one.range_sigma_m / one.range_m for one in near) > 0.01) == is_told
+
+
+def test_a_single_dimmed_disc_doubts_itself_alone() -> None:
+    """A mirror image that lacks a fifth of its light: the range of the point beside it is known as before."""
+    (disc, point) = DISCS[0], DISCS[-1]
+    mean_e = 0.8 * expected_e(CAMERA, [disc], EXPOSURE_S) + expected_e(
+        CAMERA, [point], EXPOSURE_S, BACKGROUND_E
+    )
+    told = detect(expose(mean_e, CAMERA, random(99), EXPOSURE_S), CAMERA)
+    of_disc, of_point = sorted(told, key=lambda one: abs(one.u_px - disc[0]))
+    assert told.range_doubt > 0.03
+    assert of_disc.range_sigma_m > 0.03 * of_disc.range_m
+    assert abs(of_point.range_m - point[2]) < 4.0 * of_point.range_sigma_m < 0.1 * point[2]
+
+
+def test_discs_that_move_behind_a_rolling_shutter_contradict_nothing() -> None:
+    """By 1.5 px: that they are drawn out is no matter of the point spread."""
+    drawn = [expected_e(CAMERA, [(u + d, v, r) for u, v, r in DISCS], EXPOSURE_S) for d in (-0.5, 0.0, 0.5)]
+    frame = expose(np.mean(drawn, axis=0) + BACKGROUND_E, CAMERA, random(100), EXPOSURE_S)
+    assert detect(replace(frame, line_time_s=1e-5), CAMERA).range_doubt == 0.0
+
+
+def test_large_discs_that_hide_parts_of_each_other_know_of_a_wrong_size() -> None:
+    """By 3 %: ranges are off by as much, and σ was a thousandth of that; drawn sharp, the nearer cut out of the other, spread."""
+    sharp = replace(CAMERA, width_px=300, height_px=300, cx_px=149.5, cy_px=149.5, psf_sigma_px=0.05)
+    blurred = replace(sharp, psf_sigma_px=0.7)
+    exposure_s, near, far = 2e-4, (130.0, 150.0, 0.13), (175.0, 150.3, 0.16)
+    radius_px = sharp.fx_px * math.tan(math.asin(sharp.source_radius_m / near[2]))
+    rows, columns = np.mgrid[:300, :300]
+    hidden = np.clip(radius_px + 0.5 - np.hypot(columns - near[0], rows - near[1]), 0.0, 1.0)
+    mean_e = expected_e(sharp, [near], exposure_s) + (1.0 - hidden) * expected_e(sharp, [far], exposure_s)
+    frame = expose(gaussian_filter(mean_e + BACKGROUND_E, 0.7), blurred, random(101), exposure_s)
+    sigma = {"range_constant_dn_m2_per_s": 2e-3 * CAMERA.range_constant_dn_m2_per_s}
+    off = replace(blurred, source_radius_m=1.03 * sharp.source_radius_m, sigma=sigma)
+    told = sorted(detect(frame, off), key=lambda one: one.u_px)
+    assert [one.range_m for one in told] == pytest.approx([1.03 * near[2], 1.03 * far[2]], rel=2e-3)
+    assert all(one.range_sigma_m > 0.002 * one.range_m for one in told)
