@@ -268,9 +268,7 @@ class _Notes:
     reasons: dict[str, Counter[str]] = field(default_factory=dict)  # by camera
     found: Counter[str] = field(default_factory=Counter)  # detections of each camera
     truncated: int = 0
-    doubts: list[float] = field(
-        default_factory=list
-    )  # of ranges, of the frames that contradict a calibration
+    doubts: list[float] = field(default_factory=list)  # `range_doubt` of the frames that have one
 
     def take(self, camera: str, found: Detections) -> Detections:
         """Note what is said of a camera's frame, and return its detections."""

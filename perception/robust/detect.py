@@ -112,11 +112,12 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         discs = _telling_discs([found for _, found in reported], prepared)
         camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
         range_doubt = log_range_of_calibration(discs, camera)
-        # One disc may be a mirror image, and says nothing of others.
-        reported = [
-            (blob, found.doubted(range_doubt) if len(discs) > 1 or found.alone in discs else found)
-            for blob, found in reported
-        ]
+        if range_doubt > 0.0:
+            # One disc may be a mirror image, and says nothing of others.
+            reported = [
+                (blob, found.doubted(range_doubt) if len(discs) > 1 or found.alone in discs else found)
+                for blob, found in reported
+            ]
     bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
     return Detections(
         (
