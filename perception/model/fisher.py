@@ -322,18 +322,22 @@ def _known(
         return None
     clip_e = clip_level_e(calibration, calibration.black_level_dn) if clipped_tell_nothing else math.inf
     known, structure = camera.known(clip_e), structure or even(pixels)
-    layout = known.layout(len(place), len(structure.columns))
+    layout = known.layout(len(place), structure.amplitudes)
     values = np.zeros(layout.size)
     own = layout.of_sources(values)
     own[:, 0], own[:, 1], own[:, 2] = place[:, 0], place[:, 1], log_range
     if motions_px is not None:
         own[:, layout.motion :] = motions_px
     values[layout.background] = background_e
-    expected_e, variance_e2, jacobian = np.empty(pixels), np.empty(pixels), np.empty((layout.size, pixels))
+    expected_e, variance_e2 = np.empty(pixels), np.empty(pixels)
+    jacobian = np.empty((layout.size - len(structure.order), pixels))
     at_1_m = sources._replace(log_flux_at_1_m=np.log(place[:, 3]) + 2.0 * log_range)
     blank = np.zeros((box.height, box.width))
     view = View(box.top, box.left, blank, blank.astype(np.uint8), noise_floor_e2(calibration), blank)
     expectation(values, view, at_1_m, structure, known, expected_e, jacobian, variance_e2)
+    if len(structure.order):
+        first = layout.background + 1
+        jacobian = np.concatenate([jacobian[:first], structure.waves, jacobian[first:]])
     telling = np.ones(pixels)
     if clipped_tell_nothing:
         telling = censored_weight(expected_e, variance_e2, clip_e)

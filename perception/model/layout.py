@@ -195,18 +195,60 @@ class View(NamedTuple):
 class Structure(NamedTuple):
     """What may lie on an even background: columns φ, and the precision of their amplitudes c.
 
-    `columns` has shape (amplitudes, pixels), `precision` (amplitudes, amplitudes).
+    The first are products of a cosine along the rows of a square window and one along its columns, which
+    sums over pixels make use of (`likelihood.cosines`); the others are any.
+
+    Attributes
+    ----------
+    cosines
+        cos(π k (i + ½) / side) for k = 0, 1, ..., shape (cosines, side): so many, a multiple of four, that
+        two that `order` names never add up to more.
+    order
+        Of which of them along columns and along rows each is the product, shape (waves, 2).
+    columns
+        The others, shape (amplitudes - waves, pixels).
+    precision
+        Shape (amplitudes, amplitudes).
     """
 
+    cosines: Array
+    order: NDArray[np.int64]
     columns: Array
     precision: Array
 
     @property
+    def amplitudes(self) -> int:
+        """How many there are."""
+        return len(self.precision)
+
+    @property
+    def waves(self) -> Array:
+        """The products of cosines, shape (waves, pixels)."""
+        down, across = self.cosines[self.order.T]
+        return np.asarray(down[:, :, None] * across[:, None, :]).reshape(len(self.order), down.shape[1] ** 2)
+
+    def light(self, amplitudes: Array) -> Array:
+        """Return Σ c φ, shape (pixels,)."""
+        waves = len(self.order)
+        light = np.asarray(amplitudes[waves:] @ self.columns)
+        if not waves:
+            return light
+        most = self.order.max() + 1
+        of_waves, cosines = np.zeros((most, most)), self.cosines[:most]
+        of_waves[tuple(self.order.T)] = amplitudes[:waves]
+        return np.asarray(light + (cosines.T @ of_waves @ cosines).ravel())
+
+    @property
     def log_determinant(self) -> float:
         """Logarithm of the determinant of the precision."""
-        return float(np.linalg.slogdet(self.precision)[1]) if len(self.columns) else 0.0
+        return float(np.linalg.slogdet(self.precision)[1]) if self.amplitudes else 0.0
+
+
+def any_of(columns: Array, precision: Array) -> Structure:
+    """Return a structure of any columns."""
+    return Structure(np.empty((0, 0)), np.empty((0, 2), dtype=np.int64), columns, precision)
 
 
 def even(pixels: int) -> Structure:
     """Return the structure of a background that has none."""
-    return Structure(np.empty((0, pixels)), np.empty((0, 0)))
+    return any_of(np.empty((0, pixels)), np.empty((0, 0)))

@@ -20,7 +20,7 @@ class Fit:
         window = problem.window
         self.window, self.known = window, camera.known(window.clip_e)
         self.structure = window.beside
-        self.layout = self.known.layout(len(problem.starts), len(self.structure.columns))
+        self.layout = self.known.layout(len(problem.starts), self.structure.amplitudes)
         self.values = np.zeros(self.layout.size)
         self.own[:, :3] = problem.starts
         if problem.motions is not None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from perception.model.bearing import direction_camera
 from perception.model.flare import PixelBox
 from perception.model.fog import extinction_sigma_per_m, forward_sigma, may_be_in_fog, range_in_fog_m
-from perception.model.layout import Structure
+from perception.model.layout import any_of
 from perception.model.window import Camera
 from perception.robust.problem import Window
 from perception.robust.solve import Solution, solve
@@ -73,7 +73,7 @@ def _with_halos(solution: Solution, camera: Camera) -> Window:
     halo, *kinds = np.sum(halos, axis=0)
     sigma = math.hypot(unsure_per_m / per_m, forward_sigma(calibration))
     columns = np.array([*([sigma * halo] if sigma > 0.0 else []), *kinds]).reshape(-1, halo.size)
-    unsure = Structure(columns, np.eye(len(columns))) if len(columns) else None
+    unsure = any_of(columns, np.eye(len(columns))) if len(columns) else None
     return replace(window, known_e=halo if known else None, unsure=unsure)
 
 

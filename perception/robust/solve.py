@@ -360,8 +360,8 @@ def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
         flares_e, log_information = fit.expected_e - background_e, fit.log_information
         if fit.window.known_e is not None:
             flares_e -= fit.window.known_e
-        if waves := fit.layout.structure:
-            flares_e -= (fit.values[-waves:] @ fit.structure.columns).reshape(flares_e.shape)
+        if amplitudes := fit.layout.structure:
+            flares_e -= fit.structure.light(fit.values[-amplitudes:]).reshape(flares_e.shape)
             log_information -= fit.structure.log_determinant
         solutions.append(
             Solution(

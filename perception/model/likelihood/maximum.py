@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, Known, Sources, Structure, View
 from perception.model.likelihood.pixels import expectation, is_inside, log_variances, objective, slopes
-from perception.model.likelihood.products import inverted
+from perception.model.likelihood.products import dot, factorised, inverted, solved, variance_of
 
 Array = NDArray[np.float64]
 
@@ -78,26 +78,30 @@ def maximise(
     """
     size, pixels, count = len(values), len(expected), len(sources.log_range_at)
     step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
-    jacobian, new_jacobian = np.empty((size, pixels)), np.empty((size, pixels))
+    first_wave = count * step + (known.width_spread > 0.0) + 1
+    rows = size - len(structure.order)
+    jacobian, new_jacobian = np.empty((rows, pixels)), np.empty((rows, pixels))
     new_expected, variance, new_variance = np.empty(pixels), np.empty(pixels), np.empty(pixels)
-    gradient, trial, clip_e = np.empty(size), np.empty(size), known.clip_e
-    fisher, inverse, damped = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
-    damping, is_new, log_det, before, taken = FIRST_DAMPING, True, 0.0, 0.0, 0
+    gradient, trial, shift, clip_e = np.empty(size), np.empty(size), np.empty(size), known.clip_e
+    fisher, damped, factor = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
+    scale = np.empty(size)
+    damping, is_new, to_gain, before, taken = FIRST_DAMPING, True, 0.0, 0.0, 0
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
     for _ in range(MOST_STEPS):
         if is_new:
-            slopes(view, values, expected, jacobian, variance, precision, clip_e, False, gradient, fisher)
-            log_det = inverted(fisher, inverse)
-            if math.isnan(log_det):
+            slopes(
+                view, structure, first_wave, values, expected, jacobian, variance, precision, clip_e, False,
+                gradient, fisher,
+            )  # fmt: skip
+            if math.isnan(factorised(fisher, scale, factor)):
                 return math.inf, math.inf
-            settled, to_gain = True, 0.0
-            for one in range(size):
-                free_step = 0.0
-                for other in range(size):
-                    free_step += inverse[one, other] * gradient[other]
-                if one < count * step:
-                    settled &= abs(free_step) <= SETTLED_SIGMAS * math.sqrt(inverse[one, one])
-                to_gain += free_step * gradient[one]
+            solved(scale, factor, gradient, shift)
+            to_gain = dot(shift, gradient)
+            settled = True
+            for one in range(count * step):
+                if settled:
+                    sigma = math.sqrt(variance_of(scale, factor, one))
+                    settled = abs(shift[one]) <= SETTLED_SIGMAS * sigma
             if settled:
                 break
             before = objective(view, values, expected, variance, precision, clip_e)
@@ -110,13 +114,11 @@ def maximise(
             damped[one, one] *= 1.0 + damping
         if known.motion_px > 0.0 and count == 1:
             _add_bend(view, expected, jacobian, variance, step - 2, damped)
-        if math.isnan(inverted(damped, damped)):
+        if math.isnan(factorised(damped, scale, factor)):
             return math.inf, math.inf
+        solved(scale, factor, gradient, shift)
         for one in range(size):
-            shift = 0.0
-            for other in range(size):
-                shift += damped[one, other] * gradient[other]
-            trial[one] = values[one] + min(max(shift, -most_step[one]), most_step[one])
+            trial[one] = values[one] + min(max(shift[one], -most_step[one]), most_step[one])
         is_new = False
         if is_inside(trial, view, count, step):
             expectation(trial, view, sources, structure, known, new_expected, new_jacobian, new_variance)
@@ -134,10 +136,12 @@ def maximise(
     else:
         return math.inf, math.inf
     if (view.state == CLIPPED).any():
-        slopes(view, values, expected, jacobian, variance, precision, clip_e, True, gradient, fisher)
-        log_det = inverted(fisher, inverse)
-        if math.isnan(log_det):
-            return math.inf, math.inf
-    covariance[:] = inverse
+        slopes(
+            view, structure, first_wave, values, expected, jacobian, variance, precision, clip_e, True,
+            gradient, fisher,
+        )  # fmt: skip
+    log_det = inverted(fisher, covariance)
+    if math.isnan(log_det):
+        return math.inf, math.inf
     chi2 = objective(view, values, expected, variance, precision, clip_e)
     return chi2 + log_variances(view, variance), log_det

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
+from perception.model.likelihood.cosines import add_wave_information, add_waves, cosine_sums
 from perception.model.likelihood.products import add_information, dot
 from perception.model.normal import log_upper_tail, of_clipped
 from perception.model.spread import spread_nodes
@@ -38,6 +39,7 @@ def expectation(
         The window, of which all but what it shows counts, and what is in it.
     expected, jacobian, variance
         Shape (pixels,), (unknowns, pixels) and (pixels,): written; the last as `sensor.pixel_variance_e2`.
+        Of the structure's waves, the first amplitudes after the background, `jacobian` has no rows.
     """
     count, has_slack, moves = len(sources.log_range_at), known.tie_spread > 0.0, known.motion_px > 0.0
     step = 3 + has_slack + 2 * moves
@@ -49,9 +51,13 @@ def expectation(
         jacobian[width] = 0.0
     expected[:], jacobian[background] = values[background], 1.0
     expected += view.known_e.ravel()
-    for wave in range(len(structure.columns)):
-        expected += values[background + 1 + wave] * structure.columns[wave]
-        jacobian[background + 1 + wave] = structure.columns[wave]
+    waves = len(structure.order)
+    if waves:
+        amplitudes = values[background + 1 : background + 1 + waves]
+        add_waves(structure.cosines, structure.order, amplitudes, expected.reshape(view.image_e.shape))
+    for other in range(len(structure.columns)):
+        expected += values[background + 1 + waves + other] * structure.columns[other]
+        jacobian[background + 1 + other] = structure.columns[other]
     image = np.empty((7 if moves else 5, *view.image_e.shape))
     flat = image.reshape(len(image), -1)
     motion = (0.0, 0.0)
@@ -85,14 +91,15 @@ def expectation(
 
 @compiled
 def slopes(
-    view: View, values: Array, expected: Array, jacobian: Array, variance: Array,
-    precision: Array, clip_e: float, of_average: bool, gradient: Array, information: Array,
+    view: View, structure: Structure, first_wave: int, values: Array, expected: Array, jacobian: Array,
+    variance: Array, precision: Array, clip_e: float, of_average: bool, gradient: Array, information: Array,
 ) -> None:  # fmt: skip
     """Write the gradient of ln L and the information, priors included.
 
     The information is what these very pixels give, or, `of_average`, what such pixels give on average.
+    `first_wave` is the index of the first amplitude of a wave of the structure, which `jacobian` leaves out.
     """
-    image, state = view.image_e.ravel(), view.state.ravel()
+    image, state, waves = view.image_e.ravel(), view.state.ravel(), len(structure.order)
     pull, weight = np.zeros(len(expected)), np.zeros(len(expected))
     for pixel in range(len(expected)):
         if state[pixel] == UNUSABLE:
@@ -106,12 +113,24 @@ def slopes(
             pull[pixel] = mills / sigma
             weight[pixel] *= kept if of_average else curvature
     information[:] = precision
-    add_information(jacobian, weight, information)
+    if waves:
+        of_rows = np.zeros((len(jacobian), len(jacobian)))
+        add_information(jacobian, weight, of_rows)
+        for row in range(len(jacobian)):
+            one = row if row < first_wave else row + waves
+            information[one, :first_wave] += of_rows[row, :first_wave]
+            information[one, first_wave + waves :] += of_rows[row, first_wave:]
+        add_wave_information(structure.cosines, structure.order, jacobian, weight, first_wave, information)
+        by_wave = cosine_sums(pull.reshape(view.image_e.shape), structure.cosines, structure.order.max() + 1)
+        for wave in range(waves):
+            gradient[first_wave + wave] = by_wave[structure.order[wave, 0], structure.order[wave, 1]]
+    else:
+        add_information(jacobian, weight, information)
+    for row in range(len(jacobian)):
+        gradient[row if row < first_wave else row + waves] = dot(jacobian[row], pull)
     for one in range(len(values)):
-        total = dot(jacobian[one], pull)
         for other in range(len(values)):
-            total -= precision[one, other] * values[other]
-        gradient[one] = total
+            gradient[one] -= precision[one, other] * values[other]
 
 
 @compiled

@@ -28,7 +28,7 @@ def dot(one: Array, other: Array) -> float:
 
 
 @compiled
-def _four_dots(x: Array, p: Array, q: Array, r: Array, s: Array) -> tuple[float, float, float, float]:
+def four_dots(x: Array, p: Array, q: Array, r: Array, s: Array) -> tuple[float, float, float, float]:
     """Return `dot` of an array and four others each, to the bit: their sums do not wait for one another."""
     p0 = p1 = p2 = p3 = q0 = q1 = q2 = q3 = r0 = r1 = r2 = r3 = s0 = s1 = s2 = s3 = 0.0
     whole = len(x) - len(x) % 4
@@ -53,7 +53,7 @@ def add_information(jacobian: Array, weight: Array, into: Array) -> None:
             weighted[pixel] = jacobian[one, pixel] * weight[pixel]
         fours = (one + 1) // 4 * 4
         for at in range(0, fours, 4):
-            totals[at], totals[at + 1], totals[at + 2], totals[at + 3] = _four_dots(
+            totals[at], totals[at + 1], totals[at + 2], totals[at + 3] = four_dots(
                 weighted, jacobian[at], jacobian[at + 1], jacobian[at + 2], jacobian[at + 3]
             )
         for at in range(fours, one + 1):
@@ -65,42 +65,87 @@ def add_information(jacobian: Array, weight: Array, into: Array) -> None:
 
 
 @compiled
-def inverted(matrix: Array, inverse: Array) -> float:
-    """Write the inverse of a symmetric matrix, by Cholesky's method at a unit diagonal.
+def factorised(matrix: Array, scale: Array, factor: Array) -> float:
+    """Write the Cholesky factor U, UᵀU = S A S, of a symmetric matrix A, S what makes its diagonal 1.
 
-    Returns ln of its determinant; NaN where it is singular or not finite, and then writes nothing.
+    Returns ln of the determinant of A; NaN where it is singular or not finite. `scale` has the diagonal of S;
+    `factor` is written on and above its diagonal.
     """
-    size = len(matrix)
-    scale, lower, log_det = np.empty(size), np.zeros((size, size)), 0.0
+    size, log_det = len(matrix), 0.0
     for one in range(size):
         if not (0.0 < matrix[one, one] < math.inf):
             return math.nan
         scale[one] = 1.0 / math.sqrt(matrix[one, one])
         log_det += math.log(matrix[one, one])
     for one in range(size):
-        for other in range(one + 1):
-            total = matrix[one, other] * scale[one] * scale[other]
-            for k in range(other):
-                total -= lower[one, k] * lower[other, k]
-            if one != other:
-                lower[one, other] = total / lower[other, other]
-                continue
-            if not total > LEAST_PIVOT:
-                return math.nan
-            lower[one, one] = math.sqrt(total)
-            log_det += math.log(total)
-    # L⁻¹, in place, and its product with itself.
+        for other in range(one, size):
+            factor[one, other] = matrix[one, other] * scale[one] * scale[other]
+    for k in range(size):
+        if not factor[k, k] > LEAST_PIVOT:
+            return math.nan
+        log_det += math.log(factor[k, k])
+        root = math.sqrt(factor[k, k])
+        for other in range(k, size):
+            factor[k, other] /= root
+        for one in range(k + 1, size):
+            share = factor[k, one]
+            for other in range(one, size):
+                factor[one, other] -= share * factor[k, other]
+    return log_det
+
+
+@compiled
+def solved(scale: Array, factor: Array, right: Array, solution: Array) -> None:
+    """Write A⁻¹ times a vector, of a matrix A as `factorised`."""
+    size = len(right)
     for one in range(size):
-        lower[one, one] = 1.0 / lower[one, one]
-        for other in range(one):
-            total = 0.0
-            for k in range(other, one):
-                total -= lower[one, k] * lower[k, other]
-            lower[one, other] = total * lower[one, one]
+        solution[one] = right[one] * scale[one]
     for one in range(size):
+        solution[one] /= factor[one, one]
+        for other in range(one + 1, size):
+            solution[other] -= solution[one] * factor[one, other]
+    for one in range(size - 1, -1, -1):
+        total = solution[one]
+        for other in range(one + 1, size):
+            total -= factor[one, other] * solution[other]
+        solution[one] = total / factor[one, one]
+    for one in range(size):
+        solution[one] *= scale[one]
+
+
+@compiled
+def _row_of_root(scale: Array, factor: Array, one: int, row: Array) -> None:
+    """Write a row of R, A⁻¹ = R Rᵀ, of a matrix A as `factorised`: what stands before the diagonal is 0."""
+    size = len(row)
+    row[one:] = 0.0
+    row[one] = scale[one]
+    for at in range(one, size):
+        row[at] /= factor[at, at]
+        for other in range(at + 1, size):
+            row[other] -= row[at] * factor[at, other]
+
+
+@compiled
+def variance_of(scale: Array, factor: Array, one: int) -> float:
+    """Return an element on the diagonal of A⁻¹, of a matrix A as `factorised`."""
+    row = np.empty(len(factor))
+    _row_of_root(scale, factor, one, row)
+    return dot(row[one:], row[one:])
+
+
+@compiled
+def inverted(matrix: Array, inverse: Array) -> float:
+    """Write the inverse of a symmetric matrix, by Cholesky's method at a unit diagonal.
+
+    Returns ln of its determinant; NaN where it is singular or not finite, and then writes nothing.
+    """
+    size = len(matrix)
+    scale, factor, root = np.empty(size), np.empty((size, size)), np.empty((size, size))
+    log_det = factorised(matrix, scale, factor)
+    if math.isnan(log_det):
+        return math.nan
+    for one in range(size):
+        _row_of_root(scale, factor, one, root[one])
         for other in range(one + 1):
-            total = 0.0
-            for k in range(one, size):
-                total += lower[k, one] * lower[k, other]
-            inverse[one, other] = inverse[other, one] = total * scale[one] * scale[other]
+            inverse[one, other] = inverse[other, one] = dot(root[one, one:], root[other, one:])
     return log_det

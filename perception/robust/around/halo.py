@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.layout import Structure
+from perception.model.layout import Structure, any_of
 from perception.model.window import Camera
 from perception.robust.goodness import halo_sigmas
 from perception.robust.overlap.rivals import weighed
@@ -139,7 +139,7 @@ def _halos(flare: Solution, widths_px: Sequence[float]) -> list[Structure]:
         image[behind] -= of_rows @ hidden @ of_columns.T
         wider[behind] -= of_rows @ (3.0 * squared / (1.0 + squared) * hidden) @ of_columns.T
         columns = np.stack([image.ravel(), (wider - 2.0 * image).ravel()]) / (2.0 * np.pi * width_px**2)
-        halos.append(Structure(columns, precision))
+        halos.append(any_of(columns, precision))
     return halos
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
-from perception.model.layout import SEEN, Structure
+from perception.model.layout import SEEN, Structure, any_of
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR, noise_e2
@@ -258,7 +258,7 @@ def _structure(features: Sequence[Feature], one: Solution, camera: Camera) -> St
     sigma = np.concatenate(
         [np.multiply(feature.PRIOR, max(abs(feature.height_e), _LEAST_HEIGHT_E)) for feature in features]
     )
-    return Structure(columns, np.diag(1.0 / sigma**2))
+    return any_of(columns, np.diag(1.0 / sigma**2))
 
 
 def sharp_px(one: Solution) -> float:

@@ -70,7 +70,7 @@ class Climb(ABC):
 
     @abstractmethod
     def _expectation(self, values: Array) -> tuple[Array, Array]:
-        """Return λ and its derivatives, shape (pixels,) and (unknowns, pixels)."""
+        """Return λ and its derivatives, as `likelihood.pixels.expectation`."""
 
     @property
     def so_far(self) -> float:
@@ -161,9 +161,10 @@ class Climb(ABC):
         fit.expected_e = self._expected.reshape(fit.window.image_e.shape)
 
     def _slopes(self, variance: Array, gradient: Array, fisher: Array, *, of_average: bool) -> None:
+        fit = self._fit
         slopes(
-            self._view, self._values, self._expected, self._jacobian, variance, self._prior,
-            self._fit.known.clip_e, of_average, gradient, fisher,
+            self._view, fit.structure, fit.layout.background + 1, self._values, self._expected,
+            self._jacobian, variance, self._prior, fit.known.clip_e, of_average, gradient, fisher,
         )  # fmt: skip
 
     def _variance(self, expected: Array) -> Array:

@@ -65,18 +65,18 @@ def expectation_of_spheres(
 
     Returns
     -------
-    Shapes (pixels,) and (unknowns, pixels); and what is seen.
+    Shapes (pixels,) and (unknowns, pixels), that without the structure's waves; and what is seen.
     """
     layout, calibration = fit.layout, camera.calibration
     own = layout.of_sources(values[: layout.size])
     radius_rad = np.arcsin(np.minimum(camera.radius_m * np.exp(-log_range_by_size(own, fit)), 1.0))
     axis = direction_camera(own[:, :2], calibration)
     beside = slice(layout.background + 1, layout.size)
-    expected = np.asarray(
-        values[layout.background] + fit.window.view.known_e.ravel() + values[beside] @ fit.structure.columns
-    )
-    jacobian = np.zeros((len(values), len(expected)))
-    jacobian[layout.background], jacobian[beside] = 1.0, fit.structure.columns
+    known_e, structure = fit.window.view.known_e.ravel(), fit.structure
+    expected = np.asarray(values[layout.background] + known_e + structure.light(values[beside]))
+    jacobian = np.zeros((len(values) - len(structure.order), len(expected)))
+    first = layout.background + 1
+    jacobian[layout.background], jacobian[first : first + len(structure.columns)] = 1.0, structure.columns
     hidden_px = camera.hidden_px_at_1_m(own[:, :2])
     hidden_e = None if hidden_px is None else hidden_px * max(float(values[layout.background]), 0.0)
     fit.log_flux_at_1_m = log_flux_at_1_m(camera, axis, hidden_e)

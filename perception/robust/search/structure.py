@@ -27,8 +27,8 @@ _LEAST_EIGENVALUE = 1e-6
 
 def structure_of(correlation: tuple[float, ...], side_px: int, sigma_e: float) -> Structure:
     """Return the structure of one square window, of an autocorrelation and a standard deviation."""
-    columns, precision = _cosines(correlation, side_px)
-    return Structure(columns, precision / sigma_e**2)
+    structure = _structure(correlation, side_px)
+    return structure._replace(precision=structure.precision / sigma_e**2)
 
 
 def autocorrelation(
@@ -76,16 +76,17 @@ def autocorrelation(
 
 
 @lru_cache(maxsize=128)
-def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array]:
-    """Return cosines over a square window, and the precision of their amplitudes at variance 1.
+def _structure(correlation: tuple[float, ...], side_px: int) -> Structure:
+    """Return cosines over a square window, the precision of their amplitudes at variance 1.
 
     As many as structure of this correlation needs; the constant is left out, as the background has it.
     """
     at = np.arange(side_px)
     distance = np.hypot(at[:, None], at[None, :])  # by how many rows and columns two pixels differ
     known = np.interp(distance, np.arange(len(correlation) + 1), [*correlation, 0.0])
-    waves = np.cos(np.pi * np.arange(_MOST_WAVES)[:, None] * (at + 0.5) / side_px)
-    waves /= np.linalg.norm(waves, axis=1, keepdims=True)
+    cosines = np.cos(np.pi * np.arange(2 * _MOST_WAVES)[:, None] * (at + 0.5) / side_px)
+    lengths = np.linalg.norm(cosines[:_MOST_WAVES], axis=1)
+    waves = cosines[:_MOST_WAVES] / lengths[:, None]
     # Cov(nm, n'm') = Σ waves_n(r) waves_m(c) ρ(r - r', c - c') waves_n'(r') waves_m'(c').
     lag = np.abs(at[:, None] - at[None, :])
     by_rows = np.einsum("nr,rsd,ps->npd", waves, known[lag], waves, optimize=True)  # d: columns apart
@@ -96,15 +97,18 @@ def _cosines(correlation: tuple[float, ...], side_px: int) -> tuple[Array, Array
     covariance = covariance[np.ix_(order, order)]
     values, vectors = np.linalg.eigh(covariance)
     values = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
-    basis = np.einsum("nr,mc->nmrc", waves, waves).reshape(number, side_px**2)[order]
-    return basis, np.asarray((vectors / values) @ vectors.T)
+    pairs = np.array([divmod(k, _MOST_WAVES) for k in order])
+    scale = lengths[pairs].prod(axis=1)  # the cosines are not of length 1
+    precision = scale[:, None] * ((vectors / values) @ vectors.T) * scale
+    nothing = np.empty((0, side_px**2))
+    return Structure(cosines, pairs, nothing, precision)
 
 
 def joined(one: Structure | None, other: Structure) -> Structure:
-    """Return two structures on top of each other."""
+    """Return two structures on top of each other, the second without waves."""
     if one is None:
         return other
-    count, more = len(one.columns), len(other.columns)
+    count, more = one.amplitudes, other.amplitudes
     precision = np.zeros((count + more, count + more))
     precision[:count, :count], precision[count:, count:] = one.precision, other.precision
-    return Structure(np.concatenate([one.columns, other.columns]), precision)
+    return one._replace(columns=np.concatenate([one.columns, other.columns]), precision=precision)

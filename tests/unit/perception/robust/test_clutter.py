@@ -216,7 +216,7 @@ def test_cosines_carry_the_variance_of_the_texture() -> None:
     correlation = tuple(np.exp(-(np.arange(40.0) ** 2) / 64.0).tolist())
     structure = structure_of(correlation, 21, 3.0)
     covariance = np.linalg.inv(structure.precision)
-    columns = structure.columns
+    columns = structure.waves
     made = float(np.einsum("ip,ij,jp->p", columns, covariance, columns).mean())
     at = np.arange(21)
     rows, across = (each.ravel() for each in np.meshgrid(at, at, indexing="ij"))
