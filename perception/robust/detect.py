@@ -18,7 +18,11 @@ from perception.robust.clusters import Cluster, brightest, candidates, clusters,
 from perception.robust.flare import MeasuredFlare
 from perception.robust.goodness import is_likely
 from perception.robust.measure import measure
-from perception.robust.overlap.free_fits import log_range_of_calibration
+from perception.robust.overlap.free_fits import (
+    log_range_by_width,
+    log_range_of_calibration,
+    log_width_of_calibration,
+)
 from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.hills import prominent, summit
@@ -42,6 +46,7 @@ _LEAST_DISC_PX2 = 30
 _MOSTLY_SEEN = 0.7  # of the brightness of sources
 _LEAST_OF_PART = 0.25
 _TELLS_SIZE_PX, _MOST_TESTED = 3.0, 8
+_TELLS_WIDTH_SNR, _MOST_POINTS = 20.0, 8
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
 
@@ -109,14 +114,11 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     if in_fog:
         reported = list(_in_fog(reported, frame, calibration))
     else:
-        discs = _telling_discs([found for _, found in reported], prepared)
-        camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
-        range_doubt = log_range_of_calibration(discs, camera)
+        doubts = _log_range_doubts([found for _, found in reported], prepared)
+        range_doubt = max(doubts)
         if range_doubt > 0.0:
-            # One disc may be a mirror image, and says nothing of others.
             reported = [
-                (blob, found.doubted(range_doubt) if len(discs) > 1 or found.alone in discs else found)
-                for blob, found in reported
+                (blob, found.doubted(doubt)) for (blob, found), doubt in zip(reported, doubts, strict=True)
             ]
     bearings = bearing_body([[found.u_px, found.v_px] for _, found in reported], calibration).tolist()
     return Detections(
@@ -142,6 +144,37 @@ def _measured(
             return measured, True
         measured += measure(by_flux[first : first + _AT_ONCE], prepared)
     return measured, False
+
+
+def _log_range_doubts(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> list[float]:
+    """Return how far the range of each flare may be off because the calibration is, as all of them tell."""
+    camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
+    discs = _telling_discs(found, prepared)
+    by_discs = log_range_of_calibration(discs, camera)
+    # One disc may be a mirror image, and says nothing of others.
+    doubts = [by_discs if len(discs) > 1 or one.alone in discs else 0.0 for one in found]
+    off = log_width_of_calibration(_telling_points(found), camera)
+    if off > 0.0:
+        lone = {k: one.lone for k, one in enumerate(found) if one.lone is not None}
+        slopes = dict(zip(lone, log_range_by_width(list(lone.values()), camera).tolist(), strict=True))
+        of_points = float(np.nanmedian(list(slopes.values())))
+        doubts = [max(doubt, off * slopes.get(k, of_points)) for k, doubt in enumerate(doubts)]
+    return doubts
+
+
+def _telling_points(found: Sequence[MeasuredFlare]) -> list[Solution]:
+    """Return the brightest lone flares that are hardly resolved: their width tells of the point spread."""
+    points = [
+        one
+        for flare in found
+        if (one := flare.lone) is not None
+        if one.motion_px is None and one.sources is not None
+        if one.window.features is None and one.window.structure_e == 0.0
+        if float(one.image_radius_px[0]) <= _TELLS_SIZE_PX
+        if float(one.flux_e[0]) > _TELLS_WIDTH_SNR * float(one.flux_noise_e[0])
+    ]
+    points.sort(key=lambda one: -float(one.flux_e[0]))
+    return points[:_MOST_POINTS]
 
 
 def _telling_discs(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> list[Solution]:

@@ -30,6 +30,7 @@ class Fit:
         self.expected_e = np.empty(window.image_e.shape)
         self.deviance = self.log_information = math.inf
         self.converged = False
+        self.sources: Sources | None = None
         self.log_flux_at_1_m, self.image_radius_px = (np.empty(self.layout.sources) for _ in range(2))
 
     @property
@@ -66,6 +67,7 @@ class Fit:
 
         It converges where images are no wider than the window's diagonal.
         """
+        self.sources = sources
         self.deviance, self.log_information = maximise(
             self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
             self.window.to_beat, self.values, self.covariance, self.expected_e.ravel(),

@@ -22,7 +22,7 @@ class MeasuredFlare:
     `log_range_of_model` is the part of the relative σ of its range that its own misfit brings.
     `log_range_doubt` is the part of the relative σ of its range that comes of what sources hide, of each
     other and of the background, and of its being two perhaps; `log_range_doubt_common` that of the background
-    alone. `alone` is its fit, where nothing else is seen beside it and nothing clips.
+    alone. `lone` is its fit, where that is of one flare.
     """
 
     u_px: float
@@ -47,7 +47,14 @@ class MeasuredFlare:
     may_be_more: bool = False
     on_texture: bool = False
     on_edges: bool = False
-    alone: Solution | None = None
+    lone: Solution | None = None
+
+    @property
+    def alone(self) -> Solution | None:
+        """Its fit, where nothing else is seen beside it and nothing clips."""
+        one = self.lone
+        beside = one is not None and (one.window.features is not None or one.window.structure_e > 0.0)
+        return None if self.saturated or beside else one
 
     @property
     def stands_out(self) -> bool:
@@ -107,7 +114,6 @@ def measured_flare(
         # The range that this fit states is loosely tied to the flux, which tells it in fog.
         told_sigma = math.hypot(0.5 * flux_sigma_e / flux_e, hidden / math.sqrt(3.0))
     on_edge = solution.window.features is not None
-    is_alone = solution.count == 1 and not (saturated or on_edge or solution.window.structure_e > 0.0)
     bound_only = saturated and not told_sigma < CLIPPED_RANGE_SIGMA
     return MeasuredFlare(
         u_px=u_px,
@@ -130,5 +136,5 @@ def measured_flare(
         may_be_more=solution.may_be_more,
         on_texture=solution.window.structure_e > 0.0,
         on_edges=solution.window.on_edges or on_edge or left.peak_sigmas > RESIDUAL_SIGMAS,
-        alone=solution if is_alone else None,
+        lone=solution if solution.count == 1 else None,
     )

@@ -67,6 +67,8 @@ class Solution:
     psf_sigma_px, log_information
         Width of the point spread as calibrated; logarithm of the determinant of the information, priors
         included, over that of the structure's prior.
+    sources
+        As laid out last; None where spheres hide parts of each other.
     motion_px, motion_cost
         How far each moves along u and v during the exposure, shape (flares, 2), None where none may; and what
         that costs a priori (`model.window`).
@@ -106,6 +108,7 @@ class Solution:
     deviance: float
     psf_sigma_px: float
     log_information: float
+    sources: Sources | None
     motion_px: Array | None = None
     motion_cost: float = 0.0
     log_range_of_two: float = 0.0
@@ -388,6 +391,7 @@ def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
                 deviance=fit.deviance,
                 psf_sigma_px=fit.known.psf_sigma_px,
                 log_information=log_information,
+                sources=fit.sources,
                 motion_px=motion_px,
                 motion_cost=motion_cost,
             )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.likelihood.free_width import width_step
 from perception.model.window import Camera
 from perception.robust.goodness import MISFIT_PROBABILITY
 from perception.robust.overlap.rivals import to_beat
@@ -17,6 +18,7 @@ _WIDTH_OFF, _FLUX_OFF = 0.1, 0.2  # as calibrations are off; a flux and a size b
 _FARTHEST = 3.0
 _FEWER_AT_RANDOM = 6.0  # other pixels may count; fits of another width than this may have been better
 _CLAIMED = 4.0
+_FEWEST_POINTS = 3
 
 
 def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -92,6 +94,49 @@ def _gained(told: Solution, free: Solution, camera: Camera) -> float:
     apart = abs(float(free.log_photometric_range[0] - free.log_range[0])) / lean
     sigma = math.hypot(float(free.log_range_sigma[0]), 0.5 * float(free.flux_noise_e[0] / free.flux_e[0]))
     return max(gained, (max(apart - _CLAIMED * camera.tie_spread, 0.0) / sigma) ** 2)
+
+
+def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> float:
+    """Return by how much ln of the point spread's width may be off, as all unresolved flares of a frame tell.
+
+    Each lone one takes a step from its fit to one of free width. Glossy mirrors and walls close behind make
+    some wider: the quarter that leans farthest that way does not speak. 0 where noise leans so far once in a
+    million frames, or the calibration's claim covers it.
+    """
+    steps = _width_steps(points, camera)
+    steps = steps[np.isfinite(steps).all(axis=1)]
+    if len(steps) < _FEWEST_POINTS:
+        return 0.0
+    off, precision = steps[:, 0], steps[:, 1] ** -2.0
+    leaning = off / steps[:, 1] * np.sign(np.sum(off * precision))
+    kept = np.argsort(leaning, kind="stable")[: len(steps) - len(steps) // 4]
+    sigma = 1.0 / math.sqrt(float(precision[kept].sum()))
+    mean = float(np.sum(off[kept] * precision[kept])) * sigma**2
+    beyond = (abs(mean) - _CLAIMED * camera.width_spread) / sigma
+    if math.erfc(max(beyond, 0.0) / math.sqrt(2.0)) > MISFIT_PROBABILITY:
+        return 0.0
+    return math.sqrt(mean**2 - sigma**2)
+
+
+def log_range_by_width(lone: Sequence[Solution], camera: Camera) -> NDArray[np.float64]:
+    """Return by how much ln of each range changes with ln of the width taken as known, shape (flares,)."""
+    return np.abs(_width_steps(lone, camera)[:, 2])
+
+
+def _width_steps(lone: Sequence[Solution], camera: Camera) -> NDArray[np.float64]:
+    """Return `width_step` of fits of a lone flare each, shape (flares, 3); NaN where there is none."""
+    camera = _with_spread(camera, "psf_sigma_px", _WIDTH_OFF)
+    steps = np.full((len(lone), 3), math.nan)
+    for step, one in zip(steps, lone, strict=True):
+        if one.sources is None or one.motion_px is not None:
+            continue
+        known, beside = camera.known(one.window.clip_e), one.window.beside
+        layout = known.layout(1, beside.amplitudes)
+        values, precision = np.zeros(layout.size), layout.prior(beside, known.motion_px).copy()
+        values[:3], values[layout.background] = one.starts[0], one.background_e
+        precision[layout.width, layout.width] = 0.0
+        step[:] = width_step(one.window.view, one.sources, beside, known, precision, values)
+    return steps
 
 
 def chance_of_least(total: float, least: int, count: int) -> float:
