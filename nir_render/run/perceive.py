@@ -269,6 +269,7 @@ class _Notes:
     found: Counter[str] = field(default_factory=Counter)  # detections of each camera
     truncated: int = 0
     doubts: list[float] = field(default_factory=list)  # `range_doubt` of the frames that have one
+    widths_off: list[float] = field(default_factory=list)  # and `psf_width_off`
 
     def take(self, camera: str, found: Detections) -> Detections:
         """Note what is said of a camera's frame, and return its detections."""
@@ -276,6 +277,7 @@ class _Notes:
         self.found[camera] += len(found)
         self.truncated += found.truncated
         self.doubts += [found.range_doubt] if found.range_doubt else []
+        self.widths_off += [found.psf_width_off] if found.psf_width_off else []
         return found
 
     def warnings(self, name: str, total: int) -> Iterator[str]:
@@ -295,9 +297,14 @@ class _Notes:
             yield f"{name} saw more in {frames} than it measures: the brightest are reported and told apart"
         if self.doubts:
             frames = "one frame" if len(self.doubts) == 1 else f"{len(self.doubts)} frames"
+            why = "near sources of which size and flux, as calibrated, contradict"
+            if 2 * len(self.widths_off) > len(self.doubts):
+                off = median(self.widths_off)
+                wider = f"{100.0 * abs(off):.2g} % {'wider' if off > 0.0 else 'narrower'}"
+                why = f"small flares {wider} than the calibration's point spread (out of focus?)"
             yield (
-                f"{name} saw near sources in {frames} of which size and flux, as calibrated, contradict: "
-                f"ranges may be off by {100.0 * median(self.doubts):.2g} %, which their sigmas cover"
+                f"{name} saw {why}, in {frames}: ranges may be off by {100.0 * median(self.doubts):.2g} %, "
+                "which their sigmas cover"
             )
 
     @staticmethod

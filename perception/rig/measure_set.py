@@ -124,7 +124,13 @@ def measure_set(
 def _kept(found: Sequence[Detection], now: Sequence[Detection]) -> Detections:
     """Return a frame's detections, with what was said of them as a whole."""
     if isinstance(found, Detections):
-        return Detections(now, reason=found.reason, truncated=found.truncated, range_doubt=found.range_doubt)
+        return Detections(
+            now,
+            reason=found.reason,
+            truncated=found.truncated,
+            range_doubt=found.range_doubt,
+            psf_width_off=found.psf_width_off,
+        )
     return Detections(now)
 
 

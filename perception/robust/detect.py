@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,8 @@ from perception.robust.clusters import Cluster, brightest, candidates, clusters,
 from perception.robust.flare import MeasuredFlare
 from perception.robust.goodness import is_likely
 from perception.robust.measure import measure
-from perception.robust.overlap.free_fits import (
-    log_range_by_width,
-    log_range_of_calibration,
-    log_width_of_calibration,
-)
+from perception.robust.overlap.free_fits import log_range_of_calibration
+from perception.robust.overlap.free_width import log_range_slopes, log_width_of_calibration, tells_width
 from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.hills import prominent, summit
@@ -46,7 +44,7 @@ _LEAST_DISC_PX2 = 30
 _MOSTLY_SEEN = 0.7  # of the brightness of sources
 _LEAST_OF_PART = 0.25
 _TELLS_SIZE_PX, _MOST_TESTED = 3.0, 8
-_TELLS_WIDTH_SNR, _MOST_POINTS = 20.0, 8
+_TELLS_WIDTH_SNR = 20.0
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
 
@@ -110,13 +108,13 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     reported = [(blob, found) for blob, found in measured if found.stands_out]
     if not reported:
         return Detections(reason=reason_of_none(prepared, len(blobs), late=late), truncated=truncated)
-    range_doubt = 0.0
+    range_doubt = psf_width_off = 0.0
     if in_fog:
         reported = list(_in_fog(reported, frame, calibration))
     else:
-        doubts = _log_range_doubts([found for _, found in reported], prepared)
-        range_doubt = max(doubts)
-        if range_doubt > 0.0:
+        doubts, log_width = _log_range_doubts([found for _, found in reported], prepared)
+        if any(doubts):
+            range_doubt, psf_width_off = median(filter(None, doubts)), math.expm1(log_width)
             reported = [
                 (blob, found.doubted(doubt)) for (blob, found), doubt in zip(reported, doubts, strict=True)
             ]
@@ -128,6 +126,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         ),
         truncated=truncated,
         range_doubt=range_doubt,
+        psf_width_off=psf_width_off,
     )
 
 
@@ -146,35 +145,36 @@ def _measured(
     return measured, False
 
 
-def _log_range_doubts(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> list[float]:
-    """Return how far the range of each flare may be off because the calibration is, as all of them tell."""
+def _log_range_doubts(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> tuple[list[float], float]:
+    """Return how far the range of each flare may be off because the calibration is, as all of them tell.
+
+    And by how much ln of the point spread's width is.
+    """
     camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
     discs = _telling_discs(found, prepared)
     by_discs = log_range_of_calibration(discs, camera)
     # One disc may be a mirror image, and says nothing of others.
     doubts = [by_discs if len(discs) > 1 or one.alone in discs else 0.0 for one in found]
-    off = log_width_of_calibration(_telling_points(found), camera)
-    if off > 0.0:
+    log_width = log_width_of_calibration(_telling_points(found), camera)
+    if log_width != 0.0:
         lone = {k: one.lone for k, one in enumerate(found) if one.lone is not None}
-        slopes = dict(zip(lone, log_range_by_width(list(lone.values()), camera).tolist(), strict=True))
-        of_points = float(np.nanmedian(list(slopes.values())))
-        doubts = [max(doubt, off * slopes.get(k, of_points)) for k, doubt in enumerate(doubts)]
-    return doubts
+        slopes = abs(log_range_slopes(list(lone.values()), camera))
+        slope = dict(zip(lone, np.where(np.isnan(slopes), np.nanmedian(slopes), slopes), strict=True))
+        by_width = [abs(log_width) * float(slope.get(k, np.nanmedian(slopes))) for k in range(len(found))]
+        doubts = [max(pair) for pair in zip(doubts, by_width, strict=True)]
+    return doubts, log_width
 
 
 def _telling_points(found: Sequence[MeasuredFlare]) -> list[Solution]:
-    """Return the brightest lone flares that are hardly resolved: their width tells of the point spread."""
-    points = [
+    """Return lone flares that are hardly resolved: their width tells of the point spread."""
+    return [
         one
         for flare in found
-        if (one := flare.lone) is not None
-        if one.motion_px is None and one.sources is not None
+        if (one := flare.lone) is not None and tells_width(one)
         if one.window.features is None and one.window.structure_e == 0.0
         if float(one.image_radius_px[0]) <= _TELLS_SIZE_PX
         if float(one.flux_e[0]) > _TELLS_WIDTH_SNR * float(one.flux_noise_e[0])
     ]
-    points.sort(key=lambda one: -float(one.flux_e[0]))
-    return points[:_MOST_POINTS]
 
 
 def _telling_discs(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> list[Solution]:

@@ -59,9 +59,12 @@ class Detections(list[Detection]):
         Whether more was seen than was measured: time was up, or there were too many, in the frame or in one
         place. The brightest are kept.
     range_doubt
-        How far, relatively, its ranges may be off because sizes and fluxes of near sources contradict the
-        calibration; 0 where none shows it, and where fog is not excluded. Their σ cover it, of a single
-        such source its own; upper bounds are so much farther.
+        How far, relatively, its ranges may be off, in the median, because sizes and fluxes of near sources,
+        or the width of far ones, contradict the calibration; 0 where none shows it, and where fog is not
+        excluded. Their σ cover it, of a single such source its own; upper bounds are so much farther.
+    psf_width_off
+        By what share the point spread is wider than the calibration says, or narrower if below 0; 0 where
+        nothing shows it.
     """
 
     def __init__(
@@ -71,9 +74,11 @@ class Detections(list[Detection]):
         reason: str = "",
         truncated: bool = False,
         range_doubt: float = 0.0,
+        psf_width_off: float = 0.0,
     ) -> None:
         super().__init__(found)
-        self.reason, self.truncated, self.range_doubt = reason, truncated, range_doubt
+        self.reason, self.truncated = reason, truncated
+        self.range_doubt, self.psf_width_off = range_doubt, psf_width_off
 
 
 Ghost = Literal["no", "possible", "yes"]

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.likelihood.free_width import width_step
 from perception.model.window import Camera
 from perception.robust.goodness import MISFIT_PROBABILITY
 from perception.robust.overlap.rivals import to_beat
@@ -17,8 +16,7 @@ _WIDTH_FREE, _FLUX_FREE = 0.3, 8.0  # any at all
 _WIDTH_OFF, _FLUX_OFF = 0.1, 0.2  # as calibrations are off; a flux and a size by any of these two
 _FARTHEST = 3.0
 _FEWER_AT_RANDOM = 6.0  # other pixels may count; fits of another width than this may have been better
-_CLAIMED = 4.0
-_FEWEST_POINTS = 3
+MOST_CLAIMED = 4.0  # of σ: what is claimed to be uncertain contradicts nothing up to here
 
 
 def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
@@ -26,12 +24,12 @@ def of_free_width(solutions: Sequence[Solution], camera: Camera) -> list[Solutio
 
     However unlikely: by that it is decided about others.
     """
-    return _again(solutions, _with_spread(camera, "psf_sigma_px", _WIDTH_FREE))
+    return _again(solutions, with_spread(camera, "psf_sigma_px", _WIDTH_FREE))
 
 
 def of_free_size(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     """Fit lone flares whose size may be any, whatever their flux says; however unlikely."""
-    return _again(solutions, _with_spread(camera, "range_constant_dn_m2_per_s", _FLUX_FREE))
+    return _again(solutions, with_spread(camera, "range_constant_dn_m2_per_s", _FLUX_FREE))
 
 
 def with_model_error(solution: Solution, camera: Camera) -> Solution:
@@ -83,7 +81,7 @@ def _gained(told: Solution, free: Solution, camera: Camera) -> float:
     """Return by how much better a lone flare is explained, as χ² of two degrees of freedom.
 
     What is claimed to be uncertain of flux and size is the same for all flares, and no chance of each: so far
-    as it explains that they tell two ranges, up to `_CLAIMED` of its σ, that counts for nothing.
+    as it explains that they tell two ranges, up to `MOST_CLAIMED` of its σ, that counts for nothing.
     """
     before, after = told.left_over, free.left_over
     gained = (before.noise_chi2 - before.pixels) - (after.noise_chi2 - after.pixels)
@@ -93,50 +91,7 @@ def _gained(told: Solution, free: Solution, camera: Camera) -> float:
     lean = by_flux**2 / (by_flux**2 + camera.radius_spread**2)  # of flux, as `Camera.log_range` has it
     apart = abs(float(free.log_photometric_range[0] - free.log_range[0])) / lean
     sigma = math.hypot(float(free.log_range_sigma[0]), 0.5 * float(free.flux_noise_e[0] / free.flux_e[0]))
-    return max(gained, (max(apart - _CLAIMED * camera.tie_spread, 0.0) / sigma) ** 2)
-
-
-def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> float:
-    """Return by how much ln of the point spread's width may be off, as all unresolved flares of a frame tell.
-
-    Each lone one takes a step from its fit to one of free width. Glossy mirrors and walls close behind make
-    some wider: the quarter that leans farthest that way does not speak. 0 where noise leans so far once in a
-    million frames, or the calibration's claim covers it.
-    """
-    steps = _width_steps(points, camera)
-    steps = steps[np.isfinite(steps).all(axis=1)]
-    if len(steps) < _FEWEST_POINTS:
-        return 0.0
-    off, precision = steps[:, 0], steps[:, 1] ** -2.0
-    leaning = off / steps[:, 1] * np.sign(np.sum(off * precision))
-    kept = np.argsort(leaning, kind="stable")[: len(steps) - len(steps) // 4]
-    sigma = 1.0 / math.sqrt(float(precision[kept].sum()))
-    mean = float(np.sum(off[kept] * precision[kept])) * sigma**2
-    beyond = (abs(mean) - _CLAIMED * camera.width_spread) / sigma
-    if math.erfc(max(beyond, 0.0) / math.sqrt(2.0)) > MISFIT_PROBABILITY:
-        return 0.0
-    return math.sqrt(mean**2 - sigma**2)
-
-
-def log_range_by_width(lone: Sequence[Solution], camera: Camera) -> NDArray[np.float64]:
-    """Return by how much ln of each range changes with ln of the width taken as known, shape (flares,)."""
-    return np.abs(_width_steps(lone, camera)[:, 2])
-
-
-def _width_steps(lone: Sequence[Solution], camera: Camera) -> NDArray[np.float64]:
-    """Return `width_step` of fits of a lone flare each, shape (flares, 3); NaN where there is none."""
-    camera = _with_spread(camera, "psf_sigma_px", _WIDTH_OFF)
-    steps = np.full((len(lone), 3), math.nan)
-    for step, one in zip(steps, lone, strict=True):
-        if one.sources is None or one.motion_px is not None:
-            continue
-        known, beside = camera.known(one.window.clip_e), one.window.beside
-        layout = known.layout(1, beside.amplitudes)
-        values, precision = np.zeros(layout.size), layout.prior(beside, known.motion_px).copy()
-        values[:3], values[layout.background] = one.starts[0], one.background_e
-        precision[layout.width, layout.width] = 0.0
-        step[:] = width_step(one.window.view, one.sources, beside, known, precision, values)
-    return steps
+    return max(gained, (max(apart - MOST_CLAIMED * camera.tie_spread, 0.0) / sigma) ** 2)
 
 
 def chance_of_least(total: float, least: int, count: int) -> float:
@@ -167,15 +122,15 @@ def _moved(told: Solution, free: Solution, camera: Camera) -> NDArray[np.float64
 
 def _of_any(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     """Fit flares as calibrations are off: by 10 % of width and range by flux, or as light insists."""
-    of_width = _with_spread(camera, "psf_sigma_px", _WIDTH_OFF)
-    return _again(solutions, _with_spread(of_width, "range_constant_dn_m2_per_s", _FLUX_OFF))
+    of_width = with_spread(camera, "psf_sigma_px", _WIDTH_OFF)
+    return _again(solutions, with_spread(of_width, "range_constant_dn_m2_per_s", _FLUX_OFF))
 
 
 def _again(solutions: Sequence[Solution], camera: Camera) -> list[Solution | None]:
     return solve([to_beat(one, math.inf).again() for one in solutions], camera)
 
 
-def _with_spread(camera: Camera, name: str, spread: float) -> Camera:
+def with_spread(camera: Camera, name: str, spread: float) -> Camera:
     """Return a camera one of whose constants is known to such a relative spread at best."""
     calibration = camera.calibration
     claimed = calibration.sigma.get(name, 0.0)

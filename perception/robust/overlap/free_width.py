@@ -1,0 +1,79 @@
+"""Whether the point spread is as wide as calibrated: what all small flares of a frame tell together."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.likelihood.free_width import width_step
+from perception.model.window import Camera
+from perception.robust.goodness import MISFIT_PROBABILITY
+from perception.robust.overlap.free_fits import MOST_CLAIMED, with_spread
+from perception.robust.solve import Solution
+
+Array = NDArray[np.float64]
+
+_WIDTH_UNIT = 0.1
+_FLUX_OFF = 0.05
+_FEWEST, _MOST = 3, 8
+
+
+def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> float:
+    """Return by how much ln of the point spread's width is off, by small flares alone in their windows.
+
+    Each takes a step from its fit to one of free width. A flux that is not quite what its size says, as
+    mirror images have it, makes them seem wider: so much of it is open. Glossy mirrors and walls close behind
+    make some wider, too: the quarter that leans farthest one way does not speak. 0 where noise leans so far
+    once in a million frames, or the calibration's claim covers it.
+    """
+    points = sorted(points, key=lambda one: _sigma(one, camera))[:_MOST]
+    steps = _width_steps(points, with_spread(camera, "range_constant_dn_m2_per_s", _FLUX_OFF))
+    steps = steps[np.isfinite(steps).all(axis=1)]
+    if len(steps) < _FEWEST:
+        return 0.0
+    off, precision = steps[:, 0], steps[:, 1] ** -2.0
+    leaning = off / steps[:, 1] * np.sign(np.sum(off * precision))
+    kept = np.argsort(leaning, kind="stable")[: len(steps) - len(steps) // 4]
+    sigma = 1.0 / math.sqrt(float(precision[kept].sum()))
+    mean = float(np.sum(off[kept] * precision[kept])) * sigma**2
+    beyond = (abs(mean) - MOST_CLAIMED * camera.width_spread) / sigma
+    if math.erfc(max(beyond, 0.0) / math.sqrt(2.0)) > MISFIT_PROBABILITY:
+        return 0.0
+    return math.copysign(math.sqrt(mean**2 - sigma**2), mean)
+
+
+def log_range_slopes(lone: Sequence[Solution], camera: Camera) -> Array:
+    """Return by how much ln of each range changes with ln of the width taken as known, shape (flares,).
+
+    NaN of those that move, or hide parts of each other.
+    """
+    return np.asarray(_width_steps(lone, camera)[:, 2])
+
+
+def tells_width(one: Solution) -> bool:
+    """Tell whether a fit says what another width would change: that of one flare at rest, laid out whole."""
+    return one.count == 1 and one.motion_px is None and one.sources is not None
+
+
+def _width_steps(lone: Sequence[Solution], camera: Camera) -> Array:
+    """Return `width_step` of fits of a lone flare each, shape (flares, 3); NaN where there is none."""
+    camera = with_spread(camera, "psf_sigma_px", _WIDTH_UNIT)
+    steps = np.full((len(lone), 3), math.nan)
+    for step, one in zip(steps, lone, strict=True):
+        if one.sources is None or not tells_width(one):
+            continue
+        known, beside = camera.known(one.window.clip_e), one.window.beside
+        layout = known.layout(1, beside.amplitudes)
+        values, precision = np.zeros(layout.size), layout.prior(beside, known.motion_px).copy()
+        values[:3], values[layout.background] = one.starts[0], one.background_e
+        precision[layout.width, layout.width] = 0.0
+        step[:] = width_step(one.window.view, one.sources, beside, known, precision, values)
+    return steps
+
+
+def _sigma(point: Solution, camera: Camera) -> float:
+    """Return how well a small flare tells ln of the width: about, by its light and as its size is known."""
+    of_spread_px2 = camera.calibration.psf_sigma_px**2 + 1.0 / 12.0
+    of_size = 0.25 * float(point.image_radius_px[0]) ** 2 / of_spread_px2
+    return math.hypot(float(point.flux_noise_e[0] / point.flux_e[0]), 0.5 * _FLUX_OFF * of_size)
