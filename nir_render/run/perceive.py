@@ -268,16 +268,14 @@ class _Notes:
     reasons: dict[str, Counter[str]] = field(default_factory=dict)  # by camera
     found: Counter[str] = field(default_factory=Counter)  # detections of each camera
     truncated: int = 0
-    doubts: list[float] = field(default_factory=list)  # `range_doubt` of the frames that have one
-    widths_off: list[float] = field(default_factory=list)  # and `psf_width_off`
+    doubts: list[tuple[float, float]] = field(default_factory=list)  # `range_doubt`, `psf_width_off`
 
     def take(self, camera: str, found: Detections) -> Detections:
         """Note what is said of a camera's frame, and return its detections."""
         self.reasons.setdefault(camera, Counter()).update([found.reason] if found.reason else [])
         self.found[camera] += len(found)
         self.truncated += found.truncated
-        self.doubts += [found.range_doubt] if found.range_doubt else []
-        self.widths_off += [found.psf_width_off] if found.psf_width_off else []
+        self.doubts += [(found.range_doubt, found.psf_width_off)] if found.range_doubt else []
         return found
 
     def warnings(self, name: str, total: int) -> Iterator[str]:
@@ -295,17 +293,28 @@ class _Notes:
         if self.truncated:
             frames = "one frame" if self.truncated == 1 else f"{self.truncated} frames"
             yield f"{name} saw more in {frames} than it measures: the brightest are reported and told apart"
-        if self.doubts:
-            frames = "one frame" if len(self.doubts) == 1 else f"{len(self.doubts)} frames"
-            why = "near sources of which size and flux, as calibrated, contradict"
-            if 2 * len(self.widths_off) > len(self.doubts):
-                off = median(self.widths_off)
-                wider = f"{100.0 * abs(off):.2g} % {'wider' if off > 0.0 else 'narrower'}"
-                why = f"small flares {wider} than the calibration's point spread (out of focus?)"
-            yield (
-                f"{name} saw {why}, in {frames}: ranges may be off by {100.0 * median(self.doubts):.2g} %, "
-                "which their sigmas cover"
+        if by_discs := [doubt for doubt, width_off in self.doubts if not width_off]:
+            yield self._doubted(
+                name, by_discs, "near sources of which size and flux, as calibrated, contradict"
             )
+        if of_width := [width_off for _, width_off in self.doubts if width_off]:
+            off = median(of_width)
+            how, why = (
+                ("wider", "out of focus, or larger sources") if off > 0.0 else ("narrower", "smaller sources")
+            )
+            yield self._doubted(
+                name,
+                [doubt for doubt, width_off in self.doubts if width_off],
+                f"small flares {100.0 * abs(off):.2g} % {how} than the calibration's point spread ({why}?)",
+            )
+
+    @staticmethod
+    def _doubted(name: str, doubts: Sequence[float], what: str) -> str:
+        frames = "one frame" if len(doubts) == 1 else f"{len(doubts)} frames"
+        return (
+            f"{name} saw {what}, in {frames}: ranges may be off by {100.0 * median(doubts):.2g} %, "
+            "which their sigmas cover"
+        )
 
     @staticmethod
     def _nothing(name: str, whose: str, reasons: Counter[str]) -> Iterator[str]:

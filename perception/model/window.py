@@ -88,6 +88,11 @@ class Camera:
         return math.hypot(0.5 * self.flux_spread, self.radius_spread)
 
     @property
+    def lean(self) -> float:
+        """By how much of the slack between them a range follows size and not flux: σ_φ²/σ_t, σ_φ = σ_K/2K."""
+        return (0.5 * self.flux_spread) ** 2 / self.tie_spread if self.tie_spread > 0.0 else 0.0
+
+    @property
     def width_spread(self) -> float:
         """σ_w: relative standard deviation of the point spread's width."""
         return _share(self.calibration.sigma.get("psf_sigma_px", 0.0), self.calibration.psf_sigma_px)
@@ -134,7 +139,7 @@ class Camera:
         if slack is None:
             common = np.full(np.shape(photometric), by_flux)
             return photometric, np.sqrt(covariance[..., 0, 0] + by_flux**2), common
-        lean = by_flux**2 / self.tie_spread
+        lean = self.lean
         left_open = (by_flux * self.radius_spread / self.tie_spread) ** 2
         variance = (
             covariance[..., 0, 0] - 2.0 * lean * covariance[..., 0, 1] + lean**2 * covariance[..., 1, 1]

@@ -59,12 +59,13 @@ class Detections(list[Detection]):
         Whether more was seen than was measured: time was up, or there were too many, in the frame or in one
         place. The brightest are kept.
     range_doubt
-        How far, relatively, its ranges may be off, in the median, because sizes and fluxes of near sources,
-        or the width of far ones, contradict the calibration; 0 where none shows it, and where fog is not
-        excluded. Their σ cover it, of a single such source its own; upper bounds are so much farther.
+        How far, relatively, its ranges may be off, in the median of those that are doubted, because sizes
+        and fluxes of near sources, or the width of small ones, contradict the calibration; 0 where none shows
+        it, and where fog is not excluded. Their σ cover it, of a single such source its own; upper bounds
+        are so much farther.
     psf_width_off
-        By what share the point spread is wider than the calibration says, or narrower if below 0; 0 where
-        nothing shows it.
+        By about what share small flares are wider than the calibration's point spread makes them, or
+        narrower if below 0; 0 where nothing shows it.
     """
 
     def __init__(

@@ -143,7 +143,7 @@ def contradictions(flares: Sequence[KnownFlare], calibration: Calibration) -> It
             continue
         sigma_m = math.hypot(hit.range_sigma_m, flare.range_m.sigma)
         is_off = abs(hit.range_m - flare.range_m.value) > _MOST_SIGMAS * sigma_m
-        if is_off or found.range_doubt > _MOST_DOUBT:
+        if is_off or (found.range_doubt > _MOST_DOUBT and not found.psf_width_off):
             yield (
                 f"{wanted}, and its flare at ({hit.u_px:.0f}, {hit.v_px:.0f}) px comes out at "
                 f"{hit.range_m:.3f} ± {hit.range_sigma_m:.3f} m: its light, its size and what other frames "

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 @compiled
 def width_step(
     view: View, source: Sources, structure: Structure, known: Known, precision: Array, values: Array
-) -> tuple[float, float, float]:  # fmt: skip
+) -> tuple[float, float, float, float]:  # fmt: skip
     """Return by how much the width of the point spread is off, by one flare alone in its window.
 
     One step of Fisher scoring, of all unknowns at once: exact for what is small beside the width.
@@ -26,12 +26,12 @@ def width_step(
     view, source, structure, known
         The window, and what is in it; the spread of the width, above 0, is the unit of that unknown.
     precision, values
-        Prior of the unknowns, 0 of the width; and where the fit stands (`layout.Layout`).
+        Prior of the unknowns, 0 of the width; and where to step from, near the fit (`layout.Layout`).
 
     Returns
     -------
-    The change of ln width, its standard deviation, and by how much ln range changes with ln width where the
-    width is taken as known. NaN where the window does not tell.
+    The change of ln width, its standard deviation, and by how much ln range by flux, and the slack if there
+    is one, change with ln width where the width is taken as known. NaN where the window does not tell.
     """
     size, pixels, unit = len(values), view.image_e.size, known.width_spread
     width = 3 + (known.tie_spread > 0.0)
@@ -44,6 +44,7 @@ def width_step(
         gradient, information,
     )  # fmt: skip
     if math.isnan(inverted(information, covariance)):
-        return math.nan, math.nan, math.nan
+        return math.nan, math.nan, math.nan, math.nan
     step, own = dot(covariance[width], gradient), covariance[width, width]
-    return unit * step, unit * math.sqrt(own), covariance[2, width] / (unit * own)
+    of_slack = covariance[3, width] / (unit * own) if known.tie_spread > 0.0 else 0.0
+    return unit * step, unit * math.sqrt(own), covariance[2, width] / (unit * own), of_slack

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _WIDTH_UNIT = 0.1
 _FLUX_OFF = 0.05
 _FEWEST, _MOST = 3, 8
+_MOST_TURN_CHI2 = 9.2  # noise has more once in a hundred frames
 
 
 def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> float:
@@ -25,16 +26,20 @@ def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> floa
     Each takes a step from its fit to one of free width. A flux that is not quite what its size says, as
     mirror images have it, makes them seem wider: so much of it is open. Glossy mirrors and walls close behind
     make some wider, too: the quarter that leans farthest one way does not speak. 0 where noise leans so far
-    once in a million frames, or the calibration's claim covers it.
+    once in a million frames, the calibration's claim covers it, or all are drawn out along one line: the
+    camera turns.
     """
     points = sorted(points, key=lambda one: _sigma(one, camera))[:_MOST]
     steps = _width_steps(points, with_spread(camera, "range_constant_dn_m2_per_s", _FLUX_OFF))
-    steps = steps[np.isfinite(steps).all(axis=1)]
+    tell = np.flatnonzero(np.isfinite(steps).all(axis=1))
+    points, steps = [points[k] for k in tell], steps[tell]
     if len(steps) < _FEWEST:
         return 0.0
     off, precision = steps[:, 0], steps[:, 1] ** -2.0
     leaning = off / steps[:, 1] * np.sign(np.sum(off * precision))
     kept = np.argsort(leaning, kind="stable")[: len(steps) - len(steps) // 4]
+    if _turn_chi2([points[k] for k in kept]) > _MOST_TURN_CHI2:
+        return 0.0
     sigma = 1.0 / math.sqrt(float(precision[kept].sum()))
     mean = float(np.sum(off[kept] * precision[kept])) * sigma**2
     beyond = (abs(mean) - MOST_CLAIMED * camera.width_spread) / sigma
@@ -43,12 +48,30 @@ def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> floa
     return math.copysign(math.sqrt(mean**2 - sigma**2), mean)
 
 
+def _turn_chi2(points: Sequence[Solution]) -> float:
+    """Return by how much flares are drawn out along one line in common, as χ² of two degrees of freedom.
+
+    A motion (a, b) shows as (a² - b², 2ab), of one σ in both.
+    """
+    total_u, total_v, precision = 0.0, 0.0, 0.0
+    for one in points:
+        chi2, u_px, v_px, _ = one.drawn_out
+        length2 = u_px**2 + v_px**2
+        if length2 > 0.0:
+            of_one = chi2 / length2**2
+            total_u += of_one * (u_px**2 - v_px**2)
+            total_v += of_one * 2.0 * u_px * v_px
+            precision += of_one
+    return (total_u**2 + total_v**2) / precision if precision > 0.0 else 0.0
+
+
 def log_range_slopes(lone: Sequence[Solution], camera: Camera) -> Array:
     """Return by how much ln of each range changes with ln of the width taken as known, shape (flares,).
 
     NaN of those that move, or hide parts of each other.
     """
-    return np.asarray(_width_steps(lone, camera)[:, 2])
+    _, _, by_flux, slack = _width_steps(lone, camera).T
+    return np.asarray(by_flux - camera.lean * slack)
 
 
 def tells_width(one: Solution) -> bool:
@@ -57,9 +80,9 @@ def tells_width(one: Solution) -> bool:
 
 
 def _width_steps(lone: Sequence[Solution], camera: Camera) -> Array:
-    """Return `width_step` of fits of a lone flare each, shape (flares, 3); NaN where there is none."""
+    """Return `width_step` of fits of a lone flare each, shape (flares, 4); NaN where there is none."""
     camera = with_spread(camera, "psf_sigma_px", _WIDTH_UNIT)
-    steps = np.full((len(lone), 3), math.nan)
+    steps = np.full((len(lone), 4), math.nan)
     for step, one in zip(steps, lone, strict=True):
         if one.sources is None or not tells_width(one):
             continue
