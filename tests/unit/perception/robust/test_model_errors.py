@@ -193,7 +193,9 @@ def test_points_tell_together_that_the_point_spread_is_another(width: float) -> 
         assert 0.002 < told.range_doubt < 0.05
         for u, v, range_m in places:
             (near,) = (one for one in told if math.hypot(one.u_px - u, one.v_px - v) < 2.0)
-            pulls.append((near.range_m - range_m) / near.range_sigma_m)
+            if not math.isnan(near.range_sigma_m):  # of a clipped one not even 12 % may be known then
+                pulls.append((near.range_m - range_m) / near.range_sigma_m)
+    assert len(pulls) > 40
     assert np.abs(pulls).max() < 4.5
     assert np.sqrt(np.mean(np.square(pulls))) < 1.5
 
