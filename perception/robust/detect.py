@@ -159,9 +159,9 @@ def _log_range_doubts(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -
     if log_width != 0.0:
         lone = {k: one.lone for k, one in enumerate(found) if one.lone is not None}
         slopes = abs(log_range_slopes(list(lone.values()), camera))
-        slope = dict(zip(lone, np.where(np.isnan(slopes), np.nanmedian(slopes), slopes), strict=True))
-        by_width = [abs(log_width) * float(slope.get(k, np.nanmedian(slopes))) for k in range(len(found))]
-        doubts = [max(pair) for pair in zip(doubts, by_width, strict=True)]
+        usual = float(np.nanmedian(slopes))
+        known = dict(zip(lone, np.where(np.isnan(slopes), usual, slopes).tolist(), strict=True))
+        doubts = [max(doubt, abs(log_width) * known.get(k, usual)) for k, doubt in enumerate(doubts)]
     return doubts, log_width
 
 
@@ -171,7 +171,7 @@ def _telling_points(found: Sequence[MeasuredFlare]) -> list[Solution]:
         one
         for flare in found
         if (one := flare.lone) is not None and tells_width(one)
-        if one.window.features is None and one.window.structure_e == 0.0
+        if one.window.is_even
         if float(one.image_radius_px[0]) <= _TELLS_SIZE_PX
         if float(one.flux_e[0]) > _TELLS_WIDTH_SNR * float(one.flux_noise_e[0])
     ]

@@ -53,8 +53,7 @@ class MeasuredFlare:
     def alone(self) -> Solution | None:
         """Its fit, where nothing else is seen beside it and nothing clips."""
         one = self.lone
-        beside = one is not None and (one.window.features is not None or one.window.structure_e > 0.0)
-        return None if self.saturated or beside else one
+        return one if one is not None and one.window.is_even and not self.saturated else None
 
     @property
     def stands_out(self) -> bool:

@@ -76,6 +76,11 @@ class Window:
         return even(self.image_e.size) if whole is None else whole
 
     @property
+    def is_even(self) -> bool:
+        """Whether the background has neither structure nor features; halos of flares it may have."""
+        return self.features is None and self.structure_e == 0.0
+
+    @property
     def diagonal_px(self) -> float:
         """How far apart its corners are: of a disc in it whose radius is larger no limb is seen."""
         return math.hypot(*self.image_e.shape)

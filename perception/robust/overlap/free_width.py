@@ -38,12 +38,12 @@ def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> floa
     off, precision = steps[:, 0], steps[:, 1] ** -2.0
     leaning = off / steps[:, 1] * np.sign(np.sum(off * precision))
     kept = np.argsort(leaning, kind="stable")[: len(steps) - len(steps) // 4]
-    if _turn_chi2([points[k] for k in kept]) > _MOST_TURN_CHI2:
-        return 0.0
     sigma = 1.0 / math.sqrt(float(precision[kept].sum()))
     mean = float(np.sum(off[kept] * precision[kept])) * sigma**2
     beyond = (abs(mean) - MOST_CLAIMED * camera.width_spread) / sigma
     if math.erfc(max(beyond, 0.0) / math.sqrt(2.0)) > MISFIT_PROBABILITY:
+        return 0.0
+    if _turn_chi2([points[k] for k in kept]) > _MOST_TURN_CHI2:
         return 0.0
     return math.copysign(math.sqrt(mean**2 - sigma**2), mean)
 

@@ -77,7 +77,7 @@ def autocorrelation(
 
 @lru_cache(maxsize=128)
 def _structure(correlation: tuple[float, ...], side_px: int) -> Structure:
-    """Return cosines over a square window, the precision of their amplitudes at variance 1.
+    """Return the structure of a square window at variance 1: cosines, and their amplitudes' precision.
 
     As many as structure of this correlation needs; the constant is left out, as the background has it.
     """
