@@ -57,6 +57,22 @@ def pixel_turn(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.flo
     return _turn(direction_camera(around_px.reshape(-1, 2), calibration))
 
 
+def turn_slopes_px(points_px: ArrayLike, calibration: Calibration) -> NDArray[np.float64]:
+    """How far places on the image move per radian that the camera turns about each of its axes.
+
+    Shape (n, 2) → (n, 2, 3): along u and v, about x, y and z. 0 where a place has no direction.
+    """
+    points = np.asarray(points_px, dtype=np.float64)
+    over_pixel = pixel_turn(points, calibration)
+    # What rests turns the other way: e × d, by each axis e less.
+    turned = -np.cross(np.eye(3), direction_camera(points, calibration)[:, None, :])
+    square = over_pixel @ over_pixel.swapaxes(1, 2)
+    known = np.isfinite(square).all(axis=(1, 2))
+    slopes = np.zeros((len(points), 2, 3))
+    slopes[known] = np.linalg.solve(square[known], over_pixel[known] @ turned[known].swapaxes(1, 2))
+    return slopes
+
+
 def pixel_turns(
     points_px: NDArray[np.float64], calibrations: Sequence[Calibration], camera: NDArray[np.int64]
 ) -> NDArray[np.float64]:

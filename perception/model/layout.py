@@ -138,6 +138,8 @@ class Sources(NamedTuple):
         ln of the range for whose size they are laid out, shape (sources,).
     log_flux_at_1_m
         ln F₁ in electrons, shape (sources,); 0 where no range can be had.
+    swept_u_px, swept_v_px
+        How far each is swept along u and v during the exposure as the camera turns, shape (sources,).
     """
 
     first_node: NDArray[np.int64]
@@ -150,13 +152,18 @@ class Sources(NamedTuple):
     weight: Array
     log_range_at: Array
     log_flux_at_1_m: Array
+    swept_u_px: Array
+    swept_v_px: Array
 
     @classmethod
-    def of(cls, nodes: DiscNodes, log_range_at: Array, log_flux_at_1_m: Array) -> "Sources":
-        """Return sources with such images."""
+    def of(
+        cls, nodes: DiscNodes, log_range_at: Array, log_flux_at_1_m: Array, swept_px: Array | None = None
+    ) -> "Sources":
+        """Return sources with such images, swept by so much, shape (sources, 2); by default by nothing."""
+        swept_u_px, swept_v_px = np.zeros((2, len(log_range_at))) if swept_px is None else swept_px.T.copy()
         return cls(
             nodes.first, nodes.u_px, nodes.v_px, nodes.half_px, nodes.tilt, nodes.bend, nodes.along,
-            nodes.weight, log_range_at, log_flux_at_1_m,
+            nodes.weight, log_range_at, log_flux_at_1_m, swept_u_px, swept_v_px,
         )  # fmt: skip
 
     @property
@@ -164,6 +171,11 @@ class Sources(NamedTuple):
         """Radius of each source's image before the point spread, as laid out."""
         reach_px = np.hypot(abs(self.node_u_px) + self.half_px, self.node_v_px)
         return np.maximum.reduceat(np.where(np.isfinite(reach_px), reach_px, 0.0), self.first_node[:-1])
+
+    @property
+    def swept(self) -> NDArray[np.complex128]:
+        """How far each is swept, u + iv: motions draw images out by the squares of these, which add."""
+        return np.asarray(self.swept_u_px + 1j * self.swept_v_px)
 
 
 @compiled
@@ -174,6 +186,7 @@ def part_of(sources: Sources, first: int, end: int) -> Sources:
         sources.first_node[first : end + 1] - a, sources.node_u_px[a:b], sources.node_v_px[a:b],
         sources.half_px[a:b], sources.tilt[a:b], sources.bend[a:b], sources.node_along[a:b],
         sources.weight[a:b], sources.log_range_at[first:end], sources.log_flux_at_1_m[first:end],
+        sources.swept_u_px[first:end], sources.swept_v_px[first:end],
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ with variance 1, is by how much the size may disagree with the flux: σ_t² = (�
 source whose flux is not to be trusted is ranged by its size. The width of the point spread is free within its
 own σ: σ_psf e^(σ_w w). These priors enter as `precision` does for the structure's amplitudes c. A flare that
 moves by m during the exposure, evenly, is drawn out along a line: the mean of S(u + s m) over s from -½ to ½,
-u its place in the middle of the exposure.
+u its place in the middle of the exposure. As a camera turns, what rests does so, too: m is then beside that.
 """
 
 import math
@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.bearing import direction_camera
+from perception.model.bearing import direction_camera, turn_slopes_px
 from perception.model.discs.rows import disc_rows
 from perception.model.flare import is_before
 from perception.model.layout import Known, Sources
@@ -47,6 +47,20 @@ MOST_MOTION_PX = 10.0
 _OTHERWISE = 1e-8  # how often robots are not as slow: a blow, a machine that is far quicker
 
 
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """How far a camera turns during an exposure; forwards and backwards look the same.
+
+    Attributes
+    ----------
+    rotation_rad, covariance_rad2
+        The rotation about its axes, and how well it is known, shape (3,) and (3, 3).
+    """
+
+    rotation_rad: Array
+    covariance_rad2: Array
+
+
 @dataclass(frozen=True)
 class Camera:
     """A camera at one exposure and gain, and how well what ranges depend on is known.
@@ -59,12 +73,15 @@ class Camera:
         Of the frame.
     motion_px
         How far flares may move during the exposure, the standard deviation of each part of it; 0: none does.
+    turn
+        How it turns during the exposure; None: not at all.
     """
 
     calibration: Calibration
     exposure_s: float
     gain: float
     motion_px: float = 0.0
+    turn: Turn | None = None
 
     @property
     def moving(self) -> "Camera":
@@ -110,6 +127,12 @@ class Camera:
         """
         hiding = self.calibration.hidden_background
         return hiding * covered_px_at_1_m(places_px, self.calibration) if hiding else None
+
+    def swept_px(self, places_px: Array) -> Array | None:
+        """Return how far each place, shape (n, 2), is swept over the image as the camera turns."""
+        if self.turn is None:
+            return None
+        return np.asarray(turn_slopes_px(places_px, self.calibration) @ self.turn.rotation_rad)
 
     def known(self, clip_e: float) -> Known:
         """Return what compiled loops are told of the camera, and at how many electrons a pixel clips."""
@@ -176,7 +199,8 @@ def lay_out(
         What each would take away of the background from one metre, shape (sources,): so much its flux lacks.
         By default nothing.
     moved_px
-        How far each moves at most during the exposure, shape (sources,). By default nothing does.
+        How far each moves at most during the exposure, shape (sources,), beside what the camera's turn makes
+        it. By default nothing does.
     finer
         As for `disc_rows`.
     most_radius_px
@@ -199,8 +223,12 @@ def lay_out(
         u_px, v_px = np.where(imaged, u_px, calibration.cx_px), np.where(imaged, v_px, calibration.cy_px)
         direction = np.where(imaged[:, None], direction, (0.0, 0.0, 1.0))
         radius_rad = np.where(imaged, radius_rad, 0.0)
+    swept_px = camera.swept_px(np.column_stack([u_px, v_px]))
+    if swept_px is not None:
+        swept = np.hypot(*swept_px.T)
+        moved_px = swept if moved_px is None else swept + moved_px
     nodes = disc_rows(u_px, v_px, direction, radius_rad, calibration, moved_px, finer)
-    return Sources.of(nodes, np.ascontiguousarray(log_range), log_flux), imaged
+    return Sources.of(nodes, np.ascontiguousarray(log_range), log_flux, swept_px), imaged
 
 
 def log_flux_at_1_m(camera: Camera, direction: Array, hidden_e: Array | None = None) -> Array:

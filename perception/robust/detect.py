@@ -20,7 +20,6 @@ from perception.robust.flare import MeasuredFlare
 from perception.robust.goodness import is_likely
 from perception.robust.measure import measure
 from perception.robust.overlap.free_fits import log_range_of_calibration
-from perception.robust.overlap.free_width import log_range_slopes, log_width_of_calibration, tells_width
 from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
 from perception.robust.search.frame import levels_around
 from perception.robust.search.hills import prominent, summit
@@ -28,6 +27,8 @@ from perception.robust.search.near import most_brightness
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
 from perception.robust.solve import Solution
+from perception.robust.together.camera_turn import MOST_RADIUS_PX
+from perception.robust.together.free_width import log_range_slopes, log_width_of_calibration, tells_width
 from perception.types import Calibration, Detection, Detections, RawFrame
 
 CONTRAST_SIGMAS = 6.03
@@ -43,7 +44,7 @@ _FEWEST_RING_PIXELS = 8
 _LEAST_DISC_PX2 = 30
 _MOSTLY_SEEN = 0.7  # of the brightness of sources
 _LEAST_OF_PART = 0.25
-_TELLS_SIZE_PX, _MOST_TESTED = 3.0, 8
+_MOST_TESTED = 8
 _TELLS_WIDTH_SNR = 20.0
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
@@ -102,7 +103,8 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     blobs = _above_surroundings(blobs, middles_e, prepared)
     flares = [each for each in candidates(blobs, prepared) if not is_extended(each, prepared)]
     groups = clusters(brightest(flares, MOST_FLARES), prepared)
-    measured, late = _measured(groups, prepared, started + limit_s)
+    camera = Camera(prepared.calibration, frame.exposure_s, frame.gain)
+    measured, late, camera = _measured(groups, prepared, camera, started + limit_s)
     truncated = late or len(flares) > MOST_FLARES or any(found.may_be_more for _, found in measured)
     measured.sort(key=lambda each: (each[0].box.top, each[0].box.left))
     reported = [(blob, found) for blob, found in measured if found.stands_out]
@@ -112,7 +114,9 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     if in_fog:
         reported = list(_in_fog(reported, frame, calibration))
     else:
-        doubts, log_width = _log_range_doubts([found for _, found in reported], prepared)
+        doubts, log_width = _log_range_doubts(
+            [found for _, found in reported], camera, is_at_once=frame.line_time_s == 0.0
+        )
         if any(doubts):
             range_doubt, psf_width_off = median(filter(None, doubts)), math.expm1(log_width)
             reported = [
@@ -127,31 +131,44 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         truncated=truncated,
         range_doubt=range_doubt,
         psf_width_off=psf_width_off,
+        swept_px=_swept_px([found for _, found in reported], camera),
     )
 
 
 def _measured(
-    found: Sequence[Cluster], prepared: PreparedFrame, until_s: float
-) -> tuple[list[tuple[Blob, MeasuredFlare]], bool]:
-    """Measure clusters, the brightest first where time is limited; tell whether it was up before all."""
+    found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera, until_s: float
+) -> tuple[list[tuple[Blob, MeasuredFlare]], bool, Camera]:
+    """Measure clusters, the brightest first where time is limited; tell whether it was up before all.
+
+    And return the camera as it turns, if it does.
+    """
     if until_s == math.inf:
-        return measure(found, prepared), False
+        measured, camera = measure(found, prepared, camera)
+        return measured, False, camera
     by_flux = sorted(found, key=lambda each: -max(each.members[k].flux_e for k in each.wanted))
-    measured: list[tuple[Blob, MeasuredFlare]] = []
+    measured = []
     for first in range(0, len(by_flux), _AT_ONCE):
         if time.perf_counter() >= until_s:
-            return measured, True
-        measured += measure(by_flux[first : first + _AT_ONCE], prepared)
-    return measured, False
+            return measured, True, camera
+        more, camera = measure(by_flux[first : first + _AT_ONCE], prepared, camera)
+        measured += more
+    return measured, False, camera
 
 
-def _log_range_doubts(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> tuple[list[float], float]:
+def _swept_px(found: Sequence[MeasuredFlare], camera: Camera) -> float:
+    """Return how far the flares of a frame are swept as the camera turns, in their median."""
+    swept_px = camera.swept_px(np.array([(one.u_px, one.v_px) for one in found]))
+    return 0.0 if swept_px is None else float(np.median(np.hypot(*swept_px.T)))
+
+
+def _log_range_doubts(
+    found: Sequence[MeasuredFlare], camera: Camera, *, is_at_once: bool
+) -> tuple[list[float], float]:
     """Return how far the range of each flare may be off because the calibration is, as all of them tell.
 
     And by how much ln of the point spread's width is.
     """
-    camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
-    discs = _telling_discs(found, prepared)
+    discs = _telling_discs(found, is_at_once=is_at_once)
     by_discs = log_range_of_calibration(discs, camera)
     # One disc may be a mirror image, and says nothing of others.
     doubts = [by_discs if len(discs) > 1 or one.alone in discs else 0.0 for one in found]
@@ -172,19 +189,19 @@ def _telling_points(found: Sequence[MeasuredFlare]) -> list[Solution]:
         for flare in found
         if (one := flare.lone) is not None and tells_width(one)
         if one.window.is_even
-        if float(one.image_radius_px[0]) <= _TELLS_SIZE_PX
+        if float(one.image_radius_px[0]) <= MOST_RADIUS_PX
         if float(one.flux_e[0]) > _TELLS_WIDTH_SNR * float(one.flux_noise_e[0])
     ]
 
 
-def _telling_discs(found: Sequence[MeasuredFlare], prepared: PreparedFrame) -> list[Solution]:
+def _telling_discs(found: Sequence[MeasuredFlare], *, is_at_once: bool) -> list[Solution]:
     """Return the largest lone discs: their flux and their size tell of the calibration.
 
     Behind a rolling shutter motion draws them out, and is not fitted.
     """
     lone = [one.alone for one in found if one.alone is not None]
-    discs = [one for one in lone if float(one.radius_at_rest_px[0]) > _TELLS_SIZE_PX]
-    if prepared.frame.line_time_s > 0.0:
+    discs = [one for one in lone if float(one.radius_at_rest_px[0]) > MOST_RADIUS_PX]
+    if not is_at_once:
         discs = [one for one in discs if is_likely(2, one.drawn_out[0])]
     discs.sort(key=lambda one: -float(one.radius_at_rest_px[0]))
     return discs[:_MOST_TESTED]

@@ -49,18 +49,8 @@ from perception.robust.verdict import is_hardly_seen, is_one_pixel
 _GOOD_SIGMAS = 10.0  # of χ²: what leaves so much more is not as good, whatever error the model may have
 
 
-def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
-    """Solve clusters: by a flare for each blob, drawn out or not, by several, with what lies around them.
-
-    Parameters
-    ----------
-    found, prepared, camera
-        The clusters, the frame they are of, and its camera.
-
-    Returns
-    -------
-    What explains each best; None where nothing does.
-    """
+def by_blobs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
+    """Solve clusters by a flare at rest for each blob; None where that does not converge."""
     # The same window with each set of first guesses, from the faintest on.
     first = [[Problem(c.window, starts, c.background_e) for starts in guesses(c, prepared)] for c in found]
     problems = likely_starts(first, camera)
@@ -72,6 +62,26 @@ def best(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> l
     for index, (cluster, solution) in enumerate(zip(found, chosen, strict=True)):
         if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
             chosen[index] = None
+    return chosen
+
+
+def best(
+    found: Sequence[Cluster], plain: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera
+) -> list[Solution | None]:
+    """Explain clusters by a flare for each blob, drawn out or not, by several, with what lies around them.
+
+    Parameters
+    ----------
+    found, plain
+        The clusters, and what `by_blobs` makes of them.
+    prepared, camera
+        The frame they are of, and its camera.
+
+    Returns
+    -------
+    What explains each best; None where nothing does.
+    """
+    chosen = list(plain)
     for index, fit in by_flanks(found, chosen, prepared, camera).items():
         chosen[index] = fit
     fit_beside_forward_light(chosen, camera)

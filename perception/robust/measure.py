@@ -7,7 +7,7 @@ from dataclasses import replace
 from perception.model.window import Camera
 from perception.robust.around.uneven import MOST_LEFT, explains_flanks
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters
-from perception.robust.explain import best
+from perception.robust.explain import best, by_blobs
 from perception.robust.flare import MeasuredFlare, measured_flare
 from perception.robust.large.discs import measure_large
 from perception.robust.motion import is_long_clutter
@@ -16,6 +16,7 @@ from perception.robust.overlap.free_fits import of_free_size, with_model_error
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
+from perception.robust.together.camera_turn import turning, with_turn
 from perception.robust.verdict import (
     is_any_outline,
     is_border,
@@ -37,9 +38,10 @@ _MOST_BESIDE_BORDERS = 4
 def measure(
     found: Sequence[Cluster],
     prepared: PreparedFrame,
+    camera: Camera,
     apart: bool = False,
     before: Sequence[Candidate] = (),
-) -> list[tuple[Blob, MeasuredFlare]]:
+) -> tuple[list[tuple[Blob, MeasuredFlare]], Camera]:
     """Measure clusters, and leave out what is no source.
 
     Flares of known size and strength are fitted to each window. What a fit leaves over may be more flares
@@ -52,8 +54,8 @@ def measure(
     ----------
     found
         The clusters.
-    prepared
-        The frame.
+    prepared, camera
+        The frame, and its camera: where that is at rest, the flares may tell that it turns.
     apart
         That blobs side by side have been tried together before.
     before
@@ -61,11 +63,14 @@ def measure(
 
     Returns
     -------
-    A blob and its measurement for each flare.
+    A blob and its measurement for each flare, and the camera as it turns.
     """
-    camera = Camera(prepared.calibration, prepared.frame.exposure_s, prepared.frame.gain)
     fitted = [cluster for cluster in found if not any(member.is_beyond_fit for member in cluster.members)]
-    solutions = best(fitted, prepared, camera)
+    plain = by_blobs(fitted, prepared, camera)
+    if not apart and camera.turn is None and prepared.frame.line_time_s == 0.0:
+        at_rest, camera = camera, turning([one for one in plain if one is not None], camera)
+        plain = plain if camera is at_rest else by_blobs(fitted, prepared, camera)
+    solutions = best(fitted, plain, prepared, camera)
     odd = [index for index, solution in enumerate(solutions) if solution is not None and _is_odd(solution)]
     of_odd = of_free_size([solution for k in odd if (solution := solutions[k]) is not None], camera)
     free = dict(zip(odd, of_odd, strict=True))
@@ -95,16 +100,17 @@ def measure(
     again += small
     if again:
         # What spoils a cluster spoils it for all: each by itself, the others left out.
-        measured += measure(clusters(again, prepared, apart=True, measured=done), prepared, True, done)
+        one_by_one = clusters(again, prepared, apart=True, measured=done)
+        measured += measure(one_by_one, prepared, camera, True, done)[0]
     if unseen:
         # Of two side by side that spoil nothing each leaves out too much of the other.
         together = [one for one in clusters(unseen, prepared, measured=done) if len(one.members) > 1]
-        measured += measure(together, prepared, True, done)
+        measured += measure(together, prepared, camera, True, done)[0]
     if on_flank:
         # Of what is bright beside it an edge may be the whole story: all of it in view.
         in_view = clusters(on_flank, prepared, apart=True, measured=done, within_px=_IN_VIEW_PX)
-        measured += measure(in_view, prepared, True, done)
-    return measured
+        measured += measure(in_view, prepared, camera, True, done)[0]
+    return measured, camera
 
 
 def _may_be_before_edge(solution: Solution, shape: tuple[int, int]) -> bool:
@@ -158,7 +164,7 @@ def _judged(
     of_border = {k: is_border(solution, k, prepared.shape) for k in wanted}
     if solution.count > _MOST_BESIDE_BORDERS * len(cluster.members) and any(of_border.values()):
         return []
-    told = with_model_error(solution, camera)
+    told = with_turn(with_model_error(solution, camera), camera)
     return [
         (blob, measured_flare(told, k, blob, misfit, prepared))
         for k in wanted

@@ -1,5 +1,6 @@
 """Flares that are drawn out, as they move while they are exposed: rivals of round ones and of pairs."""
 
+import cmath
 import math
 from collections.abc import Sequence
 
@@ -29,7 +30,7 @@ MOST_TOGETHER = 4
 """More flares in one window are not tried as moving ones."""
 
 AT_REST = (0.0, 0.0)
-"""A fit that begins so stays so: to first order a motion changes nothing."""
+"""A fit that begins so stays so where the camera does not turn: to first order a motion changes nothing."""
 
 
 def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, Solution]:
@@ -59,14 +60,18 @@ def moving(solutions: Sequence[Solution | None], camera: Camera) -> dict[int, So
 
 def moves(fit: Solution) -> bool:
     """Tell whether flares that may move do: as far as is seen, and no farther than is believed."""
-    return LEAST_PX <= fit.most_motion_px <= MOST_MOTION_PX
+    if fit.motion_px is None or fit.most_motion_px > MOST_MOTION_PX:
+        return False
+    swept = 0.0 if fit.sources is None else fit.sources.swept
+    whole = fit.motion_px @ (1.0, 1.0j) + swept
+    return bool(np.abs(whole**2 - swept**2).max() >= LEAST_PX**2)
 
 
 def asked_motions(solution: Solution, camera: Camera) -> list[Motion]:
     """Return the motion of each that the residual of flares at rest asks for; `AT_REST` where of none."""
     if solution.count == 1:
-        return [_seen(solution, *solution.drawn_out, camera)]
-    return [_seen(solution, *_drawn_out(solution, k), camera) for k in range(solution.count)]
+        return [_seen(solution, 0, *solution.drawn_out, camera)]
+    return [_seen(solution, k, *_drawn_out(solution, k), camera) for k in range(solution.count)]
 
 
 def share_asked(solution: Solution) -> float:
@@ -98,9 +103,15 @@ def is_long_clutter(solution: Solution, index: int, camera: Camera) -> bool:
 
 
 def _seen(
-    solution: Solution, chi2: float, along_u: float, along_v: float, most_gain: float, camera: Camera
+    solution: Solution,
+    flare: int,
+    chi2: float,
+    along_u: float,
+    along_v: float,
+    most_gain: float,
+    camera: Camera,
 ) -> Motion:
-    """Return the motion that a residual asks for (`drawn_out`), if it does.
+    """Return the motion of a flare that a residual asks for (`drawn_out`), if it does.
 
     One that costs more than it may gain, by so much that it would not be weighed in, is none.
     """
@@ -114,7 +125,13 @@ def _seen(
     if most_gain < float(price.min()) - NO_RIVAL:
         return AT_REST
     shorter = min(1.0, 0.5 * MOST_MOTION_PX / length_px)
-    return shorter * along_u, shorter * along_v
+    asked = complex(shorter * along_u, shorter * along_v)
+    if solution.sources is None:
+        return asked.real, asked.imag
+    swept = complex(solution.sources.swept[flare])
+    whole = cmath.sqrt(swept**2 + asked**2)
+    beside = whole - swept if (whole * swept.conjugate()).real >= 0.0 else -whole - swept
+    return beside.real, beside.imag
 
 
 def _drawn_out(solution: Solution, flare: int) -> tuple[float, float, float, float]:

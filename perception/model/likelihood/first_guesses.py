@@ -76,7 +76,8 @@ def unlikeliness(
         for source in range(first_source[guess], first_source[guess + 1]):
             image = np.zeros((5, rows, columns))
             place = (starts[source, 0] - left, starts[source, 1] - top)
-            spread_nodes(sources, source, place, 1.0, (0.0, 0.0), known.psf_sigma_px, image)
+            swept = (sources.swept_u_px[source], sources.swept_v_px[source])
+            spread_nodes(sources, source, place, 1.0, swept, known.psf_sigma_px, image)
             flux = math.exp(sources.log_flux_at_1_m[source] - 2.0 * starts[source, 2])
             expected += flux * image[0].ravel()
         for pixel in range(len(expected)):

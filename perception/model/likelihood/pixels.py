@@ -60,14 +60,14 @@ def expectation(
         jacobian[background + 1 + other] = structure.columns[other]
     image = np.empty((7 if moves else 5, *view.image_e.shape))
     flat = image.reshape(len(image), -1)
-    motion = (0.0, 0.0)
     for source in range(count):
         at = source * step
         by_size = values[at + 2]
         if has_slack:
             by_size -= known.tie_spread * values[at + 3]
+        motion = (sources.swept_u_px[source], sources.swept_v_px[source])
         if moves:
-            motion = (values[at + step - 2], values[at + step - 1])
+            motion = (motion[0] + values[at + step - 2], motion[1] + values[at + step - 1])
         image[:] = 0.0
         place = (values[at] - view.left, values[at + 1] - view.top)
         growth = math.exp(sources.log_range_at[source] - by_size)

@@ -14,10 +14,10 @@ from perception.model.window import Camera
 from perception.robust.clusters import candidates, clusters
 from perception.robust.measure import measure
 from perception.robust.overlap.free_fits import chance_of_least
-from perception.robust.overlap.free_width import log_range_slopes
 from perception.robust.search.blobs import blobs_at
 from perception.robust.search.prepare import prepare
 from perception.robust.solve import Solution
+from perception.robust.together.free_width import log_range_slopes
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 Array = NDArray[np.float64]
@@ -263,7 +263,8 @@ def test_what_a_width_changes_of_a_range_is_what_fits_through_others_find(
     for factor in (0.99, 1.0, 1.01):
         prepared = prepare(frame, replace(camera, psf_sigma_px=factor * camera.psf_sigma_px))
         blobs = blobs_at(prepared.lit_at, prepared.lit_e, camera.width_px)
-        measured = [one for _, one in measure(clusters(candidates(blobs, prepared), prepared), prepared)]
+        groups = clusters(candidates(blobs, prepared), prepared)
+        measured = [one for _, one in measure(groups, prepared, Camera(camera, exposure_s, 1.0))[0]]
         fits.append([one.lone for one in sorted(measured, key=lambda one: one.u_px) if one.lone is not None])
         assert len(fits[-1]) == len(places)
     narrow, wide = ([float(one.log_photometric_range[0]) for one in each] for each in (fits[0], fits[2]))

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.likelihood.free_width import width_step
+from perception.model.likelihood.scoring_step import scoring_step
 from perception.model.window import Camera
 from perception.robust.goodness import MISFIT_PROBABILITY
 from perception.robust.overlap.free_fits import MOST_CLAIMED, with_spread
 from perception.robust.solve import Solution
+from perception.robust.together.camera_turn import drawn_out_squares
 
 Array = NDArray[np.float64]
 
@@ -49,20 +50,10 @@ def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> floa
 
 
 def _turn_chi2(points: Sequence[Solution]) -> float:
-    """Return by how much flares are drawn out along one line in common, as χ² of two degrees of freedom.
-
-    A motion (a, b) shows as (a² - b², 2ab), of one σ in both.
-    """
-    total_u, total_v, precision = 0.0, 0.0, 0.0
-    for one in points:
-        chi2, u_px, v_px, _ = one.drawn_out
-        length2 = u_px**2 + v_px**2
-        if length2 > 0.0:
-            of_one = chi2 / length2**2
-            total_u += of_one * (u_px**2 - v_px**2)
-            total_v += of_one * 2.0 * u_px * v_px
-            precision += of_one
-    return (total_u**2 + total_v**2) / precision if precision > 0.0 else 0.0
+    """Return by how much flares are drawn out along one line in common, as χ² of two degrees of freedom."""
+    square, precision = drawn_out_squares(points)
+    total = float(precision.sum())
+    return float(abs(np.sum(precision * square))) ** 2 / total if total > 0.0 else 0.0
 
 
 def log_range_slopes(lone: Sequence[Solution], camera: Camera) -> Array:
@@ -80,7 +71,11 @@ def tells_width(one: Solution) -> bool:
 
 
 def _width_steps(lone: Sequence[Solution], camera: Camera) -> Array:
-    """Return `width_step` of fits of a lone flare each, shape (flares, 4); NaN where there is none."""
+    """Return what each lone flare tells of ln width, shape (flares, 4); NaN where it tells nothing.
+
+    By how much it is off, and σ of that; and by how much ln range by flux, and the slack if there is one,
+    change with ln width where that is taken as known.
+    """
     camera = with_spread(camera, "psf_sigma_px", _WIDTH_UNIT)
     steps = np.full((len(lone), 4), math.nan)
     for step, one in zip(steps, lone, strict=True):
@@ -91,7 +86,11 @@ def _width_steps(lone: Sequence[Solution], camera: Camera) -> Array:
         values, precision = np.zeros(layout.size), layout.prior(beside, known.motion_px).copy()
         values[:3], values[layout.background] = one.starts[0], one.background_e
         precision[layout.width, layout.width] = 0.0
-        step[:] = width_step(one.window.view, one.sources, beside, known, precision, values)
+        shift, covariance = scoring_step(one.window.view, one.sources, beside, known, precision, values)
+        width, unit = layout.width, known.width_spread
+        of_width = covariance[width] / (unit * covariance[width, width])
+        of_slack = of_width[3] if layout.has_slack else 0.0
+        step[:] = unit * shift[width], unit * math.sqrt(covariance[width, width]), of_width[2], of_slack
     return steps
 
 
