@@ -278,11 +278,19 @@ def is_usual_motion(length_px: Array, log_range: Array, camera: Camera) -> NDArr
     return np.asarray(usual > otherwise)
 
 
+def usual_motion_px(log_range: Array, camera: Camera, turn_rad_per_s: float) -> Array:
+    """Return the standard deviation of each part of motions at ordinary speeds, and of such a turn.
+
+    At ranges of these logarithms, shape (flares,).
+    """
+    calibration = camera.calibration
+    focal_px = math.sqrt(calibration.fx_px * calibration.fy_px)
+    rad_per_s = np.hypot(turn_rad_per_s, SPEED_M_PER_S * np.exp(-log_range))
+    return np.asarray(focal_px * camera.exposure_s * rad_per_s)
+
+
 def _motion_prior(length_px: Array, log_range: Array, camera: Camera) -> tuple[Array, float]:
     """Return the densities of motions at ordinary speeds, shape (flares,), and of any others."""
-    calibration = camera.calibration
-    turn_rad_per_s = np.hypot(TURN_RAD_PER_S, SPEED_M_PER_S * np.exp(-log_range))
-    focal_px = math.sqrt(calibration.fx_px * calibration.fy_px)
-    sigma2_px2 = (focal_px * camera.exposure_s * turn_rad_per_s) ** 2
+    sigma2_px2 = usual_motion_px(log_range, camera, TURN_RAD_PER_S) ** 2
     usual = np.exp(-0.5 * length_px**2 / sigma2_px2) / (math.pi * sigma2_px2)
     return (1.0 - _OTHERWISE) * usual, _OTHERWISE / (0.5 * math.pi * MOST_MOTION_PX**2)

@@ -6,7 +6,7 @@ motion, or two too near to be told apart, and few robots move so fast.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from perception.model.bearing import turn_slopes_px
 from perception.model.layout import CLIPPED
 from perception.model.likelihood.scoring_step import scoring_step
-from perception.model.window import SPEED_M_PER_S, TURN_RAD_PER_S, Camera, Turn
+from perception.model.window import TURN_RAD_PER_S, Camera, Turn, usual_motion_px
 from perception.robust.solve import Solution, solve
 
 Array = NDArray[np.float64]
@@ -23,19 +23,22 @@ Squares = NDArray[np.complex128]
 MOST_RADIUS_PX = 3.0
 """Of flares whose image tells of point spread and motion, and not of their own outline."""
 
-_LEAST_CHI2 = 30.7  # of three degrees of freedom: noise has more once in a million frames
+_LEAST_CHI2 = 21.1  # of three degrees of freedom: noise has more once in ten thousand frames
 _FEWEST, _MOST, _LEAST_SNR = 3, 32, 10.0
 _QUICK = 10.0  # times the usual turn: standard deviation of what is looked for
-_ROUNDS, _MOST_STEPS, _SETTLED = 4, 30, 0.1
+_ROUNDS, _SETTLED = 4, 0.1  # the latter of χ²
+_MOST_STEPS, _LEAST_STEP2 = 30, 1e-6
 _COARSE = 1.2  # differences of neighbours see so much more than is there (`goodness.drawn_out`), of points
-_CONSISTENT = 5.0  # standard deviations of χ²
+_SIGMAS = 5.0  # of χ²
+_MUCH_BETTER = 9.0  # of χ²
+_MOST_APART_CHI2 = 13.8  # of two degrees of freedom: noise has more once in a thousand flares
 
 
 def turning(lone: Sequence[Solution], camera: Camera) -> Camera:
     """Return the camera as it turns while it is exposed, as all small flares at rest tell together.
 
     A flare that is swept by m = a + ib is drawn out by m², a and b in pixels. The rotation that explains
-    these best must explain more than noise gives once in a million frames without the quarter that speaks
+    these best must explain more than noise gives once in ten thousand frames without the quarter that speaks
     for it most, as what is two, or moves itself, may be drawn out as far. And what it leaves must be noise,
     but for robots' own motions at ordinary speeds: glossy floors that draw flares out all in one direction
     draw near ones out farther.
@@ -81,7 +84,7 @@ def with_turn(solution: Solution, camera: Camera) -> Solution:
     if not np.isfinite(covariance).all():
         return solution
     slopes_px = turn_slopes_px(np.column_stack([solution.u_px, solution.v_px]), camera.calibration)
-    own_px = _own_motion_px(solution.log_range, camera)
+    own_px = usual_motion_px(solution.log_range, camera, 0.0)
     off = np.zeros((2, count))
     for flare in range(count):
         at = flare * layout.per_source
@@ -124,6 +127,42 @@ def _tells(one: Solution) -> bool:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """How far flares are drawn out, and how far a turn draws them out.
+
+    Attributes
+    ----------
+    square, precision
+        As `drawn_out_squares` has them, the turn that their fits know of counted in, shape (flares,).
+    by_turn
+        How far each is swept, a + ib, per radian about each axis, shape (flares, 3).
+    own_px
+        How far each may move itself, the standard deviation of each part, shape (flares,).
+    range_m
+        Shape (flares,).
+    """
+
+    square: Squares
+    precision: Array
+    by_turn: Squares
+    own_px: Array
+    range_m: Array
+
+    def of(self, kept: NDArray[np.intp]) -> "_Drawn":
+        """Return some of them."""
+        return _Drawn(*(getattr(self, each.name)[kept] for each in fields(self)))
+
+    def gains(self, rotation_rad: Array) -> Array:
+        """Return by how much χ² of each is less with a turn than without, shape (flares,)."""
+        left = self.square - (self.by_turn @ rotation_rad) ** 2
+        return np.asarray(self.precision * (np.abs(self.square) ** 2 - np.abs(left) ** 2))
+
+    def weight(self, swept: Squares) -> Array:
+        """Return the precision of squares, own motions allowed for: by δ beside m changes m² by 2 m δ."""
+        return np.asarray(1.0 / (1.0 / self.precision + (2.0 * np.abs(swept) * self.own_px) ** 2))
+
+
 def _turn(lone: Sequence[Solution], camera: Camera) -> Turn | None:
     """Return the turn that flares tell together, None where they tell of none."""
     if len(lone) < _FEWEST:
@@ -133,89 +172,69 @@ def _turn(lone: Sequence[Solution], camera: Camera) -> Turn | None:
     square = more + swept**2
     if float(np.sum(precision * np.abs(square) ** 2)) < _LEAST_CHI2:
         return None
-    places = np.array([(one.u_px[0], one.v_px[0]) for one in lone])
-    slopes = turn_slopes_px(places, camera.calibration)
-    by_turn: Squares = slopes[:, 0] + 1j * slopes[:, 1]
+    u_px, v_px, log_range = np.array([(one.u_px[0], one.v_px[0], one.log_range[0]) for one in lone]).T
+    slopes = turn_slopes_px(np.column_stack([u_px, v_px]), camera.calibration)
+    own_px = usual_motion_px(log_range, camera, 0.0)
+    drawn = _Drawn(square, precision, slopes[:, 0] + 1j * slopes[:, 1], own_px, np.exp(log_range))
     sigma_rad = _QUICK * TURN_RAD_PER_S * camera.exposure_s
-    gain, rotation = _first_guess(square, precision, by_turn, sigma_rad)
+    gain, rotation_rad = _first_guess(drawn, sigma_rad)
     if gain < _LEAST_CHI2:
         return None
-    own_px = _own_motion_px(np.array([one.log_range[0] for one in lone]), camera)
-    rotation, _, _ = _likeliest(rotation, square, precision, by_turn, own_px, sigma_rad)
-    gains = _gains(square, precision, by_turn, rotation)
-    kept = np.argsort(gains, kind="stable")[: len(lone) - max(len(lone) // 4, 1)]
-    square, precision, by_turn, own_px = square[kept], precision[kept], by_turn[kept], own_px[kept]
-    rotation, covariance, chi2 = _likeliest(rotation, square, precision, by_turn, own_px, sigma_rad)
-    free = 2 * len(kept) - 3
-    if chi2 > free + _CONSISTENT * math.sqrt(2.0 * free):
+    rotation_rad, _ = _likeliest(rotation_rad, drawn, sigma_rad)
+    by_gain = np.argsort(drawn.gains(rotation_rad), kind="stable")
+    kept = drawn.of(by_gain[: len(lone) - max(len(lone) // 4, 1)])
+    rotation_rad, _ = _likeliest(rotation_rad, kept, sigma_rad)
+    swept = kept.by_turn @ rotation_rad
+    weight, free = kept.weight(swept), 2 * len(swept) - 3
+    chi2 = float(np.sum(weight * np.abs(kept.square - swept**2) ** 2))
+    if float(kept.gains(rotation_rad).sum()) < _LEAST_CHI2 or chi2 > free + _SIGMAS * math.sqrt(2.0 * free):
         return None
-    if float(_gains(square, precision, by_turn, rotation).sum()) < _LEAST_CHI2:
+    # As 1/d² does what moves past, or stands on a mirror.
+    nearness = kept.range_m**-2.0
+    past = np.sum(weight * nearness * kept.square) / np.sum(weight * nearness**2)
+    if float(np.sum(weight * np.abs(kept.square - past * nearness) ** 2)) < chi2 - _MUCH_BETTER:
         return None
-    return Turn(rotation, covariance)
+    # Those that were left out have their say where they agree: they are not all above the mean by chance.
+    swept = drawn.by_turn @ rotation_rad
+    agree = drawn.weight(swept) * np.abs(drawn.square - swept**2) ** 2 < _MOST_APART_CHI2
+    return Turn(*_likeliest(rotation_rad, drawn.of(np.flatnonzero(agree)), sigma_rad))
 
 
-def _own_motion_px(log_range: Array, camera: Camera) -> Array:
-    """Return how far robots move at ordinary speeds, the standard deviation of each part, shape (flares,)."""
-    focal_px = math.sqrt(camera.calibration.fx_px * camera.calibration.fy_px)
-    return focal_px * camera.exposure_s * SPEED_M_PER_S * np.exp(-log_range)
-
-
-def _gains(square: Squares, precision: Array, by_turn: Squares, rotation: Array) -> Array:
-    """Return by how much χ² of each flare is less as it is swept."""
-    left = square - (by_turn @ rotation) ** 2
-    return np.asarray(precision * (np.abs(square) ** 2 - np.abs(left) ** 2))
-
-
-def _first_guess(
-    square: Squares, precision: Array, by_turn: Squares, sigma_rad: float
-) -> tuple[float, Array]:
+def _first_guess(drawn: _Drawn, sigma_rad: float) -> tuple[float, Array]:
     """Return more than any rotation gains of χ², and a first guess of the one that gains most.
 
     Squares are linear in the products of the rotation's parts: the best matrix of these gains more than one
     that is of rank one, as products are; the first guess is its largest part.
     """
     first, second = np.triu_indices(3)
-    products = by_turn[:, first] * by_turn[:, second] * np.where(first == second, 1.0, 2.0)
-    root = np.sqrt(precision)
-    design = np.concatenate([(root[:, None] * products).real, (root[:, None] * products).imag])
-    seen = np.concatenate([(root * square).real, (root * square).imag])
-    pull = design.T @ seen
-    best = np.linalg.solve(design.T @ design + np.eye(6) / sigma_rad**4, pull)
+    products = drawn.by_turn[:, first] * drawn.by_turn[:, second] * np.where(first == second, 1.0, 2.0)
+    root = np.sqrt(drawn.precision)
+    design, seen = root[:, None] * products, root * drawn.square
+    pull = (design.conj().T @ seen).real
+    best = np.linalg.solve((design.conj().T @ design).real + np.eye(6) / sigma_rad**4, pull)
     matrix = np.empty((3, 3))
     matrix[first, second] = matrix[second, first] = best
     values, vectors = np.linalg.eigh(matrix)
     return float(pull @ best), math.sqrt(max(float(values[-1]), 0.0)) * vectors[:, -1]
 
 
-def _likeliest(
-    rotation: Array, square: Squares, precision: Array, by_turn: Squares, own_px: Array, sigma_rad: float
-) -> tuple[Array, Array, float]:
-    """Return the likeliest rotation, its covariance, and χ² of what it leaves, own motions allowed for.
-
-    By Gauss and Newton's steps, damped.
-    """
-
-    def left_by(rotation: Array) -> tuple[Squares, Squares]:
-        swept = by_turn @ rotation
-        return square - swept**2, swept
-
-    left, swept = left_by(rotation)
-    damping = 1e-3
+def _likeliest(rotation_rad: Array, drawn: _Drawn, sigma_rad: float) -> tuple[Array, Array]:
+    """Return the likeliest rotation and its covariance, by Gauss and Newton's steps, damped."""
+    prior, damping = np.eye(3) / sigma_rad**2, 1e-3
+    swept = drawn.by_turn @ rotation_rad
     for _ in range(_MOST_STEPS):
-        # Of m² a motion δ beside it changes 2 m δ.
-        weight = 1.0 / (1.0 / precision + (2.0 * np.abs(swept) * own_px) ** 2)
-        slope = 2.0 * swept[:, None] * by_turn
-        information = ((weight[:, None] * slope).conj().T @ slope).real + np.eye(3) / sigma_rad**2
-        pull = (slope.conj().T @ (weight * left)).real - rotation / sigma_rad**2
-        before = float(np.sum(weight * np.abs(left) ** 2)) + float(rotation @ rotation) / sigma_rad**2
+        weight, left = drawn.weight(swept), drawn.square - swept**2
+        slope = 2.0 * swept[:, None] * drawn.by_turn
+        information = (slope.conj().T @ (weight[:, None] * slope)).real + prior
+        pull = (slope.conj().T @ (weight * left)).real - prior @ rotation_rad
         shift = np.linalg.solve(information + damping * np.diag(np.diagonal(information)), pull)
-        trial = rotation + shift
-        new_left, new_swept = left_by(trial)
-        after = float(np.sum(weight * np.abs(new_left) ** 2)) + float(trial @ trial) / sigma_rad**2
-        if after > before:
+        trial_rad = rotation_rad + shift
+        trial = drawn.by_turn @ trial_rad
+        gained = np.sum(weight * (np.abs(left) ** 2 - np.abs(drawn.square - trial**2) ** 2))
+        if gained + rotation_rad @ prior @ rotation_rad < trial_rad @ prior @ trial_rad:
             damping *= 10.0
             continue
-        rotation, left, swept, damping = trial, new_left, new_swept, 0.1 * damping
-        if float(shift @ information @ shift) < 1e-6:
+        rotation_rad, swept, damping = trial_rad, trial, 0.1 * damping
+        if float(shift @ information @ shift) < _LEAST_STEP2:
             break
-    return rotation, np.asarray(np.linalg.inv(information)), float(np.sum(weight * np.abs(left) ** 2))
+    return rotation_rad, np.asarray(np.linalg.inv(information))

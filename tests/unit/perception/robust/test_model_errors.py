@@ -264,7 +264,9 @@ def test_what_a_width_changes_of_a_range_is_what_fits_through_others_find(
         prepared = prepare(frame, replace(camera, psf_sigma_px=factor * camera.psf_sigma_px))
         blobs = blobs_at(prepared.lit_at, prepared.lit_e, camera.width_px)
         groups = clusters(candidates(blobs, prepared), prepared)
-        measured = [one for _, one in measure(groups, prepared, Camera(camera, exposure_s, 1.0))[0]]
+        measured = [
+            one for _, one in measure(groups, prepared, Camera(prepared.calibration, exposure_s, 1.0))[0]
+        ]
         fits.append([one.lone for one in sorted(measured, key=lambda one: one.u_px) if one.lone is not None])
         assert len(fits[-1]) == len(places)
     narrow, wide = ([float(one.log_photometric_range[0]) for one in each] for each in (fits[0], fits[2]))
