@@ -27,7 +27,6 @@ from perception.robust.search.near import most_brightness
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
 from perception.robust.solve import Solution
-from perception.robust.together.camera_turn import MOST_RADIUS_PX
 from perception.robust.together.free_width import log_range_slopes, log_width_of_calibration, tells_width
 from perception.types import Calibration, Detection, Detections, RawFrame
 
@@ -44,7 +43,7 @@ _FEWEST_RING_PIXELS = 8
 _LEAST_DISC_PX2 = 30
 _MOSTLY_SEEN = 0.7  # of the brightness of sources
 _LEAST_OF_PART = 0.25
-_MOST_TESTED = 8
+_TELLS_SIZE_PX, _MOST_TESTED = 3.0, 8
 _TELLS_WIDTH_SNR = 20.0
 _LARGE_HILL = 8  # times the square that a point's image reaches
 
@@ -189,7 +188,7 @@ def _telling_points(found: Sequence[MeasuredFlare]) -> list[Solution]:
         for flare in found
         if (one := flare.lone) is not None and tells_width(one)
         if one.window.is_even
-        if float(one.image_radius_px[0]) <= MOST_RADIUS_PX
+        if float(one.image_radius_px[0]) <= _TELLS_SIZE_PX
         if float(one.flux_e[0]) > _TELLS_WIDTH_SNR * float(one.flux_noise_e[0])
     ]
 
@@ -200,7 +199,7 @@ def _telling_discs(found: Sequence[MeasuredFlare], *, is_at_once: bool) -> list[
     Behind a rolling shutter motion draws them out, and is not fitted.
     """
     lone = [one.alone for one in found if one.alone is not None]
-    discs = [one for one in lone if float(one.radius_at_rest_px[0]) > MOST_RADIUS_PX]
+    discs = [one for one in lone if float(one.radius_at_rest_px[0]) > _TELLS_SIZE_PX]
     if not is_at_once:
         discs = [one for one in discs if is_likely(2, one.drawn_out[0])]
     discs.sort(key=lambda one: -float(one.radius_at_rest_px[0]))

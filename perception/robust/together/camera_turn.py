@@ -1,4 +1,4 @@
-"""Whether the camera turns while it is exposed: what all small flares of a frame tell together.
+"""Whether the camera turns while it is exposed: what the flares of a frame tell together.
 
 It draws out the images of all that rests, each along its own line. By one flare alone it may be its own
 motion, or two too near to be told apart, and few robots move so fast.
@@ -20,11 +20,9 @@ from perception.robust.solve import Solution, solve
 Array = NDArray[np.float64]
 Squares = NDArray[np.complex128]
 
-MOST_RADIUS_PX = 3.0
-"""Of flares whose image tells of point spread and motion, and not of their own outline."""
-
 _LEAST_CHI2 = 21.1  # of three degrees of freedom: noise has more once in ten thousand frames
 _FEWEST, _MOST, _LEAST_SNR = 3, 32, 10.0
+_MOST_RADIUS_PX = 10.0  # larger ones show whether the lens is as calibrated
 _QUICK = 10.0  # times the usual turn: standard deviation of what is looked for
 _ROUNDS, _SETTLED = 4, 0.1  # the latter of χ²
 _MOST_STEPS, _LEAST_STEP2 = 30, 1e-6
@@ -35,7 +33,7 @@ _MOST_APART_CHI2 = 13.8  # of two degrees of freedom: noise has more once in a t
 
 
 def turning(lone: Sequence[Solution], camera: Camera) -> Camera:
-    """Return the camera as it turns while it is exposed, as all small flares at rest tell together.
+    """Return the camera as it turns while it is exposed, as its flares tell together.
 
     A flare that is swept by m = a + ib is drawn out by m², a and b in pixels. The rotation that explains
     these best must explain more than noise gives once in ten thousand frames without the quarter that speaks
@@ -120,7 +118,7 @@ def _tells(one: Solution) -> bool:
         and one.motion_px is None
         and one.sources is not None
         and one.window.is_even
-        and float(one.image_radius_px[0]) <= MOST_RADIUS_PX
+        and float(one.image_radius_px[0]) <= _MOST_RADIUS_PX
         and float(one.flux_e[0]) > _LEAST_SNR * float(one.flux_noise_e[0])
         and not (one.window.state == CLIPPED).any()
         and one.drawn_out[0] > 0.0
