@@ -41,6 +41,7 @@ from perception.rig.frame_sets import robot_of
 from perception.rig.overlap import finest, overlap_warnings
 from perception.robust.detect import detect_robust
 from perception.robust.search.reason import NO_FAULT
+from perception.robust.together.free_width import log_width_of_frames
 from perception.track.own import TrackerError
 from perception.types import FrameKey, Odometry
 
@@ -182,7 +183,11 @@ def perceive_run(
     if counts:
         run_folder.write_period(folder, period_s)
         note_seconds(folder, "perceive", started)
-    said = [text for name, total in counts.items() for text in notes[name].warnings(name, total)]
+    said = [
+        text
+        for name, total in counts.items()
+        for text in notes[name].warnings(name, total, recording.calibrations)
+    ]
     return Perceived(counts, failures, (*_overlap_warnings(recording, found, period_s), *said))
 
 
@@ -269,6 +274,7 @@ class _Notes:
     found: Counter[str] = field(default_factory=Counter)  # detections of each camera
     truncated: int = 0
     doubts: list[tuple[float, float]] = field(default_factory=list)  # `range_doubt`, `psf_width_off`
+    widths: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # `psf_width_seen`, by camera
 
     def take(self, camera: str, found: Detections) -> Detections:
         """Note what is said of a camera's frame, and return its detections."""
@@ -276,9 +282,10 @@ class _Notes:
         self.found[camera] += len(found)
         self.truncated += found.truncated
         self.doubts += [(found.range_doubt, found.psf_width_off)] if found.range_doubt else []
+        self.widths.setdefault(camera, []).append(found.psf_width_seen)
         return found
 
-    def warnings(self, name: str, total: int) -> Iterator[str]:
+    def warnings(self, name: str, total: int, calibrations: Mapping[str, Calibration]) -> Iterator[str]:
         """Yield what is to be told, of an estimator that made so many detections in all.
 
         Of one camera alone that found nothing: where that is its frames' own fault, not for want of flares.
@@ -297,16 +304,20 @@ class _Notes:
             yield self._doubted(
                 name, by_discs, "near sources of which size and flux, as calibrated, contradict"
             )
-        if of_width := [width_off for _, width_off in self.doubts if width_off]:
-            off = median(of_width)
-            how, why = (
-                ("wider", "out of focus, or larger sources") if off > 0.0 else ("narrower", "smaller sources")
-            )
-            yield self._doubted(
-                name,
-                [doubt for doubt, width_off in self.doubts if width_off],
-                f"small flares {100.0 * abs(off):.2g} % {how} than the calibration's point spread ({why}?)",
-            )
+        if of_width := [(doubt, width_off) for doubt, width_off in self.doubts if width_off]:
+            by_width, off = zip(*of_width, strict=True)
+            yield self._doubted(name, by_width, self._small_flares(median(off)))
+        for camera, seen in self.widths.items():
+            if not of_width and (together := log_width_of_frames(seen, calibrations[camera])):
+                yield (
+                    f"{name} saw {self._small_flares(together)}, in all frames of {camera} together: ranges "
+                    "of clipped ones may be off as much, beyond their sigmas: state the sigma of psf_sigma_px"
+                )
+
+    @staticmethod
+    def _small_flares(off: float) -> str:
+        how, why = ("wider", "defocus, or larger sources") if off > 0.0 else ("narrower", "smaller sources")
+        return f"small flares {100.0 * abs(off):.2g} % {how} than the calibration's point spread ({why}?)"
 
     @staticmethod
     def _doubted(name: str, doubts: Sequence[float], what: str) -> str:

@@ -130,6 +130,7 @@ def _kept(found: Sequence[Detection], now: Sequence[Detection]) -> Detections:
             truncated=found.truncated,
             range_doubt=found.range_doubt,
             psf_width_off=found.psf_width_off,
+            psf_width_seen=found.psf_width_seen,
             swept_px=found.swept_px,
         )
     return Detections(now)

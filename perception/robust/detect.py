@@ -27,7 +27,13 @@ from perception.robust.search.near import most_brightness
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
 from perception.robust.solve import Solution
-from perception.robust.together.free_width import log_range_slopes, log_width_of_calibration, tells_width
+from perception.robust.together.free_width import (
+    NOTHING_SEEN,
+    log_range_slopes,
+    log_width_of_calibration,
+    seen_log_width,
+    tells_width,
+)
 from perception.types import Calibration, Detection, Detections, RawFrame
 
 CONTRAST_SIGMAS = 6.03
@@ -110,11 +116,14 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
     if not reported:
         return Detections(reason=reason_of_none(prepared, len(blobs), late=late), truncated=truncated)
     range_doubt = psf_width_off = 0.0
+    seen = NOTHING_SEEN
     if in_fog:
         reported = list(_in_fog(reported, frame, calibration))
     else:
-        doubts, log_width = _log_range_doubts(
-            [found for _, found in reported], camera, is_at_once=frame.line_time_s == 0.0
+        seen = seen_log_width(_telling_points([found for _, found in reported]), camera)
+        log_width = log_width_of_calibration(seen, camera)
+        doubts = _log_range_doubts(
+            [found for _, found in reported], log_width, camera, is_at_once=frame.line_time_s == 0.0
         )
         if any(doubts):
             range_doubt, psf_width_off = median(filter(None, doubts)), math.expm1(log_width)
@@ -130,6 +139,7 @@ def detect_robust(frame: RawFrame, calibration: Calibration, limit_s: float = ma
         truncated=truncated,
         range_doubt=range_doubt,
         psf_width_off=psf_width_off,
+        psf_width_seen=seen,
         swept_px=_swept_px([found for _, found in reported], camera),
     )
 
@@ -161,24 +171,23 @@ def _swept_px(found: Sequence[MeasuredFlare], camera: Camera) -> float:
 
 
 def _log_range_doubts(
-    found: Sequence[MeasuredFlare], camera: Camera, *, is_at_once: bool
-) -> tuple[list[float], float]:
+    found: Sequence[MeasuredFlare], log_width: float, camera: Camera, *, is_at_once: bool
+) -> list[float]:
     """Return how far the range of each flare may be off because the calibration is, as all of them tell.
 
-    And by how much ln of the point spread's width is.
+    By how much ln of the point spread's width is is known.
     """
     discs = _telling_discs(found, is_at_once=is_at_once)
     by_discs = log_range_of_calibration(discs, camera)
     # One disc may be a mirror image, and says nothing of others.
     doubts = [by_discs if len(discs) > 1 or one.alone in discs else 0.0 for one in found]
-    log_width = log_width_of_calibration(_telling_points(found), camera)
     if log_width != 0.0:
         lone = {k: one.lone for k, one in enumerate(found) if one.lone is not None}
         slopes = abs(log_range_slopes(list(lone.values()), camera))
         usual = float(np.nanmedian(slopes))
         known = dict(zip(lone, np.where(np.isnan(slopes), usual, slopes).tolist(), strict=True))
         doubts = [max(doubt, abs(log_width) * known.get(k, usual)) for k, doubt in enumerate(doubts)]
-    return doubts, log_width
+    return doubts
 
 
 def _telling_points(found: Sequence[MeasuredFlare]) -> list[Solution]:

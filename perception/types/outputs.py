@@ -66,6 +66,9 @@ class Detections(list[Detection]):
     psf_width_off
         By about what share small flares are wider than the calibration's point spread makes them, or
         narrower if below 0; 0 where nothing shows it.
+    psf_width_seen
+        The same share as this frame alone sees it, noise or not, and its σ, infinite where it sees nothing:
+        frames of a recording tell together what none tells alone.
     swept_px
         How far flares that rest are swept over the image while it is exposed, in their median, as the camera
         turns; 0 where they tell of no turn. They are fitted as drawn out by it.
@@ -79,11 +82,13 @@ class Detections(list[Detection]):
         truncated: bool = False,
         range_doubt: float = 0.0,
         psf_width_off: float = 0.0,
+        psf_width_seen: tuple[float, float] = (0.0, math.inf),
         swept_px: float = 0.0,
     ) -> None:
         super().__init__(found)
         self.reason, self.truncated = reason, truncated
-        self.range_doubt, self.psf_width_off, self.swept_px = range_doubt, psf_width_off, swept_px
+        self.range_doubt, self.psf_width_off = range_doubt, psf_width_off
+        self.psf_width_seen, self.swept_px = psf_width_seen, swept_px
 
 
 Ghost = Literal["no", "possible", "yes"]

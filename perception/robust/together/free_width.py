@@ -12,41 +12,66 @@ from perception.robust.goodness import MISFIT_PROBABILITY
 from perception.robust.overlap.free_fits import MOST_CLAIMED, with_spread
 from perception.robust.solve import Solution
 from perception.robust.together.camera_turn import drawn_out_squares
+from perception.types import Calibration
 
 Array = NDArray[np.float64]
 
 _WIDTH_UNIT = 0.1
 _FLUX_OFF = 0.05
 _FEWEST, _MOST = 3, 8
+_SIGMAS_OF_FRAMES, _LEAST_OF_FRAMES = 6.0, 0.0075
 _MOST_TURN_CHI2 = 9.2  # noise has more once in a hundred frames
 
 
-def log_width_of_calibration(points: Sequence[Solution], camera: Camera) -> float:
-    """Return by how much ln of the point spread's width is off, by small flares alone in their windows.
+NOTHING_SEEN = (0.0, math.inf)
+
+
+def seen_log_width(points: Sequence[Solution], camera: Camera) -> tuple[float, float]:
+    """Return by how much ln of the point spread's width is off, and σ, by small flares alone in windows.
 
     Each takes a step from its fit to one of free width. A flux that is not quite what its size says, as
     mirror images have it, makes them seem wider: so much of it is open. Glossy mirrors and walls close behind
-    make some wider, too: the quarter that leans farthest one way does not speak. 0 where noise leans so far
-    once in a million frames, the calibration's claim covers it, or all are drawn out along one line: the
-    camera turns.
+    make some wider, too: the quarter that leans farthest one way does not speak. `NOTHING_SEEN` where there
+    are too few, or all are drawn out along one line: the camera turns.
     """
     points = sorted(points, key=lambda one: _sigma(one, camera))[:_MOST]
     steps = _width_steps(points, with_spread(camera, "range_constant_dn_m2_per_s", _FLUX_OFF))
     tell = np.flatnonzero(np.isfinite(steps).all(axis=1))
     points, steps = [points[k] for k in tell], steps[tell]
     if len(steps) < _FEWEST:
-        return 0.0
+        return NOTHING_SEEN
     off, precision = steps[:, 0], steps[:, 1] ** -2.0
     leaning = off / steps[:, 1] * np.sign(np.sum(off * precision))
     kept = np.argsort(leaning, kind="stable")[: len(steps) - len(steps) // 4]
     sigma = 1.0 / math.sqrt(float(precision[kept].sum()))
-    mean = float(np.sum(off[kept] * precision[kept])) * sigma**2
+    if _turn_chi2([points[k] for k in kept]) > _MOST_TURN_CHI2:
+        return NOTHING_SEEN
+    return float(np.sum(off[kept] * precision[kept])) * sigma**2, sigma
+
+
+def log_width_of_calibration(seen: tuple[float, float], camera: Camera) -> float:
+    """Return by how much ln of the width is off for sure, as seen in a frame (`seen_log_width`).
+
+    0 where noise leans so far once in a million frames, or the calibration's claim covers it.
+    """
+    mean, sigma = seen
     beyond = (abs(mean) - MOST_CLAIMED * camera.width_spread) / sigma
     if math.erfc(max(beyond, 0.0) / math.sqrt(2.0)) > MISFIT_PROBABILITY:
         return 0.0
-    if _turn_chi2([points[k] for k in kept]) > _MOST_TURN_CHI2:
-        return 0.0
     return math.copysign(math.sqrt(mean**2 - sigma**2), mean)
+
+
+def log_width_of_frames(seen: Sequence[tuple[float, float]], calibration: Calibration) -> float:
+    """Return by how much ln of a camera's width is off as its frames see it together (`seen_log_width`).
+
+    0 where that is noise, too little to matter or for glossy mirrors and walls to be excluded, or claimed.
+    """
+    off, sigma = np.array(seen).reshape(-1, 2).T
+    total = float(np.sum(sigma**-2.0))
+    mean = float(np.sum(off * sigma**-2.0)) / max(total, 1e-300)
+    claimed = calibration.sigma.get("psf_sigma_px", 0.0) / calibration.psf_sigma_px
+    least = max(_SIGMAS_OF_FRAMES * max(total, 1e-300) ** -0.5, _LEAST_OF_FRAMES, MOST_CLAIMED * claimed)
+    return mean if abs(mean) > least else 0.0
 
 
 def _turn_chi2(points: Sequence[Solution]) -> float:

@@ -161,6 +161,38 @@ def test_a_calibration_that_flares_contradict_is_told(
     assert least_percent < float(told.rpartition("off by ")[2].partition(" %")[0]) < most_percent
 
 
+@pytest.mark.parametrize(
+    ("off", "claimed", "is_told"), [(1.025, 0.0, True), (1.0, 0.0, False), (1.025, 0.01, False)]
+)
+def test_frames_tell_together_of_a_width_of_which_each_is_silent(
+    tmp_path: Path, off: float, claimed: float, is_told: bool
+) -> None:
+    """Of 2.5 %, by 24 frames of five sources, each of which tells it to 1.2 %; not where it is claimed to 1 %."""
+    mean_e, lines = expected_e(FRONT, FAR, 1e-3, 2.0), []
+    for index in range(24):
+        frame = dataclasses.replace(
+            expose(mean_e, FRONT, random(72, index), 1e-3), camera="r1.front", index=index, time_s=0.1 * index
+        )
+        (tmp_path / f"{index}.png").write_bytes(encode_png16(frame.data_dn))
+        lines.append(json.dumps(frame_record(frame, f"{index}.png")))
+    (tmp_path / "frames.jsonl").write_text("\n".join(lines))
+    width_px = FRONT.psf_sigma_px / off
+    known = dataclasses.replace(
+        FRONT, psf_sigma_px=width_px, sigma={**FRONT.sigma, "psf_sigma_px": claimed * width_px}
+    )
+    (tmp_path / "calibration.json").write_text(json.dumps(calibration_document([known])))
+    warnings = perceive_run(
+        tmp_path, estimators=chosen_estimators(["robust"]), progress=lambda *_: None
+    ).warnings
+    assert len(warnings) == is_told
+    if is_told:
+        assert (
+            "% wider than the calibration's point spread (defocus, or larger sources?), in all" in warnings[0]
+        )
+        told = float(warnings[0].partition("small flares ")[2].partition(" %")[0])
+        assert told == pytest.approx(100.0 * (off - 1.0), abs=0.8)
+
+
 def test_an_estimator_of_sets_gets_its_robot_s_odometry(recording: Path) -> None:
     (recording.parent / "own.py").write_text(
         "from perception import detect\n"
