@@ -124,15 +124,7 @@ def measure_set(
 def _kept(found: Sequence[Detection], now: Sequence[Detection]) -> Detections:
     """Return a frame's detections, with what was said of them as a whole."""
     if isinstance(found, Detections):
-        return Detections(
-            now,
-            reason=found.reason,
-            truncated=found.truncated,
-            range_doubt=found.range_doubt,
-            psf_width_off=found.psf_width_off,
-            psf_width_seen=found.psf_width_seen,
-            swept_px=found.swept_px,
-        )
+        return found.replaced_by(now)
     return Detections(now)
 
 

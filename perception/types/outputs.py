@@ -90,6 +90,12 @@ class Detections(list[Detection]):
         self.range_doubt, self.psf_width_off = range_doubt, psf_width_off
         self.psf_width_seen, self.swept_px = psf_width_seen, swept_px
 
+    def replaced_by(self, now: Iterable[Detection]) -> "Detections":
+        """Return others in their place, with what is known of these as a whole."""
+        told = Detections(now)
+        told.__dict__.update(self.__dict__)
+        return told
+
 
 Ghost = Literal["no", "possible", "yes"]
 """Whether something is the mirror image of a robot."""
