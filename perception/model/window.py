@@ -291,6 +291,7 @@ def usual_motion_px(log_range: Array, camera: Camera, turn_rad_per_s: float) -> 
 
 def _motion_prior(length_px: Array, log_range: Array, camera: Camera) -> tuple[Array, float]:
     """Return the densities of motions at ordinary speeds, shape (flares,), and of any others."""
-    sigma2_px2 = usual_motion_px(log_range, camera, TURN_RAD_PER_S) ** 2
+    turn_rad_per_s = TURN_RAD_PER_S if camera.turn is None else 0.0
+    sigma2_px2 = usual_motion_px(log_range, camera, turn_rad_per_s) ** 2
     usual = np.exp(-0.5 * length_px**2 / sigma2_px2) / (math.pi * sigma2_px2)
     return (1.0 - _OTHERWISE) * usual, _OTHERWISE / (0.5 * math.pi * MOST_MOTION_PX**2)

@@ -16,9 +16,10 @@ from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
+from perception.robust.explain import by_blobs
 from perception.robust.flare import MeasuredFlare
 from perception.robust.goodness import is_likely
-from perception.robust.measure import measure
+from perception.robust.measure import as_it_turns, measure
 from perception.robust.overlap.free_fits import log_range_of_calibration
 from perception.robust.search.blobs import Blob, blobs_at, is_large, split_at_peaks
 from perception.robust.search.frame import levels_around
@@ -43,6 +44,7 @@ MOST_FLARES = 1000
 """The robust detector measures no more blobs of a frame than this, the brightest: it bounds the time."""
 
 _AT_ONCE = 8  # clusters between two looks at the clock
+_TELL_OF_TURN = 32  # clusters that are asked whether the camera turns, where time is limited
 _RING_PX = 4
 _SUMMIT_REACH = 4.0  # σ of the point spread: three of what it is filtered to, √2 times as wide
 _FEWEST_RING_PIXELS = 8
@@ -156,6 +158,9 @@ def _measured(
         return measured, False, camera
     by_flux = sorted(found, key=lambda each: -max(each.members[k].flux_e for k in each.wanted))
     measured = []
+    if time.perf_counter() < until_s:  # all of the flares are to be fitted alike
+        lone = [each for each in by_flux if len(each.members) == 1 and not each.members[0].is_beyond_fit]
+        camera = as_it_turns(by_blobs(lone[:_TELL_OF_TURN], prepared, camera), prepared, camera)
     for first in range(0, len(by_flux), _AT_ONCE):
         if time.perf_counter() >= until_s:
             return measured, True, camera

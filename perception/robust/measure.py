@@ -67,8 +67,8 @@ def measure(
     """
     fitted = [cluster for cluster in found if not any(member.is_beyond_fit for member in cluster.members)]
     plain = by_blobs(fitted, prepared, camera)
-    if not apart and camera.turn is None and prepared.frame.line_time_s == 0.0:
-        at_rest, camera = camera, turning([one for one in plain if one is not None], camera)
+    if not apart:
+        at_rest, camera = camera, as_it_turns(plain, prepared, camera)
         plain = plain if camera is at_rest else by_blobs(fitted, prepared, camera)
     solutions = best(fitted, plain, prepared, camera)
     odd = [index for index, solution in enumerate(solutions) if solution is not None and _is_odd(solution)]
@@ -111,6 +111,16 @@ def measure(
         in_view = clusters(on_flank, prepared, apart=True, measured=done, within_px=_IN_VIEW_PX)
         measured += measure(in_view, prepared, camera, True, done)[0]
     return measured, camera
+
+
+def as_it_turns(plain: Sequence[Solution | None], prepared: PreparedFrame, camera: Camera) -> Camera:
+    """Return a frame's camera as it turns, if it was at rest so far and flares at rest tell that it does.
+
+    Behind a rolling shutter motion is not fitted.
+    """
+    if camera.turn is not None or prepared.frame.line_time_s > 0.0:
+        return camera
+    return turning([one for one in plain if one is not None], camera)
 
 
 def _may_be_before_edge(solution: Solution, shape: tuple[int, int]) -> bool:

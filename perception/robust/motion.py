@@ -17,6 +17,8 @@ from perception.robust.problem import Motion, Problem
 from perception.robust.solve import Solution, solve
 
 Array = NDArray[np.float64]
+Squares = NDArray[np.complex128]
+"""Of motions a + ib along u and v, in px²: they draw images out by these, which add."""
 
 SEEMS_CHI2 = 6.0
 """Of two degrees of freedom, what a lone flare longer than wide leaves over: noise does it once in 20."""
@@ -28,6 +30,8 @@ _LONG = 0.2  # radii by which a disc moves: it is a tenth longer than wide
 
 MOST_TOGETHER = 4
 """More flares in one window are not tried as moving ones."""
+
+_COARSE = 1.2  # differences of neighbours see so much more of a point than is there (`goodness.drawn_out`)
 
 AT_REST = (0.0, 0.0)
 """A fit that begins so stays so where the camera does not turn: to first order a motion changes nothing."""
@@ -72,6 +76,18 @@ def asked_motions(solution: Solution, camera: Camera) -> list[Motion]:
     if solution.count == 1:
         return [_seen(solution, 0, *solution.drawn_out, camera)]
     return [_seen(solution, k, *_drawn_out(solution, k), camera) for k in range(solution.count)]
+
+
+def drawn_out_squares(lone: Sequence[Solution]) -> tuple[Squares, Array]:
+    """Return by how much more flares are drawn out than their fits, and the precision of both its parts.
+
+    (a + ib)², a and b the motion along u and v; of one σ in both parts. Shape (flares,) each. A precision of
+    0 tells nothing.
+    """
+    seen = np.array([one.drawn_out[:3] for one in lone]).reshape(-1, 3)
+    square: Squares = (seen[:, 1] + 1j * seen[:, 2]) ** 2 / _COARSE
+    length4 = np.abs(square) ** 2
+    return square, np.divide(seen[:, 0], length4, out=np.zeros(len(seen)), where=length4 > 0.0)
 
 
 def share_asked(solution: Solution) -> float:
@@ -150,7 +166,9 @@ def _drawn_out(solution: Solution, flare: int) -> tuple[float, float, float, flo
 
 def _around(solution: Solution, flare: int) -> PixelBox:
     """Return the part of a window that one of its flares shines into."""
-    reach_px = math.ceil(float(solution.image_radius_px[flare]) + 3.0 * solution.psf_sigma_px)
+    swept_px = 0.0 if solution.sources is None else abs(complex(solution.sources.swept[flare]))
+    radius_px = float(solution.image_radius_px[flare]) + 0.5 * swept_px
+    reach_px = math.ceil(radius_px + 3.0 * solution.psf_sigma_px)
     left, top = round(float(solution.u_px[flare])) - reach_px, round(float(solution.v_px[flare])) - reach_px
     window, side = solution.window.box, 2 * reach_px + 1
     part = PixelBox(top, left, side, side).seen_from(window).inside((window.height, window.width))

@@ -15,10 +15,11 @@ from perception.model.bearing import turn_slopes_px
 from perception.model.layout import CLIPPED
 from perception.model.likelihood.scoring_step import scoring_step
 from perception.model.window import TURN_RAD_PER_S, Camera, Turn, usual_motion_px
+from perception.robust.motion import Squares, drawn_out_squares
 from perception.robust.solve import Solution, solve
+from perception.robust.together.free_width import seen_log_width
 
 Array = NDArray[np.float64]
-Squares = NDArray[np.complex128]
 
 _LEAST_CHI2 = 21.1  # of three degrees of freedom: noise has more once in ten thousand frames
 _FEWEST, _MOST, _LEAST_SNR = 3, 32, 10.0
@@ -26,10 +27,9 @@ _MOST_RADIUS_PX = 10.0  # larger ones show whether the lens is as calibrated
 _QUICK = 10.0  # times the usual turn: standard deviation of what is looked for
 _ROUNDS, _SETTLED = 4, 0.1  # the latter of χ²
 _MOST_STEPS, _LEAST_STEP2 = 30, 1e-6
-_COARSE = 1.2  # differences of neighbours see so much more than is there (`goodness.drawn_out`), of points
 _SIGMAS = 5.0  # of χ²
 _MUCH_BETTER = 9.0  # of χ²
-_MOST_APART_CHI2 = 13.8  # of two degrees of freedom: noise has more once in a thousand flares
+_MUCH_CHI2 = 13.8  # of two degrees of freedom: noise has more once in a thousand flares
 
 
 def turning(lone: Sequence[Solution], camera: Camera) -> Camera:
@@ -37,9 +37,10 @@ def turning(lone: Sequence[Solution], camera: Camera) -> Camera:
 
     A flare that is swept by m = a + ib is drawn out by m², a and b in pixels. The rotation that explains
     these best must explain more than noise gives once in ten thousand frames without the quarter that speaks
-    for it most, as what is two, or moves itself, may be drawn out as far. And what it leaves must be noise,
-    but for robots' own motions at ordinary speeds: glossy floors that draw flares out all in one direction
-    draw near ones out farther.
+    for it most, as what is two, or moves itself, may be drawn out as far; nor may one of the others speak
+    alone. What it leaves must be noise, but for robots' own motions at ordinary speeds: glossy floors that
+    draw flares out all in one direction draw near ones out farther. And flares must not be so much narrower
+    across: a point spread that is not round looks like this.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def turning(lone: Sequence[Solution], camera: Camera) -> Camera:
         # Of images far from round a residual tells to first order only.
         before, again = turn.rotation_rad, solve([one.again() for one in tells], turned)
         tells = [one for one in again if one is not None and _tells(one)]
-    return turned
+    return camera if _is_spread(tells, turned) else turned
 
 
 def with_turn(solution: Solution, camera: Camera) -> Solution:
@@ -98,18 +99,6 @@ def with_turn(solution: Solution, camera: Camera) -> Solution:
         log_range_of_model=np.hypot(solution.log_range_of_model, off[0]),
         log_flux_of_model=np.hypot(solution.log_flux_of_model, 2.0 * off[1]),
     )
-
-
-def drawn_out_squares(lone: Sequence[Solution]) -> tuple[Squares, Array]:
-    """Return by how much more flares are drawn out than their fits, and the precision of both its parts.
-
-    (a + ib)², a and b the motion along u and v; of one σ in both parts. Shape (flares,) each. A precision of
-    0 tells nothing.
-    """
-    seen = np.array([one.drawn_out[:3] for one in lone]).reshape(-1, 3)
-    square: Squares = (seen[:, 1] + 1j * seen[:, 2]) ** 2 / _COARSE
-    length4 = np.abs(square) ** 2
-    return square, np.divide(seen[:, 0], length4, out=np.zeros(len(seen)), where=length4 > 0.0)
 
 
 def _tells(one: Solution) -> bool:
@@ -161,6 +150,19 @@ class _Drawn:
         return np.asarray(1.0 / (1.0 / self.precision + (2.0 * np.abs(swept) * self.own_px) ** 2))
 
 
+def _is_spread(lone: Sequence[Solution], turned: Camera) -> bool:
+    """Tell whether flares that are fitted as swept are narrower by what that widens them, half or more of it.
+
+    Of a motion m, σ² of an image grows by m²/24 on the mean of all directions.
+    """
+    swept2_px2 = np.median(
+        [abs(complex(one.sources.swept[0])) ** 2 for one in lone if one.sources is not None]
+    )
+    widened = float(swept2_px2) / (48.0 * turned.calibration.psf_sigma_px**2)
+    off, sigma = seen_log_width(lone, turned)
+    return abs(off + widened) < 0.5 * widened and off**2 - (off + widened) ** 2 > _MUCH_BETTER * sigma**2
+
+
 def _turn(lone: Sequence[Solution], camera: Camera) -> Turn | None:
     """Return the turn that flares tell together, None where they tell of none."""
     if len(lone) < _FEWEST:
@@ -185,7 +187,10 @@ def _turn(lone: Sequence[Solution], camera: Camera) -> Turn | None:
     swept = kept.by_turn @ rotation_rad
     weight, free = kept.weight(swept), 2 * len(swept) - 3
     chi2 = float(np.sum(weight * np.abs(kept.square - swept**2) ** 2))
-    if float(kept.gains(rotation_rad).sum()) < _LEAST_CHI2 or chi2 > free + _SIGMAS * math.sqrt(2.0 * free):
+    gains = kept.gains(rotation_rad)
+    if float(gains.sum()) < _LEAST_CHI2 or float(gains.sum() - gains.max()) < _MUCH_CHI2:
+        return None
+    if chi2 > free + _SIGMAS * math.sqrt(2.0 * free):
         return None
     # As 1/d² does what moves past, or stands on a mirror.
     nearness = kept.range_m**-2.0
@@ -194,12 +199,13 @@ def _turn(lone: Sequence[Solution], camera: Camera) -> Turn | None:
         return None
     # Those that were left out have their say where they agree: they are not all above the mean by chance.
     swept = drawn.by_turn @ rotation_rad
-    agree = drawn.weight(swept) * np.abs(drawn.square - swept**2) ** 2 < _MOST_APART_CHI2
-    return Turn(*_likeliest(rotation_rad, drawn.of(np.flatnonzero(agree)), sigma_rad))
+    agree = drawn.weight(swept) * np.abs(drawn.square - swept**2) ** 2 < _MUCH_CHI2
+    rotation_rad, covariance_rad2 = _likeliest(rotation_rad, drawn.of(np.flatnonzero(agree)), sigma_rad)
+    return Turn(rotation_rad, max(chi2 / free, 1.0) * covariance_rad2)
 
 
 def _first_guess(drawn: _Drawn, sigma_rad: float) -> tuple[float, Array]:
-    """Return more than any rotation gains of χ², and a first guess of the one that gains most.
+    """Return about the most of χ² that any rotation may gain, and a first guess of the one that gains most.
 
     Squares are linear in the products of the rotation's parts: the best matrix of these gains more than one
     that is of rank one, as products are; the first guess is its largest part.

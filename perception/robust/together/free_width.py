@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from perception.model.likelihood.scoring_step import scoring_step
 from perception.model.window import Camera
 from perception.robust.goodness import MISFIT_PROBABILITY
+from perception.robust.motion import drawn_out_squares
 from perception.robust.overlap.free_fits import MOST_CLAIMED, with_spread
 from perception.robust.solve import Solution
-from perception.robust.together.camera_turn import drawn_out_squares
 from perception.types import Calibration
 
 Array = NDArray[np.float64]

@@ -47,11 +47,11 @@ def swept_px(places: Array, turn_rad: tuple[float, float, float]) -> Array:
     return np.asarray(beyond - before)
 
 
-def told_of(sources: Array, ways_px: Array, *key: int) -> Detections:
-    """Return what is told of flares that move so, and asserted to be one each."""
+def told_of(sources: Array, ways_px: Array, *key: int, through: Calibration = CAMERA) -> Detections:
+    """Return what is told of flares that move so, seen through a lens, and asserted to be one each."""
     mean_e = np.full((KNOWN.height_px, KNOWN.width_px), 10.0)
     for (u, v, range_m), way in zip(sources.tolist(), ways_px.tolist(), strict=True):
-        left, top, light_e = drawn_out_e(CAMERA, u, v, range_m, (way[0], way[1]))
+        left, top, light_e = drawn_out_e(through, u, v, range_m, (way[0], way[1]))
         mean_e[top : top + len(light_e), left : left + len(light_e)] += light_e
     told = perception.detect(expose(mean_e, KNOWN, random(*key), EXPOSURE_S), KNOWN)
     order = [
@@ -132,6 +132,28 @@ def test_flares_that_move_themselves_or_past_the_camera_are_no_turn() -> None:
         assert told_of(sources, ways_px, 323, key).swept_px == 0.0
 
 
+def test_one_flare_of_few_tells_of_no_turn() -> None:
+    """Of three two move by 1.5 px, each its own way; near the axis the third would not contradict a roll."""
+    told = 0
+    for key in range(12):
+        number = random(325, key)
+        sources = flares(number)[[0, 7, 17]]
+        angle_rad = number.uniform(0.0, math.pi, 2)
+        ways_px = 1.5 * np.array([[math.cos(one), math.sin(one)] for one in angle_rad] + [[0.0, 0.0]])
+        told += told_of(sources, ways_px[[0, 2, 1]], 326, key).swept_px > 0.0
+    assert told <= 1
+
+
+@pytest.mark.parametrize("longer", [0.03, 0.06, 0.1])
+def test_a_point_spread_that_is_not_round_is_no_turn(longer: float) -> None:
+    """σ² larger along u by a share, and smaller along v: a turn is as wide as the calibration says across."""
+    across = replace(CAMERA, psf_sigma_px=CAMERA.psf_sigma_px * math.sqrt(1.0 - longer))
+    way_px = math.sqrt(12.0 * 2.0 * longer) * CAMERA.psf_sigma_px
+    sources = flares(random(327), 1.5, 5.0)
+    ways_px = np.full((len(sources), 2), (way_px, 0.0))
+    assert told_of(sources, ways_px, 328, through=across).swept_px == 0.0
+
+
 @pytest.mark.parametrize(("range_m", "sigma_k"), [(2.5, 0.0), (0.9, 0.0), (0.6, 0.1)])
 def test_what_own_motions_change_of_a_range_is_what_other_turns_find(range_m: float, sigma_k: float) -> None:
     """A flare swept by 2 px, without noise: by its fits where it is swept by 0.1 px more or less along u and v.
@@ -162,6 +184,22 @@ def test_what_own_motions_change_of_a_range_is_what_other_turns_find(range_m: fl
         slopes.append(math.log(more.range_m / less.range_m) / 0.2)
     moved_px = math.hypot(known.fx_px * EXPOSURE_S * 0.7 / range_m, 0.1)
     assert measured(1.6, 1.2).log_range_of_model == pytest.approx(math.hypot(*slopes) * moved_px, rel=0.04)
+
+
+def test_a_time_limit_leaves_no_flare_at_rest() -> None:
+    """The brightest eight, measured first, are near, clipped, and tell nothing of the turn."""
+    sources = flares(random(351), 1.5, 3.0)
+    sources[::3, 2] = 0.35
+    ways_px = 1.3 * swept_px(sources[:, :2], PAN_1_PX)
+    mean_e = np.full((KNOWN.height_px, KNOWN.width_px), 10.0)
+    for (u, v, range_m), way in zip(sources.tolist(), ways_px.tolist(), strict=True):
+        left, top, light_e = drawn_out_e(CAMERA, u, v, range_m, (way[0], way[1]))
+        mean_e[top : top + len(light_e), left : left + len(light_e)] += light_e
+    frame = expose(mean_e, KNOWN, random(352), EXPOSURE_S)
+    told, limited = perception.detect(frame, KNOWN), perception.detect(frame, KNOWN, limit_s=1e3)
+    assert len(told) == len(limited) == len(sources)
+    assert limited.swept_px == pytest.approx(told.swept_px, rel=0.03)
+    assert sum(one.merged for one in limited) == sum(one.merged for one in told)
 
 
 @pytest.mark.verify
