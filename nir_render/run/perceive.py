@@ -275,6 +275,7 @@ class _Notes:
     truncated: int = 0
     doubts: list[tuple[float, float]] = field(default_factory=list)  # `range_doubt`, `psf_width_off`
     widths: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # `psf_width_seen`, by camera
+    swept: list[float] = field(default_factory=list)  # `swept_px`
 
     def take(self, camera: str, found: Detections) -> Detections:
         """Note what is said of a camera's frame, and return its detections."""
@@ -283,6 +284,7 @@ class _Notes:
         self.truncated += found.truncated
         self.doubts += [(found.range_doubt, found.psf_width_off)] if found.range_doubt else []
         self.widths.setdefault(camera, []).append(found.psf_width_seen)
+        self.swept += [found.swept_px] if found.swept_px else []
         return found
 
     def warnings(self, name: str, total: int, calibrations: Mapping[str, Calibration]) -> Iterator[str]:
@@ -301,9 +303,7 @@ class _Notes:
             frames = "one frame" if self.truncated == 1 else f"{self.truncated} frames"
             yield f"{name} saw more in {frames} than it measures: the brightest are reported and told apart"
         if by_discs := [doubt for doubt, width_off in self.doubts if not width_off]:
-            yield self._doubted(
-                name, by_discs, "near sources of which size and flux, as calibrated, contradict"
-            )
+            yield self._doubted(name, by_discs, "near sources whose size and flux, as calibrated, contradict")
         if of_width := [(doubt, width_off) for doubt, width_off in self.doubts if width_off]:
             by_width, off = zip(*of_width, strict=True)
             yield self._doubted(name, by_width, self._small_flares(median(off)))
@@ -313,6 +313,9 @@ class _Notes:
                     f"{name} saw {self._small_flares(together)}, in all frames of {camera} together: ranges "
                     "of clipped ones may be off as much, beyond their sigmas: state the sigma of psf_sigma_px"
                 )
+        if self.swept:
+            by = f"{median(self.swept):.2g} px in {len(self.swept)} frame{'s'[: len(self.swept) != 1]}"
+            yield f"{name} saw cameras turn while exposed, {by}: if none did, the point spread is not round"
 
     @staticmethod
     def _small_flares(off: float) -> str:

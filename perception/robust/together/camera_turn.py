@@ -28,7 +28,7 @@ _QUICK = 10.0  # times the usual turn: standard deviation of what is looked for
 _ROUNDS, _SETTLED = 4, 0.1  # the latter of χ²
 _MOST_STEPS, _LEAST_STEP2 = 30, 1e-6
 _SIGMAS = 5.0  # of χ²
-_MUCH_BETTER = 9.0  # of χ²
+_BETTER, _MUCH_BETTER = 4.0, 9.0  # of χ²
 _MUCH_CHI2 = 13.8  # of two degrees of freedom: noise has more once in a thousand flares
 
 
@@ -160,7 +160,7 @@ def _is_spread(lone: Sequence[Solution], turned: Camera) -> bool:
     )
     widened = float(swept2_px2) / (48.0 * turned.calibration.psf_sigma_px**2)
     off, sigma = seen_log_width(lone, turned)
-    return abs(off + widened) < 0.5 * widened and off**2 - (off + widened) ** 2 > _MUCH_BETTER * sigma**2
+    return abs(off + widened) < 0.5 * widened and off**2 - (off + widened) ** 2 > _BETTER * sigma**2
 
 
 def _turn(lone: Sequence[Solution], camera: Camera) -> Turn | None:

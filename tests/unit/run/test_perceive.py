@@ -131,7 +131,7 @@ FAR = [(20.2, 20.7, 6.1), (90.4, 25.3, 5.5), (30.8, 75.1, 7.2), (95.6, 70.9, 5.8
     ("places", "exposure_s", "off", "said", "least_percent", "most_percent"),
     [
         (NEAR, 2e-5, {"source_radius_m": 1.05 * FRONT.source_radius_m},
-         "robust saw near sources of which size and flux, as calibrated, contradict, in 3 frames", 2.0, 5.0),
+         "robust saw near sources whose size and flux, as calibrated, contradict, in 3 frames", 2.0, 5.0),
         (FAR, 1e-3, {"psf_sigma_px": FRONT.psf_sigma_px / 1.1},
          r"robust saw small flares (9|10|11)(\.\d)? % wider than the calibration's point spread .*, in 3 frames", 0.05, 3.0),
     ],
@@ -191,6 +191,19 @@ def test_frames_tell_together_of_a_width_of_which_each_is_silent(
         )
         told = float(warnings[0].partition("small flares ")[2].partition(" %")[0])
         assert told == pytest.approx(100.0 * (off - 1.0), abs=0.8)
+
+
+def test_cameras_that_turn_while_exposed_are_told(recording: Path) -> None:
+    (recording.parent / "own.py").write_text(
+        "from perception import Detections, detect\n"
+        "def turned(frame, calibration):\n"
+        "    return Detections(detect(frame, calibration), swept_px=1.5 * (frame.camera == 'r1.front'))\n"
+    )
+    chosen = chosen_estimators([f"{recording.parent / 'own.py'}:turned"])
+    (told,) = perceive_run(recording, estimators=chosen, progress=lambda *_: None).warnings
+    assert told.startswith(
+        "turned saw cameras turn while exposed, 1.5 px in 3 frames: if none did, the point"
+    )
 
 
 def test_an_estimator_of_sets_gets_its_robot_s_odometry(recording: Path) -> None:
