@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 _LEAST_CHI2 = 21.1  # of three degrees of freedom: noise has more once in ten thousand frames
 _FEWEST, _MOST, _LEAST_SNR = 3, 32, 10.0
+_STRUCTURE = 30.0  # times as bright as texture beneath it is a flare that tells
 _MOST_RADIUS_PX = 10.0  # larger ones show whether the lens is as calibrated
 _QUICK = 10.0  # times the usual turn: standard deviation of what is looked for
 _ROUNDS, _SETTLED = 4, 0.1  # the latter of χ²
@@ -106,7 +107,8 @@ def _tells(one: Solution) -> bool:
         one.count == 1
         and one.motion_px is None
         and one.sources is not None
-        and one.window.is_even
+        and one.window.features is None
+        and _STRUCTURE * one.window.structure_e <= float(one.flares_e.max())
         and float(one.image_radius_px[0]) <= _MOST_RADIUS_PX
         and float(one.flux_e[0]) > _LEAST_SNR * float(one.flux_noise_e[0])
         and not (one.window.state == CLIPPED).any()
