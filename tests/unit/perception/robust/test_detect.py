@@ -242,11 +242,11 @@ def test_limited_time_measures_the_brightest_as_they_are() -> None:
 
 
 def test_what_time_leaves_is_the_brightest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock that stands at 0 for two looks: one batch of clusters, the nearest sources of all."""
+    """A clock that stands at 0 for three looks, before the turn of the camera and the first batch: the nearest of all."""
     sources = [
         (14.3 + 24.0 * k, 16.4 + 32.0 * row, 4.0 + 0.3 * (8 * row + k)) for row in range(4) for k in range(8)
     ]
-    frame, looks = take(sources[::-1], 1e-3, 72), iter([0.0, 0.0])
+    frame, looks = take(sources[::-1], 1e-3, 72), iter([0.0, 0.0, 0.0])
     monkeypatch.setattr(detect, "time", SimpleNamespace(perf_counter=lambda: next(looks, 9.0)))
     found = detect_robust(frame, SMALL, 1.0)
     assert found.truncated
