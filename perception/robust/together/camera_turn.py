@@ -30,6 +30,7 @@ _ROUNDS, _SETTLED = 4, 0.1  # the latter of χ²
 _MOST_STEPS, _LEAST_STEP2 = 30, 1e-6
 _SIGMAS = 5.0  # of χ²
 _BETTER, _MUCH_BETTER = 4.0, 9.0  # of χ²
+_LEFT = 0.75  # of what is left over, where more is wrong than that the camera turns
 _MUCH_CHI2 = 13.8  # of two degrees of freedom: noise has more once in a thousand flares
 
 
@@ -52,19 +53,24 @@ def turning(lone: Sequence[Solution], camera: Camera) -> Camera:
     """
     tells = [one for one in lone if _tells(one)]
     tells = sorted(tells, key=lambda one: -float(one.flux_e[0] / one.flux_noise_e[0]))[:_MOST]
-    turned, before = camera, np.zeros(3)
+    fits, before = [(one, one) for one in tells], np.zeros(3)
     for _ in range(_ROUNDS):
-        turn = _turn(tells, camera)
+        turn = _turn([swept for _, swept in fits], camera)
         if turn is None:
             return camera
-        turned = replace(camera, turn=turn)
-        change = turn.rotation_rad - before
+        change, before = turn.rotation_rad - before, turn.rotation_rad
         if float(change @ np.linalg.solve(turn.covariance_rad2, change)) < _SETTLED:
             break
         # Of images far from round a residual tells to first order only.
-        before, again = turn.rotation_rad, solve([one.again() for one in tells], turned)
-        tells = [one for one in again if one is not None and _tells(one)]
-    return camera if _is_spread(tells, turned) else turned
+        again = solve([swept.again() for _, swept in fits], replace(camera, turn=turn))
+        pairs = zip(fits, again, strict=True)
+        fits = [(rest, one) for (rest, _), one in pairs if one is not None and _tells(one)]
+    swept = [one for at_rest, one in fits if _is_explained(one, at_rest)]
+    turn = _turn(swept, camera)
+    if turn is None:
+        return camera
+    turned = replace(camera, turn=turn)
+    return camera if _is_spread(swept, turned) else turned
 
 
 def with_turn(solution: Solution, camera: Camera) -> Solution:
@@ -150,6 +156,12 @@ class _Drawn:
     def weight(self, swept: Squares) -> Array:
         """Return the precision of squares, own motions allowed for: by δ beside m changes m² by 2 m δ."""
         return np.asarray(1.0 / (1.0 / self.precision + (2.0 * np.abs(swept) * self.own_px) ** 2))
+
+
+def _is_explained(swept: Solution, at_rest: Solution) -> bool:
+    """Tell whether what a flare at rest leaves over is explained as it is swept: if not, it may be two."""
+    left, before = swept.left_over, at_rest.left_over
+    return left.is_good or left.noise_chi2 - left.pixels < _LEFT * (before.noise_chi2 - before.pixels)
 
 
 def _is_spread(lone: Sequence[Solution], turned: Camera) -> bool:
