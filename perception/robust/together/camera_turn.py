@@ -42,8 +42,8 @@ def turning(lone: Sequence[Solution], camera: Camera) -> Camera:
     for it most, as what is two, or moves itself, may be drawn out as far; nor may one of the others speak
     alone. What it leaves must be noise, but for robots' own motions at ordinary speeds: glossy floors that
     draw flares out all in one direction draw near ones out farther. And flares must not be so much narrower
-    across, as where a point spread is not round; those that are no better explained as swept, as pairs, do not
-    speak.
+    across, as where a point spread is not round. Those that are no better explained as swept do not speak:
+    they may be two.
 
     Parameters
     ----------
