@@ -15,6 +15,7 @@ from perception.model.bearing import turn_slopes_px
 from perception.model.layout import CLIPPED
 from perception.model.likelihood.scoring_step import scoring_step
 from perception.model.window import TURN_RAD_PER_S, Camera, Turn, usual_motion_px
+from perception.robust.fit import Fit
 from perception.robust.motion import Squares, drawn_out_squares
 from perception.robust.solve import Solution, solve
 from perception.robust.together.free_width import seen_log_width
@@ -82,12 +83,11 @@ def with_turn(solution: Solution, camera: Camera) -> Solution:
     turn, sources = camera.turn, solution.sources
     if turn is None or sources is None or solution.motion_px is not None:
         return solution
-    moving = camera.moving
-    known, beside, count = moving.known(solution.window.clip_e), solution.window.beside, solution.count
-    layout = known.layout(count, beside.amplitudes)
-    values, precision = np.zeros(layout.size), layout.prior(beside, known.motion_px)
-    layout.of_sources(values)[:, :3], values[layout.background] = solution.starts, solution.background_e
-    _, covariance = scoring_step(solution.window.view, sources, beside, known, precision, values)
+    fit = Fit(solution.again(), camera.moving)
+    layout, count = fit.layout, solution.count
+    _, covariance = scoring_step(
+        solution.window.view, sources, fit.structure, fit.known, fit.prior, fit.values
+    )
     if not np.isfinite(covariance).all():
         return solution
     slopes_px = turn_slopes_px(np.column_stack([solution.u_px, solution.v_px]), camera.calibration)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from perception.model.likelihood.scoring_step import scoring_step
 from perception.model.window import Camera
+from perception.robust.fit import Fit
 from perception.robust.goodness import MISFIT_PROBABILITY
 from perception.robust.motion import drawn_out_squares
 from perception.robust.overlap.free_fits import MOST_CLAIMED, with_spread
@@ -68,9 +69,10 @@ def log_width_of_frames(seen: Sequence[tuple[float, float]], calibration: Calibr
     """
     off, sigma = np.array(seen).reshape(-1, 2).T
     total = float(np.sum(sigma**-2.0))
-    mean = float(np.sum(off * sigma**-2.0)) / max(total, 1e-300)
-    claimed = calibration.sigma.get("psf_sigma_px", 0.0) / calibration.psf_sigma_px
-    least = max(_SIGMAS_OF_FRAMES * max(total, 1e-300) ** -0.5, _LEAST_OF_FRAMES, MOST_CLAIMED * claimed)
+    if total == 0.0:
+        return 0.0
+    mean, claimed = float(np.sum(off * sigma**-2.0)) / total, Camera(calibration, 1.0, 1.0).width_spread
+    least = max(_SIGMAS_OF_FRAMES / math.sqrt(total), _LEAST_OF_FRAMES, MOST_CLAIMED * claimed)
     return mean if abs(mean) > least else 0.0
 
 
@@ -106,15 +108,14 @@ def _width_steps(lone: Sequence[Solution], camera: Camera) -> Array:
     for step, one in zip(steps, lone, strict=True):
         if one.sources is None or not tells_width(one):
             continue
-        known, beside = camera.known(one.window.clip_e), one.window.beside
-        layout = known.layout(1, beside.amplitudes)
-        values, precision = np.zeros(layout.size), layout.prior(beside, known.motion_px).copy()
-        values[:3], values[layout.background] = one.starts[0], one.background_e
-        precision[layout.width, layout.width] = 0.0
-        shift, covariance = scoring_step(one.window.view, one.sources, beside, known, precision, values)
-        width, unit = layout.width, known.width_spread
+        fit = Fit(one.again(), camera)
+        width, unit, precision = fit.layout.width, fit.known.width_spread, fit.prior.copy()
+        precision[width, width] = 0.0
+        shift, covariance = scoring_step(
+            one.window.view, one.sources, fit.structure, fit.known, precision, fit.values
+        )
         of_width = covariance[width] / (unit * covariance[width, width])
-        of_slack = of_width[3] if layout.has_slack else 0.0
+        of_slack = of_width[3] if fit.layout.has_slack else 0.0
         step[:] = unit * shift[width], unit * math.sqrt(covariance[width, width]), of_width[2], of_slack
     return steps
 
