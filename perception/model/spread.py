@@ -32,8 +32,9 @@ def spread_nodes(
     sigma_px
         Width of the point spread.
     image
-        Zeros of shape (5 or 7, rows, columns): the share of its flux in each pixel is added, and that share's
-        derivatives by column, row, ln size and ln width of the point spread, and by both parts of its motion.
+        Zeros of shape (1, 5 or 7, rows, columns): the share of its flux in each pixel is added, and that
+        share's derivatives by column, row, ln size and ln width of the point spread, and by both parts of its
+        motion.
     """
     planes, rows, columns = image.shape
     across, down = np.empty((4, columns)), np.empty((3, rows))
@@ -58,6 +59,10 @@ def spread_nodes(
         for row in range(top, bottom):
             in_v, by_v, wider_v = weight * down[0, row], weight * down[1, row], weight * down[2, row]
             line = image[:, row, left:right]
+            if planes == 1:
+                for column in range(right - left):
+                    line[0, column] += in_v * in_u[column]
+                continue
             for column in range(right - left):
                 by_u_here, by_v_here = in_v * by_u[column], by_v * in_u[column]
                 line[0, column] += in_v * in_u[column]

@@ -13,7 +13,7 @@ from perception.model.flare import PixelBox
 from perception.model.lens import stretch
 from perception.model.ranging import angular_radius_rad, exposure_towards, flux_e_of
 from perception.model.sensor import clip_level_e
-from perception.robust.problem import Start, Window
+from perception.robust.problem import Window
 from perception.robust.search.blobs import MAX_IMAGE_RADIUS_PX, Blob, is_large, near_groups
 from perception.robust.search.cutout import cut, light_of
 from perception.robust.search.frame import excess_at
@@ -28,7 +28,6 @@ MOST_BLOBS = 8
 """Blobs in larger groups are measured one by one, each with the nearest that lie in its window."""
 
 _CROWD_NEIGHBOURS = 3
-_FAR_OFF_PX = 1.5  # of a blob's brightest pixel from the middle of its light
 _TOUCHING_PX = 4
 _KEPT_PX = 2
 
@@ -39,9 +38,6 @@ _MOST_EVEN_PX = 193  # of a group's window on even ground
 
 # Few sizes of windows, as what texture looks like is reckoned once for each.
 _SIDES_PX = (17, 21, 25, 29, 35, 41, 49, 57, 65, 81, 97, 113, MOST_STRUCTURED_PX, 161, _MOST_EVEN_PX)
-_CLIPPED_FACTORS = (1.0, 4.0, 16.0, 64.0)
-_CUT_FACTORS = (1.0, 2.0, 4.0)
-_LEAST_DISC_PX2 = 50  # of what is clipped, from which on its outline tells a disc's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,63 +240,6 @@ def _cluster(
         structure_e=sigma_e,
     )
     return Cluster(members, wanted, window, background_e)
-
-
-def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
-    """Return sets of first guesses, the best of which is to be followed.
-
-    Of a clipped flare, and of one that the frame's edge cuts, the part seen may be a small part of the flux;
-    but no source is larger than what is seen of it. Where the middle of a lone blob's light is far from its
-    brightest pixel, a flare there may stand beside something else.
-    """
-    height, width = prepared.shape
-    boxes = [member.blob.box for member in cluster.members]
-    cut = any(
-        b.top == 0 or b.left == 0 or b.top + b.height == height or b.left + b.width == width for b in boxes
-    )
-    factors = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
-    if len(cluster.members) == 1 and cluster.is_clipped:
-        factors = tuple(sorted({*factors, *_factor_by_outline(cluster.members[0], prepared)}))
-    floor_e = least_flux_e(prepared)
-    sets: list[list[Start]] = []
-    for factor in factors:
-        starts: list[Start] = []
-        for member in cluster.members:
-            flux_e = max(member.flux_e, floor_e)
-            times = factor if member.is_clipped or not cluster.is_clipped else 1.0
-            if member.image_radius_px > 0.0:
-                most = (
-                    (max(member.blob.box.height, member.blob.box.width) + 2.0) / member.image_radius_px
-                ) ** 2
-                times = min(times, max(most, 1.0))
-            starts.append((member.u_px, member.v_px, member.log_range(times * flux_e)))
-        if starts not in sets:
-            sets.append(starts)
-    if len(sets) == 1 and len(cluster.members) == 1:
-        (member,), smooth_px = cluster.members, smoothing_px(prepared.calibration)
-        box, filtered_e = member.blob.box, member.blob.filtered_e
-        row, column = divmod(int(np.argmax(filtered_e)), box.width)
-        u_px, v_px = float(box.left + column), float(box.top + row)
-        if math.hypot(u_px - member.u_px, v_px - member.v_px) > max(_FAR_OFF_PX, member.image_radius_px):
-            # Filtered with its own width, a point's image has this share of its light in its brightest pixel.
-            flux_e = 4.0 * math.pi * smooth_px**2 * member.blob.peak_e
-            sets.append([(u_px, v_px, member.log_range(max(flux_e, floor_e)))])
-    return sets
-
-
-def least_flux_e(prepared: PreparedFrame) -> float:
-    """Return the least flux that first guesses begin with."""
-    return 3.0 * math.sqrt(prepared.floor_e2)
-
-
-def _factor_by_outline(member: Candidate, prepared: PreparedFrame) -> tuple[float, ...]:
-    """Return how many times as bright a clipped flare is if it is a disc as large as what is clipped."""
-    places = np.argwhere(prepared.clipped_in(member.blob.box) & member.blob.pixels)
-    if len(places) < _LEAST_DISC_PX2 or not member.image_radius_px > 0.0:
-        return ()
-    # Along its longer axis an ellipse scatters by the square of half of that axis, over four.
-    longest_px = 2.0 * math.sqrt(float(np.linalg.eigvalsh(np.cov(places.T))[1]))
-    return (max((longest_px / member.image_radius_px) ** 2, 1.0),)
 
 
 def _window_box(members: Sequence[Candidate], prepared: PreparedFrame) -> PixelBox:

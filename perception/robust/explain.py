@@ -25,7 +25,7 @@ from perception.robust.around.uneven import (
     retry_without_spill,
     without_spill,
 )
-from perception.robust.clusters import Cluster, guesses
+from perception.robust.clusters import Cluster
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.hiding.cut import cut_discs
 from perception.robust.hiding.eclipse import eclipses, pile_of
@@ -43,7 +43,9 @@ from perception.robust.overlap.rivals import against, beside_rival, better, to_b
 from perception.robust.overlap.unparted import doubted
 from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.solve import Solution, likely_starts, solve
+from perception.robust.solve import Solution, solve
+from perception.robust.starts.guesses import guesses
+from perception.robust.starts.likely import likely_starts
 from perception.robust.verdict import is_hardly_seen, is_one_pixel
 
 _GOOD_SIGMAS = 10.0  # of χ²: what leaves so much more is not as good, whatever error the model may have

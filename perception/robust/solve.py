@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.discs.nodes import smoothing_px
 from perception.model.layout import Sources, part_of
-from perception.model.likelihood.first_guesses import Views, unlikeliness
 from perception.model.ranging import covered_px_at_1_m
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera, lay_out
@@ -25,12 +25,11 @@ from perception.robust.problem import Motion, Problem, Start, Window
 Array = NDArray[np.float64]
 
 _MOST_LAYOUTS = 7
-# How far the range by size may move before images are laid out anew: their shape changes with its square.
-_LAYOUT_KEPT = 0.02
-_LAYOUT_KEPT_PX = 0.05
-_LARGE_PX, _LAYOUT_KEPT_SIGMAS = 3.0, 0.1  # of large discs also where that moves what is seen by so many σ
+# Images are laid out anew where they grow by so much in ln size: strips are then too few (by up to 0.02 σ),
+_GROWTH_KEPT, _LEAST_DISC_PX = 0.4, 0.05
+# and where they change by so many σ, but for what so many widths of the point spread blur.
+_KEPT_SIGMAS, _BLURRED = 0.1, 4.0
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
-_OF_STARTS = 0.5  # so fine are images that are only to tell which first guess is likelier
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
 _BLOB_PX2, _PLACES = 50.0, 200.0  # of a flare in a blob: so many px², by four e-foldings of its range
 NEIGHBOURS_PER_PX2 = 20.0 / (1280.0 * 960.0)  # of twenty flares in a frame
@@ -226,53 +225,6 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
     return [solved.get(index) for index in range(len(fits))]
 
 
-def start_costs(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[list[float]]:
-    """Return −2 ln L of each window's first guesses, all at rest, but for a constant of the window.
-
-    By coarse images: they tell apart guesses whose fluxes differ several times. The windows are of one frame,
-    in which all pixels clip at the same number of electrons.
-    """
-    if not problems:
-        return []
-    windows = [of_one[0].window for of_one in problems]
-    background_e = np.array([of_one[0].background_e for of_one in problems])
-    guesses = [each.starts for of_one in problems for each in of_one]
-    window = np.repeat(np.arange(len(problems)), [len(of_one) for of_one in problems])
-    flares = [len(starts) for starts in guesses]
-    first_source = np.cumsum([0, *flares])
-    all_starts = np.array([start for starts in guesses for start in starts])
-    u_px, v_px, log_range = np.ascontiguousarray(all_starts.T)
-    hidden_e = camera.hidden_px_at_1_m(all_starts[:, :2])
-    if hidden_e is not None:
-        hidden_e *= np.repeat(np.maximum(background_e, 0.0)[window], flares)
-    laid, imaged = lay_out(camera, u_px, v_px, log_range, hidden_e, None, np.full(len(u_px), _OF_STARTS))
-    costs = unlikeliness(
-        Views.of([each.view for each in windows]), laid, camera.known(windows[0].clip_e), all_starts,
-        background_e, window, first_source,
-    )  # fmt: skip
-    costs[~np.logical_and.reduceat(imaged, first_source[:-1])] = math.inf
-    ends = np.cumsum([len(of_one) for of_one in problems]).tolist()
-    return [costs[first:end].tolist() for first, end in zip([0, *ends], ends, strict=False)]
-
-
-def likely_starts(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple[int, Problem]]:
-    """Return by index of the cluster which problems to follow: those likelier than what lies beside them.
-
-    From one that is not the climb would lead to where a likelier one leads.
-    """
-    costs = iter(start_costs([of_one for of_one in problems if len(of_one) > 1], camera))
-    chosen = []
-    for index, of_one in enumerate(problems):
-        if len(of_one) == 1:
-            chosen.append((index, of_one[0]))
-            continue
-        cost = [math.inf, *next(costs), math.inf]
-        chosen += [
-            (index, each) for at, each in enumerate(of_one, 1) if cost[at] <= min(cost[at - 1], cost[at + 1])
-        ]
-    return chosen
-
-
 def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     """Lay images out and climb; return those that have moved so far that it is to be done anew."""
     own = np.concatenate([fit.own for fit in fits])
@@ -288,19 +240,18 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
             fit.climb(part_of(laid, first, end), reach_px[first:end])
     laid_at, own = own[:, :2], np.concatenate([fit.own for fit in fits])
     change = laid.log_range_at - log_range_by_size(own, fits[0])
-    moved = (abs(change) > _LAYOUT_KEPT) & (abs(change) * reach_px * np.exp(change) > _LAYOUT_KEPT_PX)
+    moved = (change > _GROWTH_KEPT) & (reach_px * np.exp(change) > _LEAST_DISC_PX)
     if laid_px is not None and (motion_px := _motion_px(own, fits[0])) is not None:
         moved |= motion_px > laid_px
     if hidden_px is not None:
         more_e = np.concatenate([fit.background_e for fit in fits]) - background_e
         moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
-    large = np.flatnonzero(reach_px > _LARGE_PX)
-    if large.size:
-        # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
-        away_px = abs(change[large]) * reach_px[large] + np.hypot(*(own[large, :2] - laid_at[large]).T)
-        angle_rad = camera.radius_m * np.exp(-laid.log_range_at[large])
-        sigma_px = np.concatenate([fit.place_sigmas_px for fit in fits])[large]
-        moved[large] |= 2.0 * angle_rad * away_px > _LAYOUT_KEPT_SIGMAS * sigma_px
+    # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
+    away_px = abs(change) * reach_px + np.hypot(*(own[:, :2] - laid_at).T)
+    skewed_px = 2.0 * camera.radius_m * np.exp(-laid.log_range_at) * away_px
+    blur = (_BLURRED * smoothing_px(camera.calibration)) ** 2
+    seen_px = skewed_px * reach_px**2 / (reach_px**2 + blur)
+    moved |= seen_px > _KEPT_SIGMAS * np.concatenate([fit.place_sigmas_px for fit in fits])
     if not moved.any():
         return []
     return [

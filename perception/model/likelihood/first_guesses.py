@@ -44,8 +44,8 @@ class Views(NamedTuple):
 
 @compiled
 def unlikeliness(
-    views: Views, sources: Sources, known: Known, starts: Array, background_e: Array,
-    window: NDArray[np.int64], first_source: NDArray[np.int64],
+    views: Views, sources: Sources, known: Known, starts: Array, laid_as: NDArray[np.int64],
+    background_e: Array, window: NDArray[np.int64], first_source: NDArray[np.int64],
 ) -> Array:  # fmt: skip
     """Return −2 ln L of first guesses, as `maximise` of the likeliest; infinite where none can be.
 
@@ -54,9 +54,10 @@ def unlikeliness(
     views, background_e
         The windows, and the background in each, shape (windows,).
     sources, known
-        Of all guesses one after another, laid out as large as they are said to be, and what is known.
-    starts
-        Place u, v and ln range of each, shape (sources, 3).
+        Images as laid out, and what is known.
+    starts, laid_as
+        Place u, v and ln range of the sources of all guesses one after another, shape (sources, 3), and whose
+        image each has, grown to its size, shape (sources,).
     window, first_source
         Which window each guess is of, shape (guesses,), and where its sources begin, shape (guesses + 1,).
     """
@@ -74,11 +75,12 @@ def unlikeliness(
             continue
         expected, variance = views.known_e[here] + background_e[at], np.empty(view.image_e.size)
         for source in range(first_source[guess], first_source[guess + 1]):
-            image = np.zeros((5, rows, columns))
+            image, of = np.zeros((1, rows, columns)), laid_as[source]
             place = (starts[source, 0] - left, starts[source, 1] - top)
-            swept = (sources.swept_u_px[source], sources.swept_v_px[source])
-            spread_nodes(sources, source, place, 1.0, swept, known.psf_sigma_px, image)
-            flux = math.exp(sources.log_flux_at_1_m[source] - 2.0 * starts[source, 2])
+            growth = math.exp(sources.log_range_at[of] - starts[source, 2])
+            swept = (sources.swept_u_px[of], sources.swept_v_px[of])
+            spread_nodes(sources, of, place, growth, swept, known.psf_sigma_px, image)
+            flux = math.exp(sources.log_flux_at_1_m[of] - 2.0 * starts[source, 2])
             expected += flux * image[0].ravel()
         for pixel in range(len(expected)):
             lit_e = max(expected[pixel], 0.0)

@@ -155,11 +155,14 @@ def objective(
 @compiled
 def log_variances(view: View, variance: Array) -> float:
     """Return Σ ln variance of the pixels that are seen."""
-    state, total = view.state.ravel(), 0.0
+    state, total, product = view.state.ravel(), 0.0, 1.0
     for pixel in range(len(variance)):
         if state[pixel] == SEEN:
-            total += math.log(variance[pixel])
-    return total
+            product *= variance[pixel]
+            # As few logarithms as numbers of such a size allow.
+            if not 1e-150 < product < 1e150:
+                total, product = total + math.log(product), 1.0
+    return total + math.log(product)
 
 
 @compiled

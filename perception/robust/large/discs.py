@@ -13,7 +13,7 @@ from perception.model.lens import stretch
 from perception.model.ranging import brightness_e, covered_px_at_1_m
 from perception.model.window import Camera
 from perception.robust.around.uneven import MOST_LEFT
-from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, least_flux_e
+from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster
 from perception.robust.flare import MeasuredFlare, measured_flare
 from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.hiding.eclipse import pile_of
@@ -25,6 +25,7 @@ from perception.robust.problem import Problem, Start, Window
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution, solve
+from perception.robust.starts.guesses import least_flux_e
 from perception.robust.verdict import is_border
 from perception.types import Calibration
 

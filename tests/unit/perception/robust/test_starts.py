@@ -13,7 +13,7 @@ from perception.model.layout import CLIPPED, SEEN, UNUSABLE
 from perception.model.window import Camera, lay_out
 from perception.robust import explain
 from perception.robust.problem import Problem, Window
-from perception.robust.solve import start_costs
+from perception.robust.starts.likely import start_costs
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 CAMERA = calibration(width_px=320, height_px=256, cx_px=159.5, cy_px=127.5, sigma={})
