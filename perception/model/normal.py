@@ -14,6 +14,7 @@ REACH_SIGMAS = 6.0
 
 STEP = 1.0 / 32.0
 
+_SURE = -9.0  # of what exceeds it so surely nothing is lost: 1 - Q is 10⁻¹⁹
 _SQRT_HALF, _LOG_SQRT_2_PI = math.sqrt(0.5), 0.5 * math.log(2.0 * math.pi)
 
 
@@ -138,6 +139,8 @@ def strip_shares(
 @compiled
 def log_upper_tail(z: float) -> float:
     """Return ln Q(z) of the normal distribution: to 10⁻⁸ beyond z = 36, where Q itself is too small."""
+    if z < _SURE:
+        return 0.0
     if z < 0.0:
         return math.log1p(-0.5 * math.erfc(-z * _SQRT_HALF))
     if z < 36.0:
@@ -149,7 +152,9 @@ def log_upper_tail(z: float) -> float:
 @compiled
 def of_clipped(z: float) -> tuple[float, float, float]:
     """Return φ/Q, the curvature of ln Q, and the share of its information that such a pixel keeps."""
-    z = min(max(z, -38.0), 1e4)
+    if z < _SURE:
+        return 0.0, 0.0, 0.0
+    z = min(z, 1e4)
     log_tail = log_upper_tail(z)
     mills = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI - log_tail)
     curvature = min(max(mills * (mills - z), 0.0), 1.0)
