@@ -9,7 +9,7 @@ from perception.robust.around.uneven import MOST_LEFT, explains_flanks
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters
 from perception.robust.explain import best, by_blobs
 from perception.robust.flare import MeasuredFlare, measured_flare
-from perception.robust.large.discs import measure_large
+from perception.robust.large.discs import measure_large, seems_whole_disc
 from perception.robust.motion import is_long_clutter
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS
 from perception.robust.overlap.free_fits import of_free_size, with_model_error
@@ -66,11 +66,13 @@ def measure(
     A blob and its measurement for each flare, and the camera as it turns.
     """
     fitted = [cluster for cluster in found if not any(member.is_beyond_fit for member in cluster.members)]
-    plain = by_blobs(fitted, prepared, camera)
+    others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
+    alone = [*fitted, *(cluster for cluster in others if seems_whole_disc(cluster, prepared))]
+    plain = by_blobs(alone, prepared, camera)
     if not apart:
-        at_rest, camera = camera, as_it_turns(plain, prepared, camera)
-        plain = plain if camera is at_rest else by_blobs(fitted, prepared, camera)
-    solutions = best(fitted, plain, prepared, camera)
+        at_rest, camera = camera, as_it_turns(plain[: len(fitted)], prepared, camera)
+        plain = plain if camera is at_rest else by_blobs(alone, prepared, camera)
+    solutions = best(fitted, plain[: len(fitted)], prepared, camera)
     odd = [index for index, solution in enumerate(solutions) if solution is not None and _is_odd(solution)]
     of_odd = of_free_size([solution for k in odd if (solution := solutions[k]) is not None], camera)
     free = dict(zip(odd, of_odd, strict=True))
@@ -94,8 +96,8 @@ def measure(
             on_flank += wanted
         elif apart and solution is not None and is_hardly_seen(solution, 0, prepared.shape):
             unseen += wanted if solution.left_over.is_nothing else []
-    others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
-    large, small = measure_large(others, prepared, camera, apart)
+    whole = dict(zip(alone[len(fitted) :], plain[len(fitted) :], strict=True))
+    large, small = measure_large(others, whole, prepared, camera, apart)
     measured += large
     again += small
     if again:
