@@ -208,6 +208,12 @@ def _reckoned(
 
 
 @compiled
+def _add(factor: float, row: Array, into: Array) -> None:
+    for at in range(len(row)):
+        into[at] += factor * row[at]
+
+
+@compiled
 def _smoothed(image: Array, kernel: Array) -> Array:
     """Correlate an image with a symmetric kernel along both axes, zero beyond its ends."""
     rows, columns = image.shape
@@ -215,12 +221,11 @@ def _smoothed(image: Array, kernel: Array) -> Array:
     along, both = np.zeros((rows, columns)), np.zeros((rows, columns))
     for row in range(rows):
         for step in range(-half, half + 1):
-            for column in range(max(0, -step), min(columns, columns - step)):
-                along[row, column] += kernel[half + step] * image[row, column + step]
+            first, end = max(0, -step), min(columns, columns - step)
+            _add(kernel[half + step], image[row, first + step : end + step], along[row, first:end])
     for row in range(rows):
         for step in range(max(-half, -row), min(half + 1, rows - row)):
-            for column in range(columns):
-                both[row, column] += kernel[half + step] * along[row + step, column]
+            _add(kernel[half + step], along[row + step], both[row])
     return both
 
 
