@@ -90,7 +90,8 @@ def _blurred_radius_px(at_px: float, share: float, smooth_px: float) -> float:
     away = (at_px / smooth_px) ** 2
     of_point = math.sqrt(2.0 * share) * math.exp(min(0.25 * away, 50.0))
     if of_point < _SMALL_DISC:
-        return smooth_px * of_point
+        wider = 1.0 + 0.25 * of_point**2  # as its own radius widens it
+        return smooth_px * math.sqrt(2.0 * share * wider) * math.exp(0.25 * away / wider)
     h = 1.0 - 2.0 / 3.0 * (2.0 + away) * (2.0 + 3.0 * away) / (2.0 + 2.0 * away) ** 2
     p, m = (2.0 + 2.0 * away) / (2.0 + away) ** 2, (h - 1.0) * (1.0 - 3.0 * h)
     mean = 1.0 + h * p * (h - 1.0 - 0.5 * (2.0 - h) * m * p)

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from perception import Detection, detect
+from perception.robust import measure
+from perception.robust.large import discs
+from perception.robust.large.outline import outline_of
 from perception.types import Calibration
 from tests.unit.perception.robust.test_eclipse import _pulls
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, expose, random
@@ -146,3 +149,36 @@ def test_one_before_another_is_ranged() -> None:
     for place, told in zip(places, found, strict=True):
         assert not told.merged
         assert np.abs(_pulls(place, told)).max() < 4.0
+
+
+@pytest.mark.parametrize("clipped", [0.6, 8.0])
+def test_whole_discs_are_told_without_a_look_at_outlines(
+    clipped: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four of 30 to 60 px, the same as by their outlines; one that an edge hides a little of is looked at closely."""
+    places = [(220.3, 180.2, 0.16), (600.4, 480.7, 0.1), (1050.2, 220.6, 0.24), (900.7, 800.3, 0.2)]
+    exposure_s = clipped * 2.8e-4
+    frame = expose(expected_e(CAMERA, places, exposure_s) + 20.0, CAMERA, random(87), exposure_s)
+    outlined: list[object] = []
+
+    def counted(*arguments: object) -> object:
+        outlined.append(arguments)
+        return outline_of(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(discs, "outline_of", counted)
+    found = sorted(detect(frame, CAMERA), key=lambda one: one.u_px)
+    assert not outlined
+    assert found[0].saturated == (clipped > 1.0)
+    monkeypatch.setattr(measure, "seems_whole_disc", lambda *_: False)
+    others = sorted(detect(frame, CAMERA), key=lambda one: one.u_px)
+    assert len(outlined) == len(places)
+    for place, one, other in zip(sorted(places), found, others, strict=True):
+        assert np.abs(_pulls(place, one)).max() < 4.5
+        assert one.u_px == pytest.approx(other.u_px, abs=0.1 * one.u_sigma_px)
+        assert one.range_m == pytest.approx(other.range_m, abs=0.1 * one.range_sigma_m)
+        assert one.range_sigma_m == pytest.approx(other.range_sigma_m, rel=0.02)
+    monkeypatch.undo()
+    outlined.clear()
+    monkeypatch.setattr(discs, "outline_of", counted)
+    _told(_seen_e([(90.3, 101.6, 0.14)], 0.97, 0.5), SMALL)
+    assert outlined

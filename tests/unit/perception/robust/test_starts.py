@@ -6,24 +6,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import ncx2
 
 from perception import Detection, detect
 from perception.model.flare import PixelBox
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE
 from perception.model.window import Camera, lay_out
 from perception.robust import explain
+from perception.robust import solve as solve_module
 from perception.robust.problem import Problem, Window
+from perception.robust.starts.guesses import _blurred_radius_px
 from perception.robust.starts.likely import start_costs
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 CAMERA = calibration(width_px=320, height_px=256, cx_px=159.5, cy_px=127.5, sigma={})
 
 
-def _told(key: int) -> list[Detection]:
+def _told(key: int, nearest_m: float = 0.8) -> list[Detection]:
     """Return what is told of six flares, points and discs, clipped up to fifty times, some at the edge."""
     number = random(83, key)
     places = [
-        (5.0 + 62.0 * k + number.uniform(0.0, 1.0), row + number.uniform(-0.5, 0.5), 0.8 * 10.0**share)
+        (5.0 + 62.0 * k + number.uniform(0.0, 1.0), row + number.uniform(-0.5, 0.5), nearest_m * 10.0**share)
         for row in (1.0, 128.0)
         for k, share in enumerate(number.random(6).tolist())
     ]
@@ -56,6 +59,20 @@ def test_the_likeliest_guesses_lead_where_all_lead(key: int, monkeypatch: pytest
         assert one.range_sigma_m == pytest.approx(other.range_sigma_m, rel=1e-3, nan_ok=True)
 
 
+def _cost_by_hand(problem: Problem, clip_e: float) -> float:
+    """Return −2 ln L of guesses, images by brute force."""
+    window = problem.window
+    assert window.known_e is not None
+    places = [(u, v, math.exp(log_range)) for u, v, log_range in problem.starts]
+    mean_e = expected_e(CAMERA, places, 1e-4, problem.background_e)[window.box.slices] + window.known_e
+    variance = mean_e + (0.03 * mean_e) ** 2 + window.floor_e2
+    seen, clipped = window.state == SEEN, window.state == CLIPPED
+    assert clipped.sum() > 5
+    cost = float(((window.image_e - mean_e) ** 2 / variance + np.log(variance))[seen].sum())
+    sigmas = (clip_e - mean_e[clipped]) / np.sqrt(variance[clipped])
+    return cost - 2.0 * sum(math.log(0.5 * math.erfc(z * math.sqrt(0.5))) for z in sigmas.tolist())
+
+
 def test_first_guesses_are_as_likely_as_their_images_say() -> None:
     """Two windows, of one flare and of two, unlike in background, noise and light that is known, pixels clipped and
     unusable, responses 3 % apart: by hand, images by brute force."""
@@ -74,22 +91,14 @@ def test_first_guesses_are_as_likely_as_their_images_say() -> None:
         state[3, 4] = UNUSABLE
         starts = [(u + 0.2, v, math.log(1.1 * range_m)) for u, v, range_m in places]
         window = Window(box, image_e, state, floor_e2, clip_e, 0.03, known_e=known_e.reshape(41, 41))
+        nearer = [(u, v, log_range - 0.7) for u, v, log_range in starts]
         beyond = [(u + 50.0, v, log_range) for u, v, log_range in starts]
-        problems.append([Problem(window, each, background_e) for each in (starts, beyond)])
+        problems.append([Problem(window, each, background_e) for each in (starts, nearer, beyond)])
     told = start_costs(problems, known)
-    for (problem, _), costs in zip(problems, told, strict=True):
-        window = problem.window
-        assert window.known_e is not None
-        places = [(u, v, math.exp(log_range)) for u, v, log_range in problem.starts]
-        mean_e = expected_e(CAMERA, places, 1e-4, problem.background_e)[window.box.slices] + window.known_e
-        variance = mean_e + (0.03 * mean_e) ** 2 + window.floor_e2
-        seen, clipped = window.state == SEEN, window.state == CLIPPED
-        cost = float(((window.image_e - mean_e) ** 2 / variance + np.log(variance))[seen].sum())
-        sigmas = (clip_e - mean_e[clipped]) / np.sqrt(variance[clipped])
-        cost -= 2.0 * sum(math.log(0.5 * math.erfc(z * math.sqrt(0.5))) for z in sigmas.tolist())
-        assert clipped.sum() > 5
-        assert costs[0] == pytest.approx(cost, rel=2e-4)
-        assert costs[1] == math.inf
+    for of_window, costs in zip(problems, told, strict=True):
+        for problem, cost, within in zip(of_window, costs, (1e-3, 2e-3), strict=False):
+            assert cost == pytest.approx(_cost_by_hand(problem, clip_e), rel=within)
+        assert costs[2] == math.inf
 
 
 def test_what_is_larger_than_its_window_is_not_laid_out() -> None:
@@ -102,3 +111,40 @@ def test_what_is_larger_than_its_window_is_not_laid_out() -> None:
         Camera(CAMERA, 1e-4, 1.0), u_px[1:], v_px[1:], log_range[1:], most_radius_px=np.full(2, 60.0)
     )
     assert imaged.all()
+
+
+@pytest.mark.parametrize("smooth_px", [0.5, 0.757, 2.0])
+def test_where_a_blurred_disc_clips_tells_its_size(smooth_px: float) -> None:
+    """Within 5 %: by the noncentral χ² itself, which is the share of its own brightness that is seen there."""
+    for radius in (0.05, 0.2, 0.5, 0.8, 1.2, 2.0, 5.0, 15.0):
+        for away in (0.3, 0.8, 1.5, 3.0, 5.5, 15.5):
+            share = float(ncx2.cdf(radius**2, 2, away**2))
+            if 1e-3 < share < 0.98:
+                told_px = _blurred_radius_px(away * smooth_px, share, smooth_px)
+                assert told_px == pytest.approx(radius * smooth_px, rel=0.05), (radius, away)
+
+
+def test_images_are_laid_out_anew_where_it_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Discs of up to 20 px and points, half of them clipped: by far fewer images what ever finer ones say."""
+    laid = 0
+
+    def counted(*arguments: object) -> object:
+        nonlocal laid
+        result = lay_out(*arguments)  # type: ignore[arg-type]
+        laid += len(result[1])
+        return result
+
+    monkeypatch.setattr(solve_module, "lay_out", counted)
+    told, images = [], []
+    for kept in ((solve_module._GROWTH_KEPT, solve_module._KEPT_SIGMAS), (-1.0, 0.0)):
+        monkeypatch.setattr(solve_module, "_GROWTH_KEPT", kept[0])
+        monkeypatch.setattr(solve_module, "_KEPT_SIGMAS", kept[1])
+        laid = 0
+        told.append([one for key in range(2) for one in _told(key, 0.25)])
+        images.append(laid)
+    assert images[0] < 0.4 * images[1]
+    assert len(told[0]) == len(told[1]) > 20
+    for one, other in zip(*told, strict=True):
+        assert one.u_px == pytest.approx(other.u_px, abs=0.05 * other.u_sigma_px, nan_ok=True)
+        assert one.v_px == pytest.approx(other.v_px, abs=0.05 * other.v_sigma_px, nan_ok=True)
+        assert one.range_m == pytest.approx(other.range_m, abs=0.05 * other.range_sigma_m, nan_ok=True)
