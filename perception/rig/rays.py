@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.model.likelihood.products import invert
 from perception.rig.joined import Joined
 
 Array = NDArray[np.float64]
@@ -148,7 +149,7 @@ def _chi2_of_pair(
         covariance[k, k] += moved_m**2 + LEAST_M2
     _add_noise(rays, i, factor * range_i, covariance)
     _add_noise(rays, j, factor * range_j, covariance)
-    _invert(covariance)
+    invert(covariance)
     chi2, slope, bend = 0.0, 0.0, 0.0
     for k in range(3):
         for m in range(3):
@@ -169,23 +170,6 @@ def _add_noise(rays: Rays, index: int, range_m: float, covariance: Array) -> Non
             for a in range(2):
                 for b in range(2):
                     covariance[k, m] += range_m**2 * axes[a, k] * angular[a, b] * axes[b, m]
-
-
-@compiled
-def _invert(matrix: Array) -> None:
-    """Invert a small positive definite matrix in place, by elimination."""
-    size = len(matrix)
-    for pivot in range(size):
-        scale = 1.0 / matrix[pivot, pivot]
-        matrix[pivot, pivot] = 1.0
-        for column in range(size):
-            matrix[pivot, column] *= scale
-        for row in range(size):
-            if row != pivot:
-                factor = matrix[row, pivot]
-                matrix[row, pivot] = 0.0
-                for column in range(size):
-                    matrix[row, column] -= factor * matrix[pivot, column]
 
 
 @compiled
@@ -212,7 +196,7 @@ def placed(rays: Rays, rows: Indices, time_s: float, speed_m_per_s: float) -> tu
             angular[:] = rays.angular_rad2[i]
             angular[0, 0] += moved2
             angular[1, 1] += moved2
-            _invert(angular)
+            invert(angular)
             axes = rays.axes[i]
             for a in range(2):
                 for b in range(2):
@@ -232,7 +216,7 @@ def placed(rays: Rays, rows: Indices, time_s: float, speed_m_per_s: float) -> tu
                 score[k] += slope[k] * weight * off
                 for m in range(4):
                     information[k, m] += slope[k] * weight * slope[m]
-        _invert(information)
+        invert(information)
         for k in range(4):
             step = 0.0
             for m in range(4):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.model.likelihood.products import invert
 
 Array = NDArray[np.float64]
 
@@ -160,7 +161,7 @@ def _updated(
                 inverse[a, b] = noise[k, a, b]
                 for x in range(6):
                     inverse[a, b] += rows[k, a, x] * crossed[x, b]
-        _invert(inverse)
+        invert(inverse)
         _times_turned_into(gain, crossed, inverse.T)
         if noise[k, 2, 2] > BLIND_M2:
             for half in (0, 3):
@@ -206,23 +207,6 @@ def _times_turned_into(product: Array, one: Array, other: Array) -> None:
             product[x, y] = 0.0
             for z in range(one.shape[1]):
                 product[x, y] += one[x, z] * other[y, z]
-
-
-@compiled
-def _invert(matrix: Array) -> None:
-    """Invert a small positive definite matrix in place, by elimination."""
-    size = len(matrix)
-    for pivot in range(size):
-        scale = 1.0 / matrix[pivot, pivot]
-        matrix[pivot, pivot] = 1.0
-        for column in range(size):
-            matrix[pivot, column] *= scale
-        for row in range(size):
-            if row != pivot:
-                factor = matrix[row, pivot]
-                matrix[row, pivot] = 0.0
-                for column in range(size):
-                    matrix[row, column] -= factor * matrix[pivot, column]
 
 
 def updated_paper(

@@ -51,7 +51,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.command_estimator": (),
     "perception.estimators": (),
     "perception.paper": (),
-    "perception.robust": ("together", "large", "around", "hiding", "overlap", "search"),
+    "perception.robust": ("together", "large", "around", "hiding", "overlap", "starts", "search"),
     "perception.files": (),
     "perception.causes": (),
     "perception.model": ("likelihood", "discs"),

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.model.likelihood.products import invert
 from perception.rig.mirrors.flares import Flares
 from perception.rig.mirrors.model import (
     GATE_CHI2,
     NEAREST_MIRROR_M,
     add_form_into,
-    invert,
     match_all,
     pair_covariance,
     residual,

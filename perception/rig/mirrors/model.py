@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.model.likelihood.products import invert
 from perception.rig.mirrors.flares import Flares
 
 Array = NDArray[np.float64]
@@ -143,25 +144,6 @@ def pair_covariance(
             covariance[a, b] = covariance[b, a] = total + shared_a * shared_b
     covariance[2, 2] += flares.noise[image] ** 2
     return off
-
-
-@compiled
-def invert(matrix: Array) -> float:
-    """Invert a small positive definite matrix in place; returns the logarithm of its determinant."""
-    size, log_size = len(matrix), 0.0
-    for pivot in range(size):
-        log_size += math.log(max(matrix[pivot, pivot], 1e-300))
-        scale = 1.0 / matrix[pivot, pivot]
-        matrix[pivot, pivot] = 1.0
-        for column in range(size):
-            matrix[pivot, column] *= scale
-        for row in range(size):
-            if row != pivot:
-                factor = matrix[row, pivot]
-                matrix[row, pivot] = 0.0
-                for column in range(size):
-                    matrix[row, column] -= factor * matrix[pivot, column]
-    return log_size
 
 
 @compiled

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.compiled import compiled
+from perception.model.likelihood.products import invert
 from perception.rig.pose.sights import Carried, Sights
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ def fitting(places: Places, sights: Sights, layout: Carried) -> NDArray[np.bool_
                     _apart(stand_m, noise_m2, sights, rows, layout, (a, b), apart_m, covariance)
                     for k in range(3):
                         covariance[k, k] += slack_m**2
-                    _invert(covariance)
+                    invert(covariance)
                     z = apart_m[2] - arm_m[2]
                     for k in range(HEADINGS):
                         x = apart_m[0] - (cosine[k] * arm_m[0] - sine[k] * arm_m[1])
@@ -181,20 +182,3 @@ def _near(stand_m: Array, noise_m2: Array, longest_m: float) -> bool:
 @compiled
 def _distance_m(one: Array, other: Array) -> float:
     return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
-
-
-@compiled
-def _invert(matrix: Array) -> None:
-    """Invert a small positive definite matrix in place, by elimination."""
-    size = len(matrix)
-    for pivot in range(size):
-        scale = 1.0 / matrix[pivot, pivot]
-        matrix[pivot, pivot] = 1.0
-        for column in range(size):
-            matrix[pivot, column] *= scale
-        for row in range(size):
-            if row != pivot:
-                factor = matrix[row, pivot]
-                matrix[row, pivot] = 0.0
-                for column in range(size):
-                    matrix[row, column] -= factor * matrix[pivot, column]
