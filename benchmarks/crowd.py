@@ -3,7 +3,7 @@
 Sets of four frames of 1280 × 960, each with 300 flares at random places: points at 4 to 9 m; these clipped
 ten times; spheres at 0.4 to 3 m beside one another; these clipped; spheres anywhere, nearer ones before
 farther ones; and 600 points. Milliseconds for a frame, medians of several reads: by `detect` in one thread,
-and by `DetectorProcesses`, which share a set. `found` counts flares with a detection of their own within 2 px.
+and by `DetectorProcesses`, which share a set. `found` counts flares with one detection within 2 px.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/crowd.py [kind ...]
 """
