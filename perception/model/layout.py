@@ -173,6 +173,18 @@ class Sources(NamedTuple):
         return np.maximum.reduceat(np.where(np.isfinite(reach_px), reach_px, 0.0), self.first_node[:-1])
 
     @property
+    def middle_px(self) -> Array:
+        """How far the middle of each source's light lies from its place, as laid out."""
+        seen = np.isfinite(self.node_u_px) & np.isfinite(self.node_v_px)
+        weight = np.where(seen, self.weight, 0.0)
+        u_px = np.where(seen, self.node_u_px + self.tilt * self.half_px / 3.0, 0.0)
+        v_px = np.where(seen, self.node_v_px, 0.0)
+        first = self.first_node[:-1]
+        return np.asarray(
+            np.hypot(np.add.reduceat(weight * u_px, first), np.add.reduceat(weight * v_px, first))
+        )
+
+    @property
     def swept(self) -> NDArray[np.complex128]:
         """How far each is swept, u + iv: motions draw images out by the squares of these, which add."""
         return np.asarray(self.swept_u_px + 1j * self.swept_v_px)

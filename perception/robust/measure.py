@@ -9,7 +9,8 @@ from perception.robust.around.uneven import MOST_LEFT, explains_flanks
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters
 from perception.robust.explain import best, by_blobs
 from perception.robust.flare import MeasuredFlare, measured_flare
-from perception.robust.large.discs import measure_large, seems_whole_disc
+from perception.robust.large.discs import measure_large
+from perception.robust.large.whole import as_whole_discs
 from perception.robust.motion import is_long_clutter
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS
 from perception.robust.overlap.free_fits import of_free_size, with_model_error
@@ -67,7 +68,8 @@ def measure(
     """
     fitted = [cluster for cluster in found if not any(member.is_beyond_fit for member in cluster.members)]
     others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
-    alone = [*fitted, *(cluster for cluster in others if seems_whole_disc(cluster, prepared))]
+    whole = as_whole_discs(others, prepared)
+    alone = [*fitted, *whole.values()]
     plain = by_blobs(alone, prepared, camera)
     if not apart:
         at_rest, camera = camera, as_it_turns(plain[: len(fitted)], prepared, camera)
@@ -96,8 +98,8 @@ def measure(
             on_flank += wanted
         elif apart and solution is not None and is_hardly_seen(solution, 0, prepared.shape):
             unseen += wanted if solution.left_over.is_nothing else []
-    whole = dict(zip(alone[len(fitted) :], plain[len(fitted) :], strict=True))
-    large, small = measure_large(others, whole, prepared, camera, apart)
+    by_one = dict(zip(whole, plain[len(fitted) :], strict=True))
+    large, small = measure_large(others, by_one, prepared, camera, apart)
     measured += large
     again += small
     if again:

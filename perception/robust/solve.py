@@ -1,7 +1,7 @@
 """Flares are fitted to windows: the maximum-likelihood fit of any number of them in each.
 
 What is maximised is that of `model.likelihood`, with the λ and the priors of `model.window`. Images are laid
-out for all windows at once, and anew where a size, or a large disc, has moved far from where they were.
+out for all windows at once, and anew where that is seen: sizes or places have moved far from where they were.
 """
 
 import math
@@ -250,7 +250,9 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     away_px = abs(change) * reach_px + np.hypot(*(own[:, :2] - laid_at).T)
     skewed_px = 2.0 * camera.radius_m * np.exp(-laid.log_range_at) * away_px
     blur = (_BLURRED * smoothing_px(camera.calibration)) ** 2
-    seen_px = skewed_px * reach_px**2 / (reach_px**2 + blur)
+    # Its middle lies off its place by its radius squared; that no point spread blurs.
+    off_px = laid.middle_px * abs(change)
+    seen_px = skewed_px * reach_px**2 / (reach_px**2 + blur) + off_px
     moved |= seen_px > _KEPT_SIGMAS * np.concatenate([fit.place_sigmas_px for fit in fits])
     if not moved.any():
         return []

@@ -19,9 +19,9 @@ from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.hiding.eclipse import pile_of
 from perception.robust.large.aperture import mask_in, measure_by_aperture
 from perception.robust.large.outline import Outline, outline_of
+from perception.robust.large.whole import MOST_FITTED_RADIUS_PX, explained_by_one
 from perception.robust.overlap.deblend import RESIDUAL_SIGMAS
 from perception.robust.overlap.free_fits import of_free_width, with_model_error
-from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.problem import Problem, Start, Window
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
@@ -29,9 +29,6 @@ from perception.robust.solve import Solution, solve
 from perception.robust.starts.guesses import least_flux_e
 from perception.robust.verdict import is_border
 from perception.types import Calibration
-
-MOST_FITTED_RADIUS_PX = 130.0
-"""So far are images laid out exactly (`model.discs`)."""
 
 _LEAST_ROUND, _LEAST_ROUND_IF_CLIPPED = 0.3, 0.6
 """Parts of an outline that must lie on a circle: of a square's 0.2 do. The rest may be what lies around, or
@@ -42,33 +39,7 @@ _LEAST_OF_BLOB = 0.25  # that the disc of its outline is, where its light is to 
 _ODD_SIGMAS = 3.0
 _SPILLS_ON_PX = 3
 _BEYOND_PX = 0.5  # of the outline of what is clipped, where nothing that clips is a disc's own
-_HALF, _OF_ITS_BOX = (
-    0.5,
-    (0.55, 0.85),
-)  # an ellipse fills so much of the box around it: π / 4 where it is upright
-_OF_ITS_CIRCLE = (0.3, 1.3)  # and of the circle around it, as its light says
 _TIMES_LAID_OUT = 2  # a pixel elsewhere the lens stretches them otherwise
-
-
-def seems_whole_disc(cluster: Cluster, prepared: PreparedFrame) -> bool:
-    """Tell whether a cluster is one large disc, whole and of the size that its light says, if that is known.
-
-    By the area of what is clipped, or above half of its maximum: as that of an ellipse.
-    """
-    member, box = cluster.members[0], cluster.members[0].blob.box
-    if len(cluster.members) > 1 or not 0.0 < member.image_radius_px < MOST_FITTED_RADIUS_PX:
-        return False
-    if not member.at_one_metre_e > 0.0 or box.with_margin(1).inside(prepared.shape) != box.with_margin(1):
-        return False
-    clips = member.blob.pixels & prepared.clipped_in(box)
-    lit = clips if member.is_clipped else member.blob.filtered_e > _HALF * member.blob.peak_e
-    area_px2 = int(np.count_nonzero(lit))
-    across, down = (np.flatnonzero(lit.any(axis=axis)) for axis in (0, 1))
-    least, most = _OF_ITS_BOX
-    if not least < area_px2 / (np.ptp(across) + 1) / (np.ptp(down) + 1) < most:
-        return False
-    least, most = _OF_ITS_CIRCLE
-    return member.is_clipped or bool(least < area_px2 / (math.pi * member.image_radius_px**2) < most)
 
 
 def measure_large(
@@ -83,7 +54,7 @@ def measure_large(
     Parameters
     ----------
     found, whole
-        The clusters, and what one disc makes of those that seem to be one.
+        The clusters, and what one disc makes of those that seem to be one (`whole`).
     prepared, camera
         The frame they are of, and its camera.
     apart
@@ -94,12 +65,8 @@ def measure_large(
     A blob and its measurement for each flare; and what is small among them, where whole discs do not explain
     a cluster: it is to be measured by itself.
     """
-    explained = {
-        cluster: one
-        for cluster, one in whole.items()
-        if one is not None and one.left_over.is_nothing and not may_be_other_shape(one, camera)
-    }
-    measured, found = _piles([cluster for cluster in found if cluster not in explained], prepared, camera)
+    explained = explained_by_one(whole, camera)
+    measured, found = _piles([each for each in found if each not in explained], prepared, camera)
     for cluster, one in explained.items():
         measured += _by_disc(cluster, one, cluster.wanted, prepared, camera)
     again: list[Candidate] = []

@@ -15,6 +15,7 @@ _FAR_OFF_PX = 1.5  # of a blob's brightest pixel from the middle of its light
 _CLIPPED_FACTORS = (1.0, 4.0, 16.0, 64.0)
 _CUT_FACTORS = (1.0, 2.0, 4.0)
 _LEAST_DISC_PX2 = 50  # of what is clipped, from which on its longer axis tells a disc's size
+_MOST_SHARE = 1.0 - 1e-9
 _SMALL_DISC = 0.7  # of the width that blurs it
 
 
@@ -96,5 +97,5 @@ def _blurred_radius_px(at_px: float, share: float, smooth_px: float) -> float:
     p, m = (2.0 + 2.0 * away) / (2.0 + away) ** 2, (h - 1.0) * (1.0 - 3.0 * h)
     mean = 1.0 + h * p * (h - 1.0 - 0.5 * (2.0 - h) * m * p)
     sigma = h * math.sqrt(2.0 * p) * (1.0 + 0.5 * m * p)
-    root = max(mean + NormalDist().inv_cdf(share) * sigma, 0.0)
+    root = max(mean + NormalDist().inv_cdf(min(share, _MOST_SHARE)) * sigma, 0.0)
     return smooth_px * max(math.sqrt((2.0 + away) * root ** (1.0 / h)), _SMALL_DISC)

@@ -34,23 +34,25 @@ def start_costs(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[l
     first_source = np.cumsum([0, *flares])
     all_starts = np.array([start for starts in guesses for start in starts])
     source_window = np.repeat(window, flares)
-    images, laid_as = _largest_images(source_window, all_starts, camera)
+    images, laid_as, imaged = _largest_images(source_window, all_starts, camera)
     u_px, v_px, log_range = np.ascontiguousarray(all_starts[images].T)
     hidden_e = camera.hidden_px_at_1_m(all_starts[images, :2])
     if hidden_e is not None:
         hidden_e *= np.maximum(background_e, 0.0)[source_window[images]]
-    laid, imaged = lay_out(camera, u_px, v_px, log_range, hidden_e, None, np.full(len(u_px), _OF_STARTS))
+    laid, _ = lay_out(camera, u_px, v_px, log_range, hidden_e, None, np.full(len(u_px), _OF_STARTS))
     costs = unlikeliness(
         Views.of([each.view for each in windows]), laid, camera.known(windows[0].clip_e), all_starts,
         laid_as, background_e, window, first_source,
     )  # fmt: skip
-    costs[~np.logical_and.reduceat(imaged[laid_as], first_source[:-1])] = math.inf
+    costs[~np.logical_and.reduceat(imaged, first_source[:-1])] = math.inf
     ends = np.cumsum([len(of_one) for of_one in problems]).tolist()
     return [costs[first:end].tolist() for first, end in zip([0, *ends], ends, strict=False)]
 
 
-def _largest_images(window: Indices, starts: Array, camera: Camera) -> tuple[Indices, Indices]:
-    """Return which of guesses at one place of a window are largest, but have an image, and which is whose."""
+def _largest_images(
+    window: Indices, starts: Array, camera: Camera
+) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """Return the largest guesses at each place, but with an image; whose image each has; which have one."""
     radius_rad = angular_radius_rad(np.exp(starts[:, 2]), camera.radius_m)
     imaged = has_image(starts[:, 0], starts[:, 1], radius_rad, camera.calibration)
     order = np.lexsort((starts[:, 2], ~imaged, starts[:, 1], starts[:, 0], window))
@@ -58,7 +60,7 @@ def _largest_images(window: Indices, starts: Array, camera: Camera) -> tuple[Ind
     is_first = np.concatenate([[True], (places[1:] != places[:-1]).any(axis=1)])
     of = np.empty(len(order), dtype=np.int64)
     of[order] = np.cumsum(is_first) - 1
-    return order[is_first], of
+    return order[is_first], of, imaged
 
 
 def likely_starts(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[tuple[int, Problem]]:

@@ -169,7 +169,7 @@ def test_whole_discs_are_told_without_a_look_at_outlines(
     found = sorted(detect(frame, CAMERA), key=lambda one: one.u_px)
     assert not outlined
     assert found[0].saturated == (clipped > 1.0)
-    monkeypatch.setattr(measure, "seems_whole_disc", lambda *_: False)
+    monkeypatch.setattr(measure, "as_whole_discs", lambda *_: {})
     others = sorted(detect(frame, CAMERA), key=lambda one: one.u_px)
     assert len(outlined) == len(places)
     for place, one, other in zip(sorted(places), found, others, strict=True):

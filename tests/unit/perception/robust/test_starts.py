@@ -38,7 +38,7 @@ def _told(key: int, nearest_m: float = 0.8) -> list[Detection]:
 
 @pytest.mark.parametrize("key", range(2))
 def test_the_likeliest_guesses_lead_where_all_lead(key: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To a tenth of a σ: images are not laid out anew for sizes that are off by less than 2 %."""
+    """To a tenth of a σ: images are not laid out anew where that is not seen."""
     few, followed = _told(key), 0
 
     def all_of(problems: Sequence[Sequence[Problem]], _: object) -> list[tuple[int, Problem]]:

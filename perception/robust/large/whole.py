@@ -1,0 +1,106 @@
+"""Large discs that are whole and alone: one fit explains them, with no look at outlines or piles."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.model.bearing import direction_camera
+from perception.model.layout import SEEN
+from perception.model.lens import stretch
+from perception.model.ranging import brightness_e
+from perception.model.sensor import pixel_variance_e2
+from perception.model.window import Camera
+from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster
+from perception.robust.forward_light import fit_beside_forward_light
+from perception.robust.goodness import MODEL_ERROR
+from perception.robust.overlap.limb import may_be_other_shape
+from perception.robust.problem import Window
+from perception.robust.search.prepare import PreparedFrame
+from perception.robust.solve import Solution
+
+MOST_FITTED_RADIUS_PX = 130.0
+"""So far are images laid out exactly (`model.discs`)."""
+
+_HALF = 0.5  # of its brightest, where an unclipped disc ends
+_OF_ITS_BOX = (0.55, 0.85)  # parts of the box around it that an ellipse fills: π/4 where it is upright
+_OF_ITS_CIRCLE = (0.3, 1.3)  # and of the circle that its light says
+_MOST_LONGER = 1.15  # than the lens makes it
+_MOST_BRIGHTNESS_FACTOR = 2.0
+_MOST_CHI2 = 2.0  # for each pixel: with more left over nothing is explained
+
+
+def as_whole_discs(found: Sequence[Cluster], prepared: PreparedFrame) -> dict[Cluster, Cluster]:
+    """Return clusters that seem to be one large disc, each with itself as it is to be fitted.
+
+    Fits of what is none are given up early.
+    """
+    return {
+        cluster: replace(cluster, window=replace(cluster.window, to_beat=_most_deviance(cluster.window)))
+        for cluster in found
+        if len(cluster.members) == 1 and _seems_whole(cluster.members[0], prepared)
+    }
+
+
+def explained_by_one(solutions: Mapping[Cluster, Solution | None], camera: Camera) -> dict[Cluster, Solution]:
+    """Return the clusters of which one disc, whole and far enough away, leaves nothing over."""
+    fits = [
+        None if one is None else replace(one, window=cluster.window) for cluster, one in solutions.items()
+    ]
+    fit_beside_forward_light(fits, camera)
+    return {
+        cluster: one
+        for cluster, one in zip(solutions, fits, strict=True)
+        if one is not None and one.left_over.is_nothing and one.ranged.all()
+        if float(one.log_range.min()) >= math.log(LEAST_RANGE_M)
+        if not may_be_other_shape(one, camera)
+    }
+
+
+def _seems_whole(member: Candidate, prepared: PreparedFrame) -> bool:
+    """Tell whether a blob is whole, as long and as large as a source, and no brighter.
+
+    By the area of what is clipped, or above half of its maximum.
+    """
+    calibration, box = prepared.calibration, member.blob.box
+    if not (member.at_one_metre_e > 0.0 and 0.0 < member.image_radius_px < MOST_FITTED_RADIUS_PX):
+        return False
+    if box.with_margin(1).inside(prepared.shape) != box.with_margin(1):
+        return False
+    clips = member.blob.pixels & prepared.clipped_in(box)
+    lit = clips if member.is_clipped else member.blob.filtered_e > _HALF * member.blob.peak_e
+    if not _is_ellipse(lit, member, prepared):
+        return False
+    area_px2, place = int(np.count_nonzero(lit)), np.array([[member.u_px, member.v_px]])
+    px_per_rad = float(stretch(direction_camera(place, calibration), calibration)[0])
+    angle_rad = math.atan(math.sqrt(area_px2 / math.pi) / px_per_rad)
+    if calibration.source_radius_m < LEAST_RANGE_M * math.sin(angle_rad):
+        return False
+    if not member.is_clipped:
+        least, most = _OF_ITS_CIRCLE
+        return bool(least < area_px2 / (math.pi * member.image_radius_px**2) < most)
+    frame = prepared.frame
+    disc_e = float(brightness_e(place, frame.exposure_s, frame.gain, calibration)[0])
+    return bool(np.median(prepared.excess_e[box.slices][lit]) < _MOST_BRIGHTNESS_FACTOR * disc_e)
+
+
+def _is_ellipse(lit: NDArray[np.bool_], member: Candidate, prepared: PreparedFrame) -> bool:
+    """Tell whether what is lit fills its box as an ellipse does, and is no longer than the lens makes it."""
+    places = np.argwhere(lit)
+    height, width = np.ptp(places, axis=0) + 1
+    least, most = _OF_ITS_BOX
+    if not least < len(places) / (height * width) < most:
+        return False
+    direction = direction_camera([(member.u_px, member.v_px)], prepared.calibration)[0]
+    short2, long2 = np.linalg.eigvalsh(np.cov(places.T))
+    return bool(long2 * direction[2] ** 2 < _MOST_LONGER**2 * short2)
+
+
+def _most_deviance(window: Window) -> float:
+    """Return −2 ln L of a fit that leaves a window's pixels hardly explained: by noise as they are seen."""
+    seen_e = window.image_e[window.state == SEEN]
+    variance = pixel_variance_e2(seen_e, window.floor_e2, window.prnu)
+    by_model = (MODEL_ERROR * seen_e) ** 2
+    return float(np.sum(np.log(variance) + _MOST_CHI2 * (1.0 + by_model / variance)))
