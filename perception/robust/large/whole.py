@@ -1,4 +1,4 @@
-"""Large discs that are whole and alone: one fit explains them, with no look at outlines or piles."""
+"""Large discs, whole, alone and not clipped: one fit explains them, with no look at outlines or piles."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
 from perception.model.layout import SEEN
-from perception.model.lens import stretch
-from perception.model.ranging import brightness_e
 from perception.model.sensor import pixel_variance_e2
 from perception.model.window import Camera
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster
@@ -28,7 +26,6 @@ _HALF = 0.5  # of its brightest, where an unclipped disc ends
 _OF_ITS_BOX = (0.55, 0.85)  # parts of the box around it that an ellipse fills: π/4 where it is upright
 _OF_ITS_CIRCLE = (0.3, 1.3)  # and of the circle that its light says
 _MOST_LONGER = 1.15  # than the lens makes it
-_MOST_BRIGHTNESS_FACTOR = 2.0
 _MOST_CHI2 = 2.0  # for each pixel: with more left over nothing is explained
 
 
@@ -60,30 +57,18 @@ def explained_by_one(solutions: Mapping[Cluster, Solution | None], camera: Camer
 
 
 def _seems_whole(member: Candidate, prepared: PreparedFrame) -> bool:
-    """Tell whether a blob is whole, as long and as large as a source, and no brighter.
-
-    By the area of what is clipped, or above half of its maximum.
-    """
-    calibration, box = prepared.calibration, member.blob.box
-    if not (member.at_one_metre_e > 0.0 and 0.0 < member.image_radius_px < MOST_FITTED_RADIUS_PX):
+    """Tell whether a blob is whole, as long as a source, and as large as one of its light."""
+    box = member.blob.box
+    if member.is_clipped or not 0.0 < member.image_radius_px < MOST_FITTED_RADIUS_PX:
         return False
     if box.with_margin(1).inside(prepared.shape) != box.with_margin(1):
         return False
-    clips = member.blob.pixels & prepared.clipped_in(box)
-    lit = clips if member.is_clipped else member.blob.filtered_e > _HALF * member.blob.peak_e
-    if not _is_ellipse(lit, member, prepared):
+    if member.log_range(member.flux_e) < math.log(LEAST_RANGE_M):
         return False
-    area_px2, place = int(np.count_nonzero(lit)), np.array([[member.u_px, member.v_px]])
-    px_per_rad = float(stretch(direction_camera(place, calibration), calibration)[0])
-    angle_rad = math.atan(math.sqrt(area_px2 / math.pi) / px_per_rad)
-    if calibration.source_radius_m < LEAST_RANGE_M * math.sin(angle_rad):
-        return False
-    if not member.is_clipped:
-        least, most = _OF_ITS_CIRCLE
-        return bool(least < area_px2 / (math.pi * member.image_radius_px**2) < most)
-    frame = prepared.frame
-    disc_e = float(brightness_e(place, frame.exposure_s, frame.gain, calibration)[0])
-    return bool(np.median(prepared.excess_e[box.slices][lit]) < _MOST_BRIGHTNESS_FACTOR * disc_e)
+    lit = member.blob.filtered_e > _HALF * member.blob.peak_e
+    least, most = _OF_ITS_CIRCLE
+    is_as_large = least < np.count_nonzero(lit) / (math.pi * member.image_radius_px**2) < most
+    return bool(is_as_large) and _is_ellipse(lit, member, prepared)
 
 
 def _is_ellipse(lit: NDArray[np.bool_], member: Candidate, prepared: PreparedFrame) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.flare import has_image
+from perception.model.flare import has_image, image_radius_px
 from perception.model.likelihood.first_guesses import Views, unlikeliness
 from perception.model.ranging import angular_radius_rad
 from perception.model.window import Camera, lay_out
@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _OF_STARTS = 0.5  # so fine are images that are only to tell which first guess is likelier
+_LEANING_PX = 0.5  # radius times its angle
 
 
 def start_costs(problems: Sequence[Sequence[Problem]], camera: Camera) -> list[list[float]]:
@@ -55,8 +56,13 @@ def _largest_images(
     """Return the largest guesses at each place, but with an image; whose image each has; which have one."""
     radius_rad = angular_radius_rad(np.exp(starts[:, 2]), camera.radius_m)
     imaged = has_image(starts[:, 0], starts[:, 1], radius_rad, camera.calibration)
-    order = np.lexsort((starts[:, 2], ~imaged, starts[:, 1], starts[:, 0], window))
-    places = np.column_stack([window, starts[:, :2]])[order]
+    # Images off the axis lean by their radius squared: larger ones are no images of smaller discs.
+    radius_px = image_radius_px(
+        starts[:, 0], starts[:, 1], np.where(imaged, radius_rad, 0.0), camera.calibration
+    )
+    own = np.where(imaged & (radius_px * radius_rad > _LEANING_PX), np.arange(len(starts)), -1)
+    order = np.lexsort((starts[:, 2], ~imaged, own, starts[:, 1], starts[:, 0], window))
+    places = np.column_stack([window, starts[:, :2], own])[order]
     is_first = np.concatenate([[True], (places[1:] != places[:-1]).any(axis=1)])
     of = np.empty(len(order), dtype=np.int64)
     of[order] = np.cumsum(is_first) - 1
