@@ -181,3 +181,13 @@ def test_whole_discs_are_told_without_a_look_at_outlines(
     monkeypatch.setattr(discs, "outline_of", counted)
     _told(_seen_e([(90.3, 101.6, 0.14)], 0.97, 0.5), SMALL)
     assert outlined
+
+
+@pytest.mark.parametrize("range_m", [0.028, 0.035])
+def test_what_would_stand_before_the_lens_is_no_source(range_m: float) -> None:
+    """A whole disc, neither clipped nor larger than is fitted, nearer than 3 cm: of balls of 3 mm."""
+    camera = replace(CAMERA, source_radius_m=0.003)
+    mean_e = expected_e(camera, [(600.4, 480.7, range_m)], 1e-5)
+    exposure_s = 1e-5 * 2000.0 / float(mean_e.max())
+    frame = expose(mean_e * exposure_s / 1e-5 + 5.0, camera, random(88), exposure_s)
+    assert len(detect(frame, camera)) == (range_m > 0.03)
