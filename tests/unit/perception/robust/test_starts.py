@@ -103,7 +103,7 @@ def test_first_guesses_are_as_likely_as_their_images_say() -> None:
     unusable, responses 3 % apart: by hand, images by brute force."""
     known, problems = Camera(replace(CAMERA, prnu=0.03), 1e-4, 1.0), []
     clip_e = 900.0
-    for key, places in enumerate([[(90.3, 70.2, 2.0)], [(100.1, 120.7, 1.5), (108.6, 117.2, 3.0)]]):
+    for key, places in enumerate([[(30.3, 22.2, 2.0)], [(100.1, 120.7, 1.5), (108.6, 117.2, 3.0)]]):
         background_e, floor_e2, known_e = (
             9.0 + 40.0 * key,
             100.0 + 80.0 * key,
@@ -118,13 +118,14 @@ def test_first_guesses_are_as_likely_as_their_images_say() -> None:
         window = Window(box, image_e, state, floor_e2, clip_e, 0.03, known_e=known_e.reshape(41, 41))
         nearer = [(u, v, log_range - 0.7) for u, v, log_range in starts]
         beyond = [(u + 50.0, v, log_range) for u, v, log_range in starts]
-        around = [(u, v, math.log(0.01001)) for u, v, _ in starts]  # a part of it behind the camera
+        around = [(u, v, math.log(0.0105)) for u, v, _ in starts]  # in the corner partly behind the camera
         problems.append([Problem(window, each, background_e) for each in (starts, nearer, beyond, around)])
     told = start_costs(problems, known)
     for of_window, costs in zip(problems, told, strict=True):
         for problem, cost, within in zip(of_window, costs, (1e-3, 2e-3), strict=False):
             assert cost == pytest.approx(_cost_by_hand(problem, clip_e), rel=within)
-        assert costs[2] == costs[3] == math.inf
+        assert costs[2] == math.inf
+    assert told[0][3] == math.inf
 
 
 def test_what_is_larger_than_its_window_is_not_laid_out() -> None:
