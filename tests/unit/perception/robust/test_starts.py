@@ -181,3 +181,23 @@ def test_images_are_laid_out_anew_where_it_is_seen(
         assert one.u_px == pytest.approx(other.u_px, abs=0.05 * other.u_sigma_px, nan_ok=True)
         assert one.v_px == pytest.approx(other.v_px, abs=0.05 * other.v_sigma_px, nan_ok=True)
         assert one.range_m == pytest.approx(other.range_m, abs=0.05 * other.range_sigma_m, nan_ok=True)
+
+
+@pytest.mark.parametrize(("psf_sigma_px", "radius_px"), [(0.4, 1.5), (0.7, 3.0)])
+@pytest.mark.parametrize("too_far", [0.6, 1.2])
+def test_a_guess_that_is_far_too_small_does_not_matter(
+    psf_sigma_px: float, radius_px: float, too_far: float
+) -> None:
+    """Laid out for a disc of a third of the size, images of it have too few strips: that is half a σ of range."""
+    camera = replace(CAMERA, psf_sigma_px=psf_sigma_px)
+    u, v, range_m = 162.3, 125.6, 480.0 * camera.source_radius_m / radius_px
+    box, number = PixelBox(100, 135, 51, 51), random(95)
+    mean_e = expected_e(camera, [(u, v, range_m)], 1.5e-4, 3.0)[box.slices]
+    image_e = number.poisson(mean_e) + number.normal(0.0, 10.0, mean_e.shape)
+    window = Window(box, image_e, np.full(mean_e.shape, SEEN, dtype=np.uint8), 100.0, math.inf, 0.0)
+    problems = [Problem(window, [(u, v, math.log(range_m) + off)], 3.0) for off in (0.0, too_far)]
+    one, other = solve_module.solve(problems, Camera(camera, 1.5e-4, 1.0))
+    assert one is not None
+    assert other is not None
+    assert abs(other.u_px[0] - one.u_px[0]) < 0.02 * one.u_sigma_px[0]
+    assert abs(other.log_range[0] - one.log_range[0]) < 0.02 * one.log_range_sigma[0]
