@@ -84,15 +84,14 @@ def test_the_likeliest_guesses_lead_where_all_lead(key: int, monkeypatch: pytest
         assert one.range_sigma_m == pytest.approx(other.range_sigma_m, rel=1e-3, nan_ok=True)
 
 
-def _cost_by_hand(problem: Problem, clip_e: float) -> float:
+def _cost_by_hand(problem: Problem, clip_e: float, camera: Calibration = CAMERA) -> float:
     """Return −2 ln L of guesses, images by brute force."""
     window = problem.window
     assert window.known_e is not None
     places = [(u, v, math.exp(log_range)) for u, v, log_range in problem.starts]
-    mean_e = expected_e(CAMERA, places, 1e-4, problem.background_e)[window.box.slices] + window.known_e
+    mean_e = expected_e(camera, places, 1e-4, problem.background_e)[window.box.slices] + window.known_e
     variance = mean_e + (0.03 * mean_e) ** 2 + window.floor_e2
     seen, clipped = window.state == SEEN, window.state == CLIPPED
-    assert clipped.sum() > 5
     cost = float(((window.image_e - mean_e) ** 2 / variance + np.log(variance))[seen].sum())
     sigmas = (clip_e - mean_e[clipped]) / np.sqrt(variance[clipped])
     return cost - 2.0 * sum(math.log(0.5 * math.erfc(z * math.sqrt(0.5))) for z in sigmas.tolist())
@@ -122,10 +121,26 @@ def test_first_guesses_are_as_likely_as_their_images_say() -> None:
         problems.append([Problem(window, each, background_e) for each in (starts, nearer, beyond, around)])
     told = start_costs(problems, known)
     for of_window, costs in zip(problems, told, strict=True):
+        assert (of_window[0].window.state == CLIPPED).sum() > 5
         for problem, cost, within in zip(of_window, costs, (1e-3, 2e-3), strict=False):
             assert cost == pytest.approx(_cost_by_hand(problem, clip_e), rel=within)
         assert costs[2] == math.inf
     assert told[0][3] == math.inf
+
+
+def test_a_large_disc_off_the_axis_is_as_likely_as_its_own_image_says() -> None:
+    """45° off the axis one of 10 px leans otherwise than one of 30 px, by whose image -2 ln L would be three times that."""
+    camera = replace(CAMERA, fx_px=100.0, fy_px=100.0, prnu=0.03)
+    place = (59.7, 127.5, 0.2)
+    box = PixelBox(87, 20, 81, 81)
+    mean_e = expected_e(camera, [place], 1e-4, 3.0)[box.slices]
+    nothing_e = np.zeros(mean_e.shape)
+    state = np.full(mean_e.shape, SEEN, dtype=np.uint8)
+    window = Window(box, mean_e, state, 100.0, math.inf, 0.03, known_e=nothing_e)
+    starts = [[(*place[:2], math.log(times * place[2]))] for times in (1.0, 1.0 / 3.0)]
+    problems = [Problem(window, each, 3.0) for each in starts]
+    ((cost, _),) = start_costs([problems], Camera(camera, 1e-4, 1.0))
+    assert cost == pytest.approx(_cost_by_hand(problems[0], math.inf, camera), rel=2e-3)
 
 
 def test_what_is_larger_than_its_window_is_not_laid_out() -> None:
