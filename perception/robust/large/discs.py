@@ -54,7 +54,7 @@ def measure_large(
     Parameters
     ----------
     found, whole
-        The clusters, and what one disc makes of those that seem to be one (`whole`).
+        The clusters, and what one disc makes of those that seem to be one (`as_whole_discs`).
     prepared, camera
         The frame they are of, and its camera.
     apart
