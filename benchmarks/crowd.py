@@ -24,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import perception
 from perception import RawFrame
-from perception.model.flare import PixelBox, flare_image
+from perception.model.flare import image_radius_px
 from tests.hard_frames.near import union_of_discs
-from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expose, random
+from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 CAMERA = replace(calibration(), sigma={})
 FRAMES = 4
@@ -65,37 +65,27 @@ def flares_of(kind: Kind, *key: int) -> Flares:
     generator = random(*key)
     ranges_m = np.sort(kind.near_m * (kind.far_m / kind.near_m) ** generator.random(kind.count))
     flares: Flares = []
+    radii_px: list[float] = []
     for range_m in ranges_m.tolist():
         while True:
             u, v = 25.0 + 1230.0 * generator.random(), 25.0 + 910.0 * generator.random()
+            radius_px = float(image_radius_px(u, v, math.asin(CAMERA.source_radius_m / range_m), CAMERA))
             if not kind.apart or all(
-                math.hypot(u - a, v - b) > _GAP_PX + _radius_px(u, v, range_m) + _radius_px(a, b, other_m)
-                for a, b, other_m in flares
+                math.hypot(u - a, v - b) > _GAP_PX + radius_px + other_px
+                for (a, b, _), other_px in zip(flares, radii_px, strict=True)
             ):
                 flares.append((u, v, range_m))
+                radii_px.append(radius_px)
                 break
     return flares
 
 
-def _radius_px(u: float, v: float, range_m: float) -> float:
-    return CAMERA.fx_px * CAMERA.source_radius_m / range_m * (1.0 + _tangent2(u, v))
-
-
-def _tangent2(u: float, v: float) -> float:
-    return ((u - CAMERA.cx_px) ** 2 + (v - CAMERA.cy_px) ** 2) / CAMERA.fx_px**2
-
-
 def frame_of(kind: Kind, flares: Flares, *key: int) -> RawFrame:
-    """Return a frame of flares: points as the stack draws them, balls by brute force, nearer ones before."""
+    """Return a frame of flares by brute force, of balls the nearer ones before the farther."""
     if kind.near_m < _BALLS_M:
-        mean_e_per_s, _ = union_of_discs(flares, CAMERA)
-        return expose(mean_e_per_s * kind.exposure_s + BACKGROUND_E, CAMERA, random(*key), kind.exposure_s)
-    mean_e = np.full((CAMERA.height_px, CAMERA.width_px), BACKGROUND_E)
-    for u, v, range_m in flares:
-        window = PixelBox.around(u, v, 1.3 * _radius_px(u, v, range_m) + 6.0, CAMERA)
-        share = flare_image(u, v, math.asin(CAMERA.source_radius_m / range_m), window, CAMERA).fraction
-        cosine = 1.0 / math.sqrt(1.0 + _tangent2(u, v))
-        mean_e[window.slices] += FLUX_PER_S_AT_1_M * kind.exposure_s * cosine / range_m**2 * share
+        mean_e = union_of_discs(flares, CAMERA)[0] * kind.exposure_s + BACKGROUND_E
+    else:
+        mean_e = expected_e(CAMERA, flares, kind.exposure_s, BACKGROUND_E)
     return expose(mean_e, CAMERA, random(*key), kind.exposure_s)
 
 

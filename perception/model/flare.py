@@ -59,6 +59,12 @@ class PixelBox:
         """Return the box with a margin all around, which may reach beyond the image."""
         return PixelBox(self.top - by_px, self.left - by_px, self.height + 2 * by_px, self.width + 2 * by_px)
 
+    def touches_border(self, shape: tuple[int, int]) -> bool:
+        """Tell whether the box, which lies in a frame of so many rows and columns, reaches its border."""
+        height, width = shape
+        ends = self.top + self.height == height or self.left + self.width == width
+        return self.top == 0 or self.left == 0 or ends
+
     @property
     def corner_and_size(self) -> tuple[int, int, int, int]:
         """Top, left, height and width, as compiled loops take a box."""

@@ -130,7 +130,7 @@ def is_extended(candidate: Candidate, prepared: PreparedFrame) -> bool:
     """
     if candidate.is_clipped:
         return False
-    half_area = int(np.count_nonzero(candidate.blob.filtered_e > 0.5 * candidate.blob.peak_e))
+    half_area = int(np.count_nonzero(candidate.blob.bright_half))
     # Half maximum of a Gaussian filtered with itself lies at √(2 ln 2) · √2 σ = 1.67 σ.
     smooth_px = smoothing_px(prepared.calibration)
     return half_area > 4.0 * math.pi * (candidate.image_radius_px + 1.67 * smooth_px) ** 2 + 8.0
@@ -160,6 +160,11 @@ class Cluster:
     def is_in_crowd(self) -> bool:
         """Whether it is a part of a larger group."""
         return len(self.wanted) < len(self.members)
+
+    @property
+    def is_beyond_fit(self) -> bool:
+        """Whether any member is."""
+        return any(member.is_beyond_fit for member in self.members)
 
     @property
     def is_clipped(self) -> bool:

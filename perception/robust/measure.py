@@ -66,8 +66,8 @@ def measure(
     -------
     A blob and its measurement for each flare, and the camera as it turns.
     """
-    fitted = [cluster for cluster in found if not any(member.is_beyond_fit for member in cluster.members)]
-    others = [cluster for cluster in found if any(member.is_beyond_fit for member in cluster.members)]
+    fitted = [cluster for cluster in found if not cluster.is_beyond_fit]
+    others = [cluster for cluster in found if cluster.is_beyond_fit]
     whole = as_whole_discs(others, prepared)
     alone = [*fitted, *whole.values()]
     plain = by_blobs(alone, prepared, camera)

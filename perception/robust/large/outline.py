@@ -16,7 +16,6 @@ from perception.types import Calibration
 
 Array = NDArray[np.float64]
 
-_HALF = 0.5  # of its brightest, where an unclipped disc ends
 _WIDER_THAN_SPILL_PX = 5
 _FEWEST = 24  # pixels of an outline
 _TRIED, _LEAST_VOLUME, _ROUNDS = 20, 1e-12, 3
@@ -58,7 +57,7 @@ def outline_of(blob: Blob, prepared: PreparedFrame) -> Outline | None:
 
     box, (rows, columns) = blob.box, prepared.shape
     clips = blob.pixels & prepared.clipped_in(box)
-    lit = clips if clips.any() else blob.pixels & (blob.filtered_e > _HALF * blob.peak_e)
+    lit = clips if clips.any() else blob.bright_half
     across_spill = np.ones((1, _WIDER_THAN_SPILL_PX), dtype=np.uint8)
     whole = np.pad(lit, 1).astype(np.uint8)
     whole = np.asarray(cv2.morphologyEx(whole, cv2.MORPH_OPEN, across_spill))

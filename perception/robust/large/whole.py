@@ -16,13 +16,13 @@ from perception.robust.forward_light import fit_beside_forward_light
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.limb import may_be_other_shape
 from perception.robust.problem import Window
+from perception.robust.search.blobs import half_axes_px
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
 
 MOST_FITTED_RADIUS_PX = 130.0
 """So far are images laid out exactly (`model.discs`)."""
 
-_HALF = 0.5  # of its brightest, where an unclipped disc ends
 _OF_ITS_BOX = (0.55, 0.85)  # parts of the box around it that an ellipse fills: π/4 where it is upright
 _OF_ITS_CIRCLE = (0.3, 1.3)  # and of the circle that its light says
 _MOST_LONGER = 1.15  # than the lens makes it
@@ -58,14 +58,13 @@ def explained_by_one(solutions: Mapping[Cluster, Solution | None], camera: Camer
 
 def _seems_whole(member: Candidate, prepared: PreparedFrame) -> bool:
     """Tell whether a blob is whole, as long as a source, and as large as one of its light."""
-    box = member.blob.box
     if member.is_clipped or not 0.0 < member.image_radius_px < MOST_FITTED_RADIUS_PX:
         return False
-    if box.with_margin(1).inside(prepared.shape) != box.with_margin(1):
+    if member.blob.box.touches_border(prepared.shape):
         return False
     if member.log_range(member.flux_e) < math.log(LEAST_RANGE_M):
         return False
-    lit = member.blob.filtered_e > _HALF * member.blob.peak_e
+    lit = member.blob.bright_half
     least, most = _OF_ITS_CIRCLE
     is_as_large = least < np.count_nonzero(lit) / (math.pi * member.image_radius_px**2) < most
     return bool(is_as_large) and _is_ellipse(lit, member, prepared)
@@ -73,14 +72,13 @@ def _seems_whole(member: Candidate, prepared: PreparedFrame) -> bool:
 
 def _is_ellipse(lit: NDArray[np.bool_], member: Candidate, prepared: PreparedFrame) -> bool:
     """Tell whether what is lit fills its box as an ellipse does, and is no longer than the lens makes it."""
-    places = np.argwhere(lit)
-    height, width = np.ptp(places, axis=0) + 1
+    height, width = np.ptp(np.argwhere(lit), axis=0) + 1
     least, most = _OF_ITS_BOX
-    if not least < len(places) / (height * width) < most:
+    if not least < np.count_nonzero(lit) / (height * width) < most:
         return False
     direction = direction_camera([(member.u_px, member.v_px)], prepared.calibration)[0]
-    short2, long2 = np.linalg.eigvalsh(np.cov(places.T))
-    return bool(long2 * direction[2] ** 2 < _MOST_LONGER**2 * short2)
+    shorter_px, longer_px = half_axes_px(lit)
+    return bool(longer_px * abs(direction[2]) < _MOST_LONGER * shorter_px)
 
 
 def _most_deviance(window: Window) -> float:

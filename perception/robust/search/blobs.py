@@ -35,6 +35,11 @@ class Blob:
         return float(self.filtered_e[self.pixels].max())
 
     @property
+    def bright_half(self) -> NDArray[np.bool_]:
+        """Which of its pixels are brighter than half of its maximum, in its box."""
+        return np.asarray(self.filtered_e > 0.5 * self.peak_e)
+
+    @property
     def area_px(self) -> int:
         """Number of pixels."""
         return int(np.count_nonzero(self.pixels))
@@ -43,6 +48,16 @@ class Blob:
         """Return its pixels as indices in a frame of so many columns, in order."""
         rows, columns = np.nonzero(self.pixels)
         return np.asarray((self.box.top + rows) * width + self.box.left + columns)
+
+
+def half_axes_px(mask: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return half of the shorter and of the longer axis of an ellipse that fills a mask.
+
+    Along each an ellipse scatters by the square of half of that axis, over four.
+    """
+    variances_px2 = np.linalg.eigvalsh(np.cov(np.argwhere(mask).T))
+    shorter, longer = (2.0 * np.sqrt(np.maximum(variances_px2, 0.0))).tolist()
+    return shorter, longer
 
 
 def is_large(blob: Blob) -> bool:

@@ -6,9 +6,9 @@ from statistics import NormalDist
 import numpy as np
 
 from perception.model.discs.nodes import smoothing_px
-from perception.model.sensor import clip_level_e
 from perception.robust.clusters import Candidate, Cluster
 from perception.robust.problem import Start
+from perception.robust.search.blobs import half_axes_px
 from perception.robust.search.prepare import PreparedFrame
 
 _FAR_OFF_PX = 1.5  # of a blob's brightest pixel from the middle of its light
@@ -26,14 +26,12 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
     but no source is larger than what is seen of it. Where the middle of a lone blob's light is far from its
     brightest pixel, a flare there may stand beside something else.
     """
-    height, width = prepared.shape
-    boxes = [member.blob.box for member in cluster.members]
-    cut = any(
-        b.top == 0 or b.left == 0 or b.top + b.height == height or b.left + b.width == width for b in boxes
-    )
+    cut = any(member.blob.box.touches_border(prepared.shape) for member in cluster.members)
     factors = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
     if len(cluster.members) == 1 and cluster.is_clipped:
-        factors = tuple(sorted({*factors, *_factor_by_outline(cluster.members[0], prepared)}))
+        factors = tuple(
+            sorted({*factors, *_factor_by_outline(cluster.members[0], cluster.window.clip_e, prepared)})
+        )
     floor_e = least_flux_e(prepared)
     sets: list[list[Start]] = []
     for factor in factors:
@@ -66,19 +64,17 @@ def least_flux_e(prepared: PreparedFrame) -> float:
     return 3.0 * math.sqrt(prepared.floor_e2)
 
 
-def _factor_by_outline(member: Candidate, prepared: PreparedFrame) -> tuple[float, ...]:
+def _factor_by_outline(member: Candidate, clip_e: float, prepared: PreparedFrame) -> tuple[float, ...]:
     """Return how many times as bright a clipped flare is if it is a disc whose image clips so far out."""
     brightness_e = prepared.brightness_e(member.u_px, member.v_px)
     clipped = prepared.clipped_in(member.blob.box) & member.blob.pixels
     clipped_px2 = np.count_nonzero(clipped)
-    clips_e = clip_level_e(prepared.calibration, prepared.frame.black_level_dn, prepared.frame.gain)
-    if not (clipped_px2 and member.image_radius_px > 0.0 and clips_e < brightness_e < math.inf):
+    if not (clipped_px2 and member.image_radius_px > 0.0 and clip_e < brightness_e < math.inf):
         return ()
     at_px = math.sqrt(clipped_px2 / math.pi)
     if clipped_px2 >= _LEAST_DISC_PX2:
-        # Along its longer axis an ellipse scatters by the square of half of that axis, over four.
-        at_px = 2.0 * math.sqrt(float(np.linalg.eigvalsh(np.cov(np.argwhere(clipped).T))[1]))
-    radius_px = _blurred_radius_px(at_px, clips_e / brightness_e, smoothing_px(prepared.calibration))
+        at_px = half_axes_px(clipped)[1]
+    radius_px = _blurred_radius_px(at_px, clip_e / brightness_e, smoothing_px(prepared.calibration))
     return (max((radius_px / member.image_radius_px) ** 2, 1.0),)
 
 

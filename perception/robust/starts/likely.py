@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.flare import has_image, image_radius_px
+from perception.model.bearing import direction_camera
+from perception.model.flare import is_before
+from perception.model.lens import stretch
 from perception.model.likelihood.first_guesses import Views, unlikeliness
 from perception.model.ranging import angular_radius_rad
 from perception.model.window import Camera, lay_out
@@ -55,12 +57,11 @@ def _largest_images(
 ) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Return the largest guesses at each place, but with an image; whose image each has; which have one."""
     radius_rad = angular_radius_rad(np.exp(starts[:, 2]), camera.radius_m)
-    imaged = has_image(starts[:, 0], starts[:, 1], radius_rad, camera.calibration)
+    direction = direction_camera(starts[:, :2], camera.calibration)
+    imaged = is_before(direction, radius_rad)
     # Images off the axis lean by their radius squared: larger ones are no images of smaller discs.
-    radius_px = image_radius_px(
-        starts[:, 0], starts[:, 1], np.where(imaged, radius_rad, 0.0), camera.calibration
-    )
-    own = np.where(imaged & (radius_px * radius_rad > _LEANING_PX), np.arange(len(starts)), -1)
+    leaning_px = stretch(direction, camera.calibration) * np.tan(radius_rad) * radius_rad
+    own = np.where(imaged & (leaning_px > _LEANING_PX), np.arange(len(starts)), -1)
     order = np.lexsort((starts[:, 2], ~imaged, own, starts[:, 1], starts[:, 0], window))
     places = np.column_stack([window, starts[:, :2], own])[order]
     is_first = np.concatenate([[True], (places[1:] != places[:-1]).any(axis=1)])
