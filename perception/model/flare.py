@@ -16,7 +16,8 @@ from perception.model.bearing import direction_camera
 from perception.model.discs.nodes import disc_nodes
 from perception.model.layout import Sources
 from perception.model.lens import stretch
-from perception.model.spread import spread_nodes
+from perception.model.spread.edges import blur_of, whole_lanes
+from perception.model.spread.image import spread_nodes
 from perception.types import Calibration
 
 Array = NDArray[np.float64]
@@ -174,8 +175,9 @@ def flare_image(
     u, v, radius = (np.array([value], dtype=np.float64) for value in (u_px, v_px, angular_radius_rad))
     direction = direction_camera(np.stack([u, v], axis=1), calibration)
     nodes = disc_nodes(u, v, direction, radius, calibration)
-    image = np.zeros((5, window.height, window.width))
+    image = np.zeros((5, window.height, whole_lanes(window.width)))
+    blur = blur_of(calibration.psf_sigma_px, max(window.height, window.width))
     source = Sources.of(nodes, np.zeros(1), np.zeros(1))
     place = (float(u_px) - window.left, float(v_px) - window.top)
-    spread_nodes(source, 0, place, 1.0, (0.0, 0.0), calibration.psf_sigma_px, image)
-    return FlareImage(*image)
+    spread_nodes(source, 0, place, 1.0, (0.0, 0.0), blur, window.width, image)
+    return FlareImage(*np.ascontiguousarray(image[:, :, : window.width]))

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import Known, Sources, View
-from perception.model.likelihood.pixels import is_inside, log_variances, objective
-from perception.model.spread import spread_nodes
+from perception.model.likelihood.pixels import add_plane, is_inside, log_variances, objective
+from perception.model.spread.edges import blur_of, whole_lanes
+from perception.model.spread.image import spread_nodes
 
 Array = NDArray[np.float64]
 
@@ -74,14 +75,18 @@ def unlikeliness(
         if not is_inside(own.ravel(), view, len(own), 3):
             continue
         expected, variance = views.known_e[here] + background_e[at], np.empty(view.image_e.size)
+        blur, image = (
+            blur_of(known.psf_sigma_px, max(rows, columns)),
+            np.empty((1, rows, whole_lanes(columns))),
+        )
         for source in range(first_source[guess], first_source[guess + 1]):
-            image, of = np.zeros((1, rows, columns)), laid_as[source]
+            image[:], of = 0.0, laid_as[source]
             place = (starts[source, 0] - left, starts[source, 1] - top)
             growth = math.exp(sources.log_range_at[of] - starts[source, 2])
             swept = (sources.swept_u_px[of], sources.swept_v_px[of])
-            spread_nodes(sources, of, place, growth, swept, known.psf_sigma_px, image)
+            spread_nodes(sources, of, place, growth, swept, blur, columns, image)
             flux = math.exp(sources.log_flux_at_1_m[of] - 2.0 * starts[source, 2])
-            expected += flux * image[0].ravel()
+            add_plane(flux, image[0], columns, expected)
         for pixel in range(len(expected)):
             lit_e = max(expected[pixel], 0.0)
             variance[pixel] = lit_e + (known.prnu * lit_e) ** 2 + view.floor_e2

@@ -16,8 +16,9 @@ from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
 from perception.model.likelihood.cosines import add_wave_information, add_waves, cosine_sums
 from perception.model.likelihood.products import add_information, dot
-from perception.model.normal import log_upper_tail, of_clipped
-from perception.model.spread import spread_nodes
+from perception.model.normal import kept_of_clipping, log_upper_tail, of_clipped
+from perception.model.spread.edges import blur_of, whole_lanes
+from perception.model.spread.image import spread_nodes
 
 Array = NDArray[np.float64]
 
@@ -58,8 +59,9 @@ def expectation(
     for other in range(len(structure.columns)):
         expected += values[background + 1 + waves + other] * structure.columns[other]
         jacobian[background + 1 + other] = structure.columns[other]
-    image = np.empty((7 if moves else 5, *view.image_e.shape))
-    flat = image.reshape(len(image), -1)
+    rows, columns = view.image_e.shape
+    planes = 7 if moves else 4 + (known.width_spread > 0.0)
+    image, blur = np.empty((planes, rows, whole_lanes(columns))), blur_of(sigma_px, max(rows, columns))
     for source in range(count):
         at = source * step
         by_size = values[at + 2]
@@ -71,22 +73,49 @@ def expectation(
         image[:] = 0.0
         place = (values[at] - view.left, values[at + 1] - view.top)
         growth = math.exp(sources.log_range_at[source] - by_size)
-        spread_nodes(sources, source, place, growth, motion, sigma_px, image)
+        spread_nodes(sources, source, place, growth, motion, blur, columns, image)
         flux = math.exp(sources.log_flux_at_1_m[source] - 2.0 * values[at + 2])
-        for pixel in range(len(expected)):
-            expected[pixel] += flux * flat[0, pixel]
-            jacobian[at, pixel] = flux * flat[1, pixel]
-            jacobian[at + 1, pixel] = flux * flat[2, pixel]
-            jacobian[at + 2, pixel] = -flux * (2.0 * flat[0, pixel] + flat[3, pixel])
+        add_plane(flux, image[0], columns, expected)
+        _set_by_place_and_range(flux, image, columns, jacobian[at : at + 3])
         if has_slack:
-            jacobian[at + 3] = known.tie_spread * flux * flat[3]
+            jacobian[at + 3] = 0.0
+            add_plane(known.tie_spread * flux, image[3], columns, jacobian[at + 3])
         if moves:
-            jacobian[at + step - 2], jacobian[at + step - 1] = flux * flat[5], flux * flat[6]
+            for plane in (5, 6):
+                jacobian[at + step + plane - 7] = 0.0
+                add_plane(flux, image[plane], columns, jacobian[at + step + plane - 7])
         if known.width_spread > 0.0:
-            jacobian[width] += known.width_spread * flux * flat[4]
+            add_plane(known.width_spread * flux, image[4], columns, jacobian[width])
     for pixel in range(len(expected)):
         lit_e = max(expected[pixel], 0.0)
         variance[pixel] = lit_e + (known.prnu * lit_e) ** 2 + view.floor_e2
+
+
+@compiled
+def add_plane(factor: float, plane: Array, columns: int, into: Array) -> None:
+    """Add so many times what is in a plane's columns, of which it has more, to pixels row after row."""
+    rows, width = plane.shape
+    flat = plane.reshape(-1)
+    for row in range(rows):
+        at, pixel = np.uint64(row * width), np.uint64(row * columns)
+        for column in range(np.uint64(columns)):
+            into[pixel + column] += factor * flat[at + column]
+
+
+@compiled
+def _set_by_place_and_range(flux: float, image: Array, columns: int, into: Array) -> None:
+    """Set the derivatives of a source's light by u, v and ln range, shape (3, pixels), from its planes."""
+    _, rows, width = image.shape
+    light, of_u, of_v, larger = image[0].ravel(), image[1].ravel(), image[2].ravel(), image[3].ravel()
+    by_u, by_v, by_range = into[0], into[1], into[2]
+    for row in range(rows):
+        at, pixel = np.uint64(row * width), np.uint64(row * columns)
+        for column in range(np.uint64(columns)):
+            by_u[pixel + column] = flux * of_u[at + column]
+        for column in range(np.uint64(columns)):
+            by_v[pixel + column] = flux * of_v[at + column]
+        for column in range(np.uint64(columns)):
+            by_range[pixel + column] = -flux * (2.0 * light[at + column] + larger[at + column])
 
 
 @compiled
@@ -100,18 +129,22 @@ def slopes(
     `first_wave` is the index of the first amplitude of a wave of the structure, which `jacobian` leaves out.
     """
     image, state, waves = view.image_e.ravel(), view.state.ravel(), len(structure.order)
-    pull, weight = np.zeros(len(expected)), np.zeros(len(expected))
+    pull, weight = np.empty(len(expected)), np.empty(len(expected))
     for pixel in range(len(expected)):
-        if state[pixel] == UNUSABLE:
-            continue
-        weight[pixel] = 1.0 / variance[pixel]
-        if state[pixel] == SEEN and not of_average:
-            pull[pixel] = (image[pixel] - expected[pixel]) / variance[pixel]
-        elif math.isfinite(clip_e):
-            sigma = math.sqrt(variance[pixel])
-            mills, curvature, kept = of_clipped((clip_e - expected[pixel]) / sigma)
-            pull[pixel] = mills / sigma
-            weight[pixel] *= kept if of_average else curvature
+        weight[pixel] = 1.0 / variance[pixel] if state[pixel] != UNUSABLE else 0.0
+    for pixel in range(len(expected)):
+        pull[pixel] = (image[pixel] - expected[pixel]) * weight[pixel] if state[pixel] == SEEN else 0.0
+    if of_average and math.isfinite(clip_e):
+        for pixel in range(len(expected)):
+            if state[pixel] != UNUSABLE:
+                weight[pixel] *= kept_of_clipping((clip_e - expected[pixel]) / math.sqrt(variance[pixel]))
+    elif math.isfinite(clip_e):
+        for pixel in range(len(expected)):
+            if state[pixel] == CLIPPED:
+                sigma = math.sqrt(variance[pixel])
+                mills, curvature = of_clipped((clip_e - expected[pixel]) / sigma)
+                pull[pixel] = mills / sigma
+                weight[pixel] *= curvature
     information[:] = precision
     if waves:
         of_rows = np.zeros((len(jacobian), len(jacobian)))

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.discs.visible import EDGE, NO_LIMB, Seen
 from perception.model.layout import Known, View
-from perception.model.normal import shares, strip_shares
-from perception.model.spread import LEAST_STRIP
+from perception.model.spread.edges import blur_of, whole_lanes
+from perception.model.spread.image import LEAST_STRIP
+from perception.model.spread.shares import shares, strip_shares
 
 Array = NDArray[np.float64]
 
@@ -43,10 +44,11 @@ def add_seen(
     """
     rows, columns = view.image_e.shape
     lit, slopes = expected.reshape(rows, columns), jacobian.reshape(-1, rows, columns)
-    across, down = np.empty((4, columns)), np.empty((3, rows))
+    across, down = np.empty((4, whole_lanes(columns))), np.empty((3, whole_lanes(rows)))
+    blur = blur_of(sigma_px, max(rows, columns))
     for piece in range(len(seen.disc)):
         disc, v_px = seen.disc[piece], seen.v_px[piece]
-        top, bottom = shares(v_px - view.top, rows, sigma_px, down)
+        top, bottom = shares(v_px - view.top, rows, blur, down)
         begin_px, end_px = seen.ends_px[piece]
         half_px, middle_px = 0.5 * (end_px - begin_px), 0.5 * (begin_px + end_px) - view.left
         if half_px > LEAST_STRIP * sigma_px:
@@ -54,7 +56,7 @@ def add_seen(
             # The parabola through all three, 1 + tilt t + bend (t² - 1/3) times its mean.
             mean = (first + 4.0 * middle + last) / 6.0
             shading = 0.5 * (last - first) / mean, (0.5 * (first + last) - middle) / mean
-            left, right = strip_shares(middle_px, half_px, shading, 0.0, columns, sigma_px, across)
+            left, right = strip_shares(middle_px, half_px, shading, 0.0, columns, blur, across)
             light_e = flux[disc] * 2.0 * half_px * mean
             _add_strip(
                 light_e, disc, len(flux), known, down[:, top:bottom], across[:, left:right],
@@ -66,7 +68,7 @@ def add_seen(
                 continue
             at_px = seen.ends_px[piece, end]
             edge_e = flux[disc] * seen.density[piece, 2 * end] * (2.0 * end - 1.0)
-            left, right = shares(at_px - view.left, columns, sigma_px, across)
+            left, right = shares(at_px - view.left, columns, blur, across)
             by_end = slopes[:, top:bottom, left:right]
             if limb == EDGE:
                 cosine, sine = math.cos(seen.edge[2]), math.sin(seen.edge[2])

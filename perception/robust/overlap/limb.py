@@ -15,7 +15,8 @@ from perception.compiled import compiled
 from perception.model.bearing import pixel_turn
 from perception.model.layout import SEEN
 from perception.model.likelihood.products import add_information, inverted
-from perception.model.normal import shares
+from perception.model.spread.edges import blur_of, whole_lanes
+from perception.model.spread.shares import shares
 from perception.model.window import Camera
 from perception.robust.goodness import MODEL_ERROR
 from perception.robust.overlap.deblend import LEAST_GAIN, asks_for_more
@@ -88,10 +89,11 @@ def _gain(
     rows, columns = left_e.shape
     count = len(waves) + 2
     images = np.zeros((count, rows, columns))
-    across, down = np.empty((3, columns)), np.empty((3, rows))
+    across, down = np.empty((3, whole_lanes(columns))), np.empty((3, whole_lanes(rows)))
+    blur = blur_of(sigma_px, max(rows, columns))
     for point in range(outline.shape[1]):
-        left, right = shares(outline[0, point], columns, sigma_px, across)
-        top, bottom = shares(outline[1, point], rows, sigma_px, down)
+        left, right = shares(outline[0, point], columns, blur, across)
+        top, bottom = shares(outline[1, point], rows, blur, down)
         for wave in range(len(waves)):
             for row in range(top, bottom):
                 light = waves[wave, point] * down[0, row]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, Sources
 from perception.model.likelihood.maximum import JUDGED_AFTER, MORE_TO_GAIN, TIMES_TO_GAIN
-from perception.model.normal import shares, strip_shares
-from perception.model.spread import LEAST_STRIP
+from perception.model.spread.edges import blur_of, whole_lanes
+from perception.model.spread.image import LEAST_STRIP
+from perception.model.spread.shares import shares, strip_shares
 from perception.model.window import Camera, lay_out
 from perception.robust.goodness import MODEL_ERROR, is_likely, residual_e
 from perception.robust.overlap.deblend import LEAST_GAIN
@@ -230,7 +231,8 @@ def _spread(
     Into zeros of shape (6, rows, columns): its light, and the derivatives by u, v, ln wider, lean, ln taller.
     """
     _, rows, columns = image.shape
-    across, down = np.empty((4, columns)), np.empty((3, rows))
+    across, down = np.empty((4, whole_lanes(columns))), np.empty((3, whole_lanes(rows)))
+    blur = blur_of(sigma_px, max(rows, columns))
     wider, lean, taller = matrix
     for node in range(len(laid.weight)):
         out_v, off_px = laid.node_v_px[node], wider * laid.node_u_px[node]
@@ -239,12 +241,12 @@ def _spread(
         at_px, half_px = place[0] + off_px + lean * out_v, wider * laid.half_px[node]
         if half_px > LEAST_STRIP * sigma_px:
             shading = (laid.tilt[node], laid.bend[node])
-            left, right = strip_shares(at_px, half_px, shading, off_px, columns, sigma_px, across)
+            left, right = strip_shares(at_px, half_px, shading, off_px, columns, blur, across)
         else:
-            left, right = shares(at_px, columns, sigma_px, across)
+            left, right = shares(at_px, columns, blur, across)
             for column in range(left, right):
                 across[3, column] = off_px * across[1, column]
-        top, bottom = shares(place[1] + taller * out_v, rows, sigma_px, down)
+        top, bottom = shares(place[1] + taller * out_v, rows, blur, down)
         for row in range(top, bottom):
             in_v, by_v = laid.weight[node] * down[0, row], laid.weight[node] * down[1, row]
             for column in range(left, right):

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, View
 from perception.model.likelihood.pixels import log_variances
-from perception.model.normal import log_upper_tail, of_clipped
+from perception.model.normal import kept_of_clipping, log_upper_tail, of_clipped
 
 
 def test_what_a_clipped_pixel_tells() -> None:
@@ -18,7 +18,7 @@ def test_what_a_clipped_pixel_tells() -> None:
         mills = math.exp(norm.logpdf(z) - log_ndtr(-z))
         kept = ndtr(z) - z * norm.pdf(z) + mills * norm.pdf(z) if z < 8.0 else 1.0
         assert log_upper_tail(z) == pytest.approx(log_ndtr(-z), rel=1e-8, abs=1e-15)
-        told = of_clipped(z)
+        told = *of_clipped(z), kept_of_clipping(z)
         if z < 8.0:  # beyond it differences of large numbers are left
             assert told == pytest.approx((mills, mills * (mills - z), kept), rel=1e-6, abs=1e-12)
         assert told[0] == pytest.approx(mills, rel=1e-7, abs=1e-15)

@@ -12,9 +12,9 @@ from perception.model.discs.nodes import DiscNodes, disc_nodes
 from perception.model.discs.rows import disc_rows
 from perception.model.layout import Sources
 from perception.model.lens import project
-from perception.model.normal import strip_shares
 from perception.model.ranging import angular_radius_rad
-from perception.model.spread import spread_nodes
+from perception.model.spread.edges import blur_of, whole_lanes
+from perception.model.spread.image import spread_nodes
 from perception.types import Calibration
 from tests.unit.perception.simulation import calibration
 
@@ -46,9 +46,11 @@ def _image(
     nodes: DiscNodes, u_px: float, v_px: float, half_px: int, sigma_px: float, motion: tuple[float, float]
 ) -> Array:
     source = Sources.of(nodes, np.zeros(1), np.zeros(1))
-    image = np.zeros((7 if any(motion) else 5, 2 * half_px + 1, 2 * half_px + 1))
-    spread_nodes(source, 0, (half_px + u_px % 1.0, half_px + v_px % 1.0), 1.02, motion, sigma_px, image)
-    return image
+    side = 2 * half_px + 1
+    image = np.zeros((7 if any(motion) else 5, side, whole_lanes(side)))
+    place = (half_px + u_px % 1.0, half_px + v_px % 1.0)
+    spread_nodes(source, 0, place, 1.02, motion, blur_of(sigma_px, side), side, image)
+    return image[:, :, :side]
 
 
 @pytest.mark.parametrize("lens", list(LENSES))
@@ -93,10 +95,11 @@ def test_what_moves_is_the_mean_of_what_stands_still() -> None:
 
 
 def _shifted(still: DiscNodes, by_u_px: float, by_v_px: float) -> Array:
-    image = np.zeros((5, 41, 41))
+    image = np.zeros((5, 41, whole_lanes(41)))
     place = 20.0 + 700.4 % 1.0 + by_u_px, 20.0 + 300.2 % 1.0 + by_v_px
-    spread_nodes(Sources.of(still, np.zeros(1), np.zeros(1)), 0, place, 1.02, (0.0, 0.0), 0.7, image)
-    return image
+    source = Sources.of(still, np.zeros(1), np.zeros(1))
+    spread_nodes(source, 0, place, 1.02, (0.0, 0.0), blur_of(0.7, 41), 41, image)
+    return image[:, :, :41]
 
 
 def test_rows_are_few() -> None:
@@ -151,26 +154,3 @@ def test_where_the_response_bends_images_are_right(angle_rad: float) -> None:
     # Where half of a disc is dark as many points as others need are off by a thousandth themselves.
     least = max(2e-4 * float(points.max()), float(np.abs(coarse - points).max()))
     assert np.abs(rows - points).max() <= least < 2e-3 * points.max()
-
-
-@pytest.mark.parametrize("shading", [(0.0, 0.0), (0.4, -0.3)])
-def test_a_strip_against_a_sum_of_points(shading: tuple[float, float]) -> None:
-    """Φ and φ of 4 001 points along it, from the standard library's erf: to 1e-6 of the greatest."""
-    half_px, sigma_px, at_px, off_px, count = 2.3, 0.7, 9.37, -1.7, 20
-    into: Array = np.zeros((4, count))
-    first, end = strip_shares(at_px, half_px, shading, off_px, count, sigma_px, into)
-    assert (first, end) == (3, 17)
-    t = (np.arange(4001) + 0.5) / 2000.5 - 1.0
-    light = 1.0 + shading[0] * t + shading[1] * (t**2 - 1.0 / 3.0)
-    light /= light.sum()
-    z = (np.arange(count + 1)[:, None] - 0.5 - at_px - half_px * t) / sigma_px
-    below = 0.5 + 0.5 * np.vectorize(math.erf)(z * math.sqrt(0.5))
-    density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
-    sums: list[Array] = [
-        np.diff(below @ light),
-        -np.diff(density @ light) / sigma_px,
-        -np.diff((z * density) @ light),
-        -np.diff((density * (off_px + half_px * t)) @ light) / sigma_px,
-    ]
-    for row, expected in zip(into, sums, strict=True):
-        np.testing.assert_allclose(row, expected, atol=1e-6 * float(np.abs(expected).max()))
