@@ -54,7 +54,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "perception.robust": ("together", "large", "around", "hiding", "overlap", "starts", "search"),
     "perception.files": (),
     "perception.causes": (),
-    "perception.model": ("likelihood", "discs"),
+    "perception.model": ("likelihood", "spread", "discs"),
     "perception.odometry": (),
     "perception.own_code": (),
     "perception.compiled": (),
