@@ -12,8 +12,10 @@ Array = NDArray[np.float64]
 
 HARMONICS = 7
 AROUND = 2 * HARMONICS + 2  # points of an outline
-_STEPS, _SETTLED = 40, 1e-8  # Newton's, in rad
+_STEPS, _SETTLED = 40, 1e-5  # Newton's, in rad: what is left then is its square
 _LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
+_TURNS: Array = 2.0 * math.pi * np.arange(AROUND) / AROUND
+_COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
 
 
 @compiled
@@ -25,9 +27,8 @@ def rims_of(direction: Array, angular_radius_rad: Array) -> tuple[Array, Array, 
         across[cap], down[cap] = across_and_down(direction[cap, 0], direction[cap, 1], direction[cap, 2])
         cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
         for at in range(AROUND):
-            turn = 2.0 * math.pi * at / AROUND
             for axis in range(3):
-                aside = math.cos(turn) * across[cap, axis] + math.sin(turn) * down[cap, axis]
+                aside = _COSINES[at] * across[cap, axis] + _SINES[at] * down[cap, axis]
                 rims[cap, at, axis] = cosine * direction[cap, axis] + sine * aside
     return rims, across, down
 
@@ -38,9 +39,8 @@ def series_of(values: Array) -> Array:
     series = np.zeros((1 + HARMONICS, 2))
     for harmonic in range(1 + HARMONICS):
         for at in range(AROUND):
-            turn = 2.0 * math.pi * ((harmonic * at) % AROUND) / AROUND
-            series[harmonic, 0] += values[at] * math.cos(turn) * 2.0 / AROUND
-            series[harmonic, 1] += values[at] * math.sin(turn) * 2.0 / AROUND
+            series[harmonic, 0] += values[at] * _COSINES[(harmonic * at) % AROUND] * 2.0 / AROUND
+            series[harmonic, 1] += values[at] * _SINES[(harmonic * at) % AROUND] * 2.0 / AROUND
     series[0] *= 0.5
     return series
 

@@ -22,9 +22,10 @@ from perception.types import Calibration
 
 Array = NDArray[np.float64]
 
-# Rows per ratio of image radius to smoothing: the smallest numbers, found by comparison with three times as
-# many, that keep the error below 1e-4 of the peak for radii from 0 to 130 px.
-_ROWS_BASE, _ROWS_SLOPE = 1.4, 2.7
+# Rows per ratio of image radius to smoothing, in which a pixel counts for less than its variance: so few that
+# the error, found by comparison with points, stays below 1e-4 of the peak for radii from 0 to 130 px.
+_ROWS_BASE, _ROWS_SLOPE, _OF_PIXEL_PX2 = 1.45, 2.0, 0.01
+_EVENED, _EVENED_FROM = 0.03, 4
 _SMOOTH_RAD, _MOST_PARTS = 0.05, 8  # half of a strip on the axis along which light is as in a parabola
 _TIMES_MOVED = 2
 _PLACES = 5  # of a strip where light is looked at: its ends, its middle, and two between to try the parabola
@@ -52,7 +53,8 @@ def disc_rows(
     outlines_px = project(rims.reshape(-1, 3), calibration).reshape(-1, AROUND, 2)
     outlines_px -= np.stack([u_px, v_px], axis=1)[:, None, :]
     is_disc = angular_radius_rad > 0.0
-    rows = np.where(is_disc, np.ceil(_ROWS_BASE + _ROWS_SLOPE * fineness), 1.0).astype(np.int64)
+    slope = _ROWS_SLOPE * smooth_px / math.sqrt(calibration.psf_sigma_px**2 + _OF_PIXEL_PX2)
+    rows = np.where(is_disc, np.ceil(_ROWS_BASE + slope * fineness), 1.0).astype(np.int64)
     parts = parts_of_rows(direction, angular_radius_rad)
     first = np.cumsum([0, *(rows * parts).tolist()])
     strip_v_px, share, omega, is_known = _strips(
@@ -115,7 +117,10 @@ def _strips(
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:  # fmt: skip
     """Lay strips between outlines: rows, each in so many parts one after another.
 
-    Rows lie at Chebyshev's places of the second kind: the lengths of a disc's rows end like √(1-x²).
+    Rows lie at equal steps of an angle φ, x = (cos φ + a cos 3φ) / (1 + a) of half the height from its
+    middle: their lengths, which end like √(1-x²), are smooth along it. With a = 0 these are Chebyshev's places
+    of the second kind; a little of the third harmonic lets them lie more evenly, so that fewer do (as maps do
+    for Gauss's places: Hale & Trefethen, SIAM J. Numer. Anal. 46, 930, 2008).
 
     Returns
     -------
@@ -136,10 +141,12 @@ def _strips(
         one_way = (highest - lowest) % (2.0 * math.pi)
         other_way = one_way - 2.0 * math.pi
         cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
+        third = _EVENED * max(1.0 - _EVENED_FROM / rows[cap], 0.0)
         for row in range(rows[cap]):
-            way = (row + 1) / (rows[cap] + 1)
-            angle = math.pi * way
-            at_v = 0.5 * (top + bottom) + 0.5 * (bottom - top) * math.cos(angle)
+            angle = math.pi * (row + 1) / (rows[cap] + 1)
+            height = (math.cos(angle) + third * math.cos(3.0 * angle)) / (1.0 + third)
+            way = math.acos(height) / math.pi
+            at_v = 0.5 * (top + bottom) + 0.5 * (bottom - top) * height
             left = crossing(of_v, at_v, lowest, lowest + one_way, lowest + way * one_way)
             right = crossing(of_v, at_v, lowest, lowest + other_way, lowest + way * other_way)
             if value_at(of_u, left)[0] > value_at(of_u, right)[0]:
@@ -151,7 +158,7 @@ def _strips(
                 ends[1, axis] = cosine * ahead + sine * (math.cos(right) * aside + math.sin(right) * below)
             for part in range(parts[cap]):
                 strip = first[cap] + row * parts[cap] + part
-                v_px[strip], share[strip] = at_v, math.sin(angle)
+                v_px[strip], share[strip] = at_v, math.sin(angle) + 3.0 * third * math.sin(3.0 * angle)
                 for place in range(_PLACES):
                     along = (part + place / (_PLACES - 1)) / parts[cap]
                     here = omega[strip, place]
