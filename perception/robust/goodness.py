@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE
-from perception.model.likelihood.products import dot
+from perception.model.likelihood.products import LEAST_PIVOT, add_information, dot
 
 Array = NDArray[np.float64]
 
@@ -162,19 +162,14 @@ def _reckoned(
 ) -> tuple[float, int, float, float, float, int, float, int, int, float, int, float, float]:  # fmt: skip
     rows, columns = image_e.shape
     residual, weight = residual_e(image_e, state, expected_e), np.zeros((rows, columns))
-    away = np.ones((rows, columns), dtype=np.bool_)
-    noise = np.empty((rows, columns))
+    reached, noise = np.zeros((rows, columns), dtype=np.bool_), np.empty((rows, columns))
     chi2, pixels, residual2, flares2, seen_chi2, seen_pixels, noise_chi2 = 0.0, 0, 0.0, 0.0, 0.0, 0, 0.0
     for row in range(rows):
         for column in range(columns):
             flare, left = flares_e[row, column], residual[row, column]
             noise[row, column] = noise_e2(expected_e[row, column], floor_e2, prnu)
             variance = noise[row, column] + (MODEL_ERROR * flare) ** 2
-            if flare > REACHED_SIGMAS * math.sqrt(noise[row, column]):
-                for down in range(-DISC_PX, DISC_PX + 1):
-                    wide = DISC_PX - abs(down)
-                    if 0 <= row + down < rows:
-                        away[row + down, max(0, column - wide) : column + wide + 1] = False
+            reached[row, column] = flare > 0.0 and flare * flare > REACHED_SIGMAS**2 * noise[row, column]
             if state[row, column] == UNUSABLE:
                 continue
             weight[row, column] = 1.0 / variance
@@ -192,9 +187,10 @@ def _reckoned(
                 seen_chi2 += left * left / variance
                 seen_pixels += 1
     around_chi2, around_pixels, around_excess = 0.0, 0, 0.0
+    near = _grown(reached, DISC_PX)
     for row in range(rows):
         for column in range(columns):
-            if away[row, column] and state[row, column] == SEEN:
+            if not near[row, column] and state[row, column] == SEEN:
                 left2 = residual[row, column] ** 2
                 around_chi2 += left2 / noise[row, column]
                 around_excess += left2 - noise[row, column]
@@ -208,25 +204,56 @@ def _reckoned(
 
 
 @compiled
-def _add(factor: float, row: Array, into: Array) -> None:
-    for at in range(len(row)):
-        into[at] += factor * row[at]
+def _grown(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
+    """Return a mask grown by so many steps up, down, to the left and to the right."""
+    rows, columns = mask.shape
+    width = columns + 1  # a column between, which is left out
+    size = rows * width
+    padded = np.zeros(size + 2 * width, dtype=np.uint8)
+    for row in range(rows):
+        padded[(row + 1) * width :][:columns] = mask[row]
+    grown = padded.copy()
+    for _ in range(steps):
+        middle, above, below = padded[width:], padded, padded[2 * width :]
+        left, right, into = padded[width - 1 :], padded[width + 1 :], grown[width:]
+        for at in range(size):
+            into[at] = middle[at] | above[at] | below[at] | left[at] | right[at]
+        for row in range(rows):
+            into[row * width + columns] = 0
+        padded, grown = grown, padded
+    return padded[width:][:size].reshape(rows, width)[:, :columns] > 0
 
 
 @compiled
 def _smoothed(image: Array, kernel: Array) -> Array:
-    """Correlate an image with a symmetric kernel along both axes, zero beyond its ends."""
+    """Correlate an image with a symmetric kernel along both axes, zero beyond its ends.
+
+    Rows lie one after another with zeros between, and above and below: so each step is one long loop.
+    """
     rows, columns = image.shape
     half = len(kernel) // 2
-    along, both = np.zeros((rows, columns)), np.zeros((rows, columns))
+    width = columns + half
+    first, size = half * width + half, rows * width
+    padded, along, both = np.zeros(size + 2 * first), np.zeros(size + 2 * first), np.empty(size)
     for row in range(rows):
-        for step in range(-half, half + 1):
-            first, end = max(0, -step), min(columns, columns - step)
-            _add(kernel[half + step], image[row, first + step : end + step], along[row, first:end])
-    for row in range(rows):
-        for step in range(max(-half, -row), min(half + 1, rows - row)):
-            _add(kernel[half + step], along[row + step], both[row])
-    return both
+        padded[first + row * width :][:columns] = image[row]
+    _correlate(padded, kernel, first, 1, along[first:][:size])
+    _correlate(along, kernel, first, width, both)
+    return both.reshape(rows, width)[:, :columns].copy()
+
+
+@compiled
+def _correlate(padded: Array, kernel: Array, first: int, step: int, into: Array) -> None:
+    """Weigh values so many steps apart, about the `first` and those after it."""
+    half = len(kernel) // 2
+    middle, weight = padded[first:], kernel[half]
+    for at in range(len(into)):
+        into[at] = weight * middle[at]
+    for beside in range(1, half + 1):
+        before, after = padded[first - beside * step :], padded[first + beside * step :]
+        weight = kernel[half + beside]
+        for at in range(len(into)):
+            into[at] += weight * (before[at] + after[at])
 
 
 @compiled
@@ -239,11 +266,11 @@ def _matched_peak(weighted: Array, weight: Array, smooth_px: float) -> tuple[flo
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / smooth_px) ** 2)
     matched, power = _smoothed(weighted, kernel).ravel(), _smoothed(weight, kernel**2).ravel()
     least = LEAST_KNOWN * power.max()
-    best, at = 0.0, 0
+    best2, at = 0.0, 0
     for pixel in range(len(matched)):
-        if power[pixel] > least and matched[pixel] > best * math.sqrt(power[pixel]):
-            best, at = matched[pixel] / math.sqrt(power[pixel]), pixel
-    return best, at
+        if power[pixel] > least and matched[pixel] > 0.0 and matched[pixel] ** 2 > best2 * power[pixel]:
+            best2, at = matched[pixel] ** 2 / power[pixel], pixel
+    return math.sqrt(best2), at
 
 
 @compiled
@@ -263,41 +290,46 @@ def drawn_out(
     less once in a thousand.
     """
     rows, columns = image_e.shape
-    parts, count, stands_out, chi2 = np.empty((8, rows * columns)), 0, 0, 0.0
+    parts, stands_out, chi2 = np.zeros((8, rows, columns)), 0, 0.0
     for row in range(1, rows - 1):
+        of_row, weight, line = parts[:, row], parts[0, row], flares_e[row]
+        above, below = flares_e[row - 1], flares_e[row + 1]
         for column in range(1, columns - 1):
-            if state[row, column] != SEEN:
-                continue
-            weight = 1.0 / math.sqrt(noise_e2(expected_e[row, column], floor_e2, prnu))
-            near = flares_e[row - 1 : row + 2, column - 1 : column + 2]
-            by_uu = near[1, 2] - 2.0 * near[1, 1] + near[1, 0]
-            by_vv = near[2, 1] - 2.0 * near[1, 1] + near[0, 1]
-            parts[0, count] = weight
-            parts[1, count] = weight * near[1, 1]
-            parts[2, count] = weight * (near[1, 2] - near[1, 0])
-            parts[3, count] = weight * (near[2, 1] - near[0, 1])
-            parts[4, count] = weight * (by_uu + by_vv)
-            parts[5, count] = weight * (by_uu - by_vv)
-            parts[6, count] = weight * 0.25 * (near[2, 2] + near[0, 0] - near[2, 0] - near[0, 2])
-            parts[7, count] = weight * (image_e[row, column] - expected_e[row, column])
-            if parts[1, count] > 1.0:
-                stands_out += 1
-                chi2 += parts[7, count] ** 2
-            count += 1
+            noise = math.sqrt(noise_e2(expected_e[row, column], floor_e2, prnu))
+            weight[column] = 1.0 / noise if state[row, column] == SEEN else 0.0
+        for column in range(1, columns - 1):
+            by_uu = line[column + 1] - 2.0 * line[column] + line[column - 1]
+            by_vv = below[column] - 2.0 * line[column] + above[column]
+            by_uv = below[column + 1] + above[column - 1] - below[column - 1] - above[column + 1]
+            of_row[1, column] = weight[column] * line[column]
+            of_row[2, column] = weight[column] * (line[column + 1] - line[column - 1])
+            of_row[3, column] = weight[column] * (below[column] - above[column])
+            of_row[4, column] = weight[column] * (by_uu + by_vv)
+            of_row[5, column] = weight[column] * (by_uu - by_vv)
+            of_row[6, column] = weight[column] * 0.25 * by_uv
+        for column in range(1, columns - 1):
+            if weight[column] > 0.0:
+                of_row[7, column] = weight[column] * (image_e[row, column] - expected_e[row, column])
+                if of_row[1, column] > 1.0:
+                    stands_out += 1
+                    chi2 += of_row[7, column] ** 2
     most_gain = chi2 - stands_out + 3.0 * math.sqrt(2.0 * stands_out)
-    shown, free = np.zeros(7), parts[:, :count].copy()
+    # Gram and Schmidt's shares of each part in those after it follow from the sums of products alone.
+    shown, sums, even = np.zeros(7), np.zeros((8, 8)), np.ones(rows * columns)
+    add_information(parts.reshape(8, -1), even, sums)
+    powers = np.diag(sums).copy()
     for one in range(7):
-        power = dot(free[one], free[one])
-        if not power > 0.0:
+        power = sums[one, one]
+        if not power > LEAST_PIVOT * powers[one]:
             return 0.0, 0.0, 0.0, most_gain
         for other in range(one + 1, 8):
-            share = dot(free[one], free[other]) / power
+            share = sums[one, other] / power
             if other == 7:
                 shown[one] = share * math.sqrt(power)
             if one == 5 and other == 6:
                 mixed = share
-            for pixel in range(count):
-                free[other, pixel] -= share * free[one, pixel]
+            for beyond in range(other, 8):
+                sums[other, beyond] -= share * sums[one, beyond]
         if one == 5:
             power_5 = power
     across = shown[6] / math.sqrt(power)

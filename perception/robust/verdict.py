@@ -116,9 +116,10 @@ def _share_above(
     else:
         peak_e = flares_e[min(max(round(v), top), bottom - 1), min(max(round(u), left), right - 1)]
     most_e, count, above = peaks * peak_e, 0, 0
-    for row in range(top, bottom):
-        for column in range(left, right):
-            if ring_px[0] <= math.hypot(column - u, row - v) <= ring_px[1]:
+    least2_px2, most2_px2 = ring_px[0] ** 2, ring_px[1] ** 2
+    for row in range(max(top, math.floor(v - ring_px[1])), min(bottom, math.ceil(v + ring_px[1]) + 1)):
+        for column in range(max(left, math.floor(u - ring_px[1])), min(right, math.ceil(u + ring_px[1]) + 1)):
+            if least2_px2 <= (column - u) ** 2 + (row - v) ** 2 <= most2_px2:
                 count += 1
                 above += image_e[row, column] - flares_e[row, column] - background_e > most_e
     return above / max(count, 1)
@@ -151,14 +152,17 @@ def _seen(
     reach, seen, whole = math.ceil(3.0 * width_px), 0.0, 0.0
     off_u, off_v, whole_u, whole_v = 0.0, 0.0, 0.0, 0.0
     middle_row, middle = round(place[1]), round(place[0])
-    left_out = np.zeros(state.shape[1], dtype=np.bool_)  # columns, as a whole
-    for at in range(max(middle - reach - corner[0], 0), min(middle + reach + 1 - corner[0], state.shape[1])):
-        left_out[at] = not (state[:, at] != UNUSABLE).any()
+    left_out = np.ones(state.shape[1], dtype=np.bool_)  # columns, as a whole
+    for here in range(state.shape[0]):
+        for at in range(state.shape[1]):
+            left_out[at] &= state[here, at] == UNUSABLE
+    first, end = max(middle - reach, 0), min(middle + reach + 1, shape[1])
+    across = np.exp(-0.5 * ((np.arange(first, end) - place[0]) / width_px) ** 2)
     for row in range(max(middle_row - reach, 0), min(middle_row + reach + 1, shape[0])):
-        for column in range(max(middle - reach, 0), min(middle + reach + 1, shape[1])):
-            u, v = column - place[0], row - place[1]
-            light = math.exp(-0.5 * (u**2 + v**2) / width_px**2)
-            here, at = row - corner[1], column - corner[0]
+        v, here = row - place[1], row - corner[1]
+        down = math.exp(-0.5 * (v / width_px) ** 2)
+        for column in range(first, end):
+            u, light, at = column - place[0], down * across[column - first], column - corner[0]
             inside = 0 <= here < state.shape[0] and 0 <= at < state.shape[1]
             if inside and left_out[at]:
                 continue

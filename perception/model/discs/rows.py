@@ -118,9 +118,9 @@ def _strips(
     """Lay strips between outlines: rows, each in so many parts one after another.
 
     Rows lie at equal steps of an angle φ, x = (cos φ + a cos 3φ) / (1 + a) of half the height from its
-    middle: their lengths, which end like √(1-x²), are smooth along it. With a = 0 these are Chebyshev's places
-    of the second kind; a little of the third harmonic lets them lie more evenly, so that fewer do (as maps do
-    for Gauss's places: Hale & Trefethen, SIAM J. Numer. Anal. 46, 930, 2008).
+    middle: their lengths, which end like √(1-x²), are smooth along it. With a = 0 these are Chebyshev's
+    places of the second kind; a little of the third harmonic lets them lie more evenly, so that fewer do (as
+    maps do for Gauss's places: Hale & Trefethen, SIAM J. Numer. Anal. 46, 930, 2008).
 
     Returns
     -------

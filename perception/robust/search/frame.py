@@ -145,43 +145,36 @@ def exceeding(
     for by in range(1, half * len(limit_e) // rows + 2):
         lowest_e = np.minimum(np.minimum(lowest_e, _shifted(limit_e, by)), _shifted(limit_e, -by))
     lowest_e = np.minimum(lowest_e, _shifted(lowest_e, 1))  # a row lies between two of the mesh's
-    bright, count_of = np.empty((taps, columns), dtype=np.int64), np.zeros(taps, dtype=np.int64)
-    latest = np.full(columns, -1)
+    bright_pixels = np.zeros(taps, dtype=np.int64)
+    lit, row_limit_e = np.empty(columns, dtype=np.int64), np.empty(columns, dtype=np.float32)
     samples = np.empty((sample_of.max() + 1, len(sampled)), dtype=np.float32)
     places, values, count = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.float32), 0
     for ahead in range(rows + half):
         now, row = ahead % taps, ahead - half
         _filter_row(pixels, kernel, none, ahead, 0, padded, across[now])
         one, other, _ = between(min(ahead, rows - 1), rows, len(limit_e))
-        count_of[now] = _brighter(across[now], lowest_e[one], bright[now])
+        bright_pixels[now] = _count_above(across[now], lowest_e[one])
         if row < 0:
             continue
         if sample_of[row] >= 0:
             _sum_rows(across, kernel, row, result)
             for at in range(len(sampled)):
                 samples[sample_of[row], at] = result[sampled[at]]
-        if not count_of.any():
+        if not bright_pixels.any():
             continue
         one, other, share = between(row, rows, len(limit_e))
-        rest, part, before = np.float32(1.0 - share), np.float32(share), count
-        for line in range(taps):
-            for column in bright[line, : count_of[line]]:
-                if latest[column] == row:
-                    continue
-                latest[column] = row
-                total = np.float32(0.0)
-                for step in range(taps):
-                    total += kernel[step] * across[(row + step - half) % taps, column]
-                if total > rest * limit_e[one, column] + part * limit_e[other, column]:
-                    if count == len(places):
-                        places = np.append(places, np.empty(count, dtype=np.int64))
-                        values = np.append(values, np.empty(count, dtype=np.float32))
-                    places[count], values[count] = row * columns + column, total
-                    count += 1
-        if count > before + 1:
-            order = np.argsort(places[before:count])
-            places[before:count] = places[before:count][order]
-            values[before:count] = values[before:count][order]
+        rest, part = np.float32(1.0 - share), np.float32(share)
+        if sample_of[row] < 0:
+            _sum_rows(across, kernel, row, result)
+        for column in range(columns):
+            row_limit_e[column] = rest * limit_e[one, column] + part * limit_e[other, column]
+        found = _brighter(result, row_limit_e, lit)
+        while count + found > len(places):
+            places = np.append(places, np.empty(len(places), dtype=np.int64))
+            values = np.append(values, np.empty(len(values), dtype=np.float32))
+        for column in lit[:found]:
+            places[count], values[count] = row * columns + column, result[column]
+            count += 1
     return places[:count].copy(), values[:count].copy(), samples
 
 
@@ -383,18 +376,26 @@ def neighbours(
     """
     rows, columns = pixels.data_dn.shape
     own, around, variance = np.zeros(len(places)), np.zeros(len(places)), np.zeros(len(places))
-    reach = 0 if along_rows else 1
+    reach, row = 0 if along_rows else 1, -1
+    one, other, share = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64), np.empty(3)
     for index, place in enumerate(places):
-        row, column = place // columns, place % columns
-        own[index] = electrons_at(pixels, row, column) - ground_at(pixels, row, column)
-        for down in range(-reach, reach + 1):
+        if row < 0 or not row * columns <= place < (row + 1) * columns:
+            row = place // columns
+            for line in range(3):  # the one above, its own, the one below
+                near_row = min(max(row + line - 1, 0), rows - 1)
+                one[line], other[line], share[line] = between(near_row, rows, len(pixels.ground_e))
+        column = place - row * columns
+        for line in range(1 - reach, 2 + reach):
             for across in range(-1, 2):
-                if down == 0 and across == 0:
-                    continue
-                near_row, near = row + down, column + across
-                if not (0 <= near_row < rows and 0 <= near < columns):
-                    near_row, near = row, column
+                near_row, near, at = row + line - 1, column + across, line
+                if not (0 <= near < columns and 0 <= near_row < rows):
+                    near_row, near, at = row, column, 1
                 seen = electrons_at(pixels, near_row, near)
-                around[index] += seen - ground_at(pixels, near_row, near)
+                first, second = float(pixels.ground_e[one[at], near]), float(pixels.ground_e[other[at], near])
+                excess = seen - ((1.0 - share[at]) * first + share[at] * second)
+                if line == 1 and across == 0:
+                    own[index] = excess
+                    continue
+                around[index] += excess
                 variance[index] += max(seen, 0.0) + floor_e2
     return own, around, variance
