@@ -4,14 +4,16 @@ import math
 
 from perception.compiled import compiled
 
-_SURE = 9.0  # σ: beyond these Φ or Q is 10⁻¹⁹
+SURE_SIGMAS = 9.0
+"""Beyond these Φ or Q is 10⁻¹⁹."""
+
 _SQRT_HALF, _LOG_SQRT_2_PI = math.sqrt(0.5), 0.5 * math.log(2.0 * math.pi)
 
 
 @compiled
 def log_upper_tail(z: float) -> float:
     """Return ln Q(z) of the normal distribution: to 10⁻⁸ beyond z = 36, where Q itself is too small."""
-    if z < -_SURE:
+    if z < -SURE_SIGMAS:
         return 0.0
     if z < 0.0:
         return math.log1p(-0.5 * math.erfc(-z * _SQRT_HALF))
@@ -24,7 +26,7 @@ def log_upper_tail(z: float) -> float:
 @compiled
 def of_clipped(z: float) -> tuple[float, float]:
     """Return φ/Q, and how ln Q bends."""
-    if z < -_SURE:
+    if z < -SURE_SIGMAS:
         return 0.0, 0.0
     z = min(z, 1e4)
     mills = math.exp(-0.5 * z * z - _LOG_SQRT_2_PI - log_upper_tail(z))
@@ -37,7 +39,7 @@ def kept_of_clipping(z: float) -> float:
 
     On average over what it shows: Φ - z φ + φ²/Q.
     """
-    if abs(z) > _SURE:
+    if abs(z) > SURE_SIGMAS:
         return 1.0 if z > 0.0 else 0.0
     tail, density = math.exp(log_upper_tail(z)), math.exp(-0.5 * z * z - _LOG_SQRT_2_PI)
     return min(max(1.0 - tail - z * density + density * density / tail, 0.0), 1.0)

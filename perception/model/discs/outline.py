@@ -14,8 +14,10 @@ HARMONICS = 7
 AROUND = 2 * HARMONICS + 2  # points of an outline
 _STEPS, _SETTLED = 40, 1e-5  # Newton's, in rad: what is left then is its square
 _LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
-_TURNS: Array = 2.0 * math.pi * np.arange(AROUND) / AROUND
-_COSINES, _SINES = np.cos(_TURNS), np.sin(_TURNS)
+# Of each harmonic at each of the points.
+_TURNS = 2.0 * math.pi / AROUND * (np.outer(np.arange(1 + HARMONICS), np.arange(AROUND)) % AROUND)
+_COSINES: Array = np.cos(_TURNS, dtype=np.float64)
+_SINES: Array = np.sin(_TURNS, dtype=np.float64)
 
 
 @compiled
@@ -28,7 +30,7 @@ def rims_of(direction: Array, angular_radius_rad: Array) -> tuple[Array, Array, 
         cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
         for at in range(AROUND):
             for axis in range(3):
-                aside = _COSINES[at] * across[cap, axis] + _SINES[at] * down[cap, axis]
+                aside = _COSINES[1, at] * across[cap, axis] + _SINES[1, at] * down[cap, axis]
                 rims[cap, at, axis] = cosine * direction[cap, axis] + sine * aside
     return rims, across, down
 
@@ -39,8 +41,8 @@ def series_of(values: Array) -> Array:
     series = np.zeros((1 + HARMONICS, 2))
     for harmonic in range(1 + HARMONICS):
         for at in range(AROUND):
-            series[harmonic, 0] += values[at] * _COSINES[(harmonic * at) % AROUND] * 2.0 / AROUND
-            series[harmonic, 1] += values[at] * _SINES[(harmonic * at) % AROUND] * 2.0 / AROUND
+            series[harmonic, 0] += values[at] * _COSINES[harmonic, at] * 2.0 / AROUND
+            series[harmonic, 1] += values[at] * _SINES[harmonic, at] * 2.0 / AROUND
     series[0] *= 0.5
     return series
 

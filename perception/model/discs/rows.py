@@ -141,6 +141,7 @@ def _strips(
         one_way = (highest - lowest) % (2.0 * math.pi)
         other_way = one_way - 2.0 * math.pi
         cosine, sine = math.cos(angular_radius_rad[cap]), math.sin(angular_radius_rad[cap])
+        is_mirrored = False
         third = _EVENED * max(1.0 - _EVENED_FROM / rows[cap], 0.0)
         for row in range(rows[cap]):
             angle = math.pi * (row + 1) / (rows[cap] + 1)
@@ -149,7 +150,9 @@ def _strips(
             at_v = 0.5 * (top + bottom) + 0.5 * (bottom - top) * height
             left = crossing(of_v, at_v, lowest, lowest + one_way, lowest + way * one_way)
             right = crossing(of_v, at_v, lowest, lowest + other_way, lowest + way * other_way)
-            if value_at(of_u, left)[0] > value_at(of_u, right)[0]:
+            if row == 0:
+                is_mirrored = value_at(of_u, left)[0] > value_at(of_u, right)[0]
+            if is_mirrored:
                 left, right = right, left
             is_known[cap] &= math.isfinite(left) and math.isfinite(right)
             for axis in range(3):
@@ -161,9 +164,14 @@ def _strips(
                 v_px[strip], share[strip] = at_v, math.sin(angle) + 3.0 * third * math.sin(3.0 * angle)
                 for place in range(_PLACES):
                     along = (part + place / (_PLACES - 1)) / parts[cap]
+                    x, y, z = (
+                        (1.0 - along) * ends[0, 0] + along * ends[1, 0],
+                        (1.0 - along) * ends[0, 1] + along * ends[1, 1],
+                        (1.0 - along) * ends[0, 2] + along * ends[1, 2],
+                    )
+                    length = math.sqrt(x * x + y * y + z * z)
                     here = omega[strip, place]
-                    here[:] = (1.0 - along) * ends[0] + along * ends[1]
-                    here /= math.sqrt((here**2).sum())
+                    here[0], here[1], here[2] = x / length, y / length, z / length
     return v_px, share, omega, is_known
 
 

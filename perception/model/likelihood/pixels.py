@@ -16,7 +16,7 @@ from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, UNUSABLE, Known, Sources, Structure, View
 from perception.model.likelihood.cosines import add_wave_information, add_waves, cosine_sums
 from perception.model.likelihood.products import add_information, dot
-from perception.model.normal import kept_of_clipping, log_upper_tail, of_clipped
+from perception.model.normal import SURE_SIGMAS, kept_of_clipping, log_upper_tail, of_clipped
 from perception.model.spread.edges import blur_of, whole_lanes
 from perception.model.spread.image import spread_nodes
 
@@ -136,8 +136,11 @@ def slopes(
         pull[pixel] = (image[pixel] - expected[pixel]) * weight[pixel] if state[pixel] == SEEN else 0.0
     if of_average and math.isfinite(clip_e):
         for pixel in range(len(expected)):
-            if state[pixel] != UNUSABLE:
-                weight[pixel] *= kept_of_clipping((clip_e - expected[pixel]) / math.sqrt(variance[pixel]))
+            short_e = clip_e - expected[pixel]
+            if short_e * short_e <= SURE_SIGMAS**2 * variance[pixel]:
+                weight[pixel] *= kept_of_clipping(short_e / math.sqrt(variance[pixel]))
+            elif short_e < 0.0:
+                weight[pixel] = 0.0
     elif math.isfinite(clip_e):
         for pixel in range(len(expected)):
             if state[pixel] == CLIPPED:
@@ -177,8 +180,11 @@ def objective(
         if state[pixel] == SEEN:
             total += (image[pixel] - expected[pixel]) ** 2 / variance[pixel]
         elif state[pixel] == CLIPPED:
-            z = (clip_e - expected[pixel]) / math.sqrt(variance[pixel])
-            total -= 2.0 * log_upper_tail(min(max(z, -38.0), 1e4))
+            short_e = clip_e - expected[pixel]
+            if short_e < 0.0 and short_e * short_e > SURE_SIGMAS**2 * variance[pixel]:
+                continue  # ln 1
+            z = short_e / math.sqrt(variance[pixel])
+            total -= 2.0 * log_upper_tail(min(z, 1e4))
     for one in range(len(values)):
         for other in range(len(values)):
             total += values[one] * precision[one, other] * values[other]

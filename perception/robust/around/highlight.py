@@ -283,27 +283,36 @@ def _likeliest_highlight(
     Beside flares that may all be off; of places within `reach_px` of `middle`.
     """
     parts, weights, at = free_of_flares(image_e, state, expected_e, flares_e, floor_e2, prnu)
+    rows, columns = image_e.shape
+    middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (rows - 1)
+    of_pixel = np.zeros((rows, columns, 7))  # of those that are not seen nothing
+    for pixel in range(len(weights)):
+        here = of_pixel[round(at[1, pixel] + middle_y), round(at[0, pixel] + middle_x)]
+        here[:6], here[6] = parts[:, pixel], weights[pixel]
     most, height_e, x_px, y_px, wide_px = 0.0, 0.0, 0.0, 0.0, 0.0
-    shares, of_pixel = np.empty(6), parts.T.copy()
     for width_px in widths_px:
         steps, far2_px2 = int(_STEPS * reach_px / width_px), (_FARTHEST - 1.0) * width_px**2
         far_px, per_px2 = math.sqrt(far2_px2), 1.0 / width_px**2
         for down in range(-steps, steps + 1):
             y = middle[1] + down * width_px / _STEPS
-            first, end = np.searchsorted(at[1], np.array([y - far_px, y + far_px]))  # rows after rows
+            top = max(math.ceil(y + middle_y - far_px), 0)
+            bottom = min(math.floor(y + middle_y + far_px) + 1, rows)
             for right in range(-steps, steps + 1):
                 x = middle[0] + right * width_px / _STEPS
-                whole, shares[:] = 0.0, 0.0
-                for pixel in range(first, end):
-                    squared = (at[0, pixel] - x) ** 2 + (at[1, pixel] - y) ** 2
-                    if squared < far2_px2:
-                        spread = 1.0 + squared * per_px2
-                        profile = weights[pixel] / (spread * spread)
-                        whole += profile**2
-                        for part in range(6):
-                            shares[part] += profile * of_pixel[pixel, part]
-                power = whole - (shares[:5] ** 2).sum()
-                if power > _LEAST_KEPT * whole and shares[5] > 0.0 and shares[5] ** 2 > most * power:
-                    most, height_e = shares[5] ** 2 / power, shares[5] / power
+                first = max(math.ceil(x + middle_x - far_px), 0)
+                end = min(math.floor(x + middle_x + far_px) + 1, columns)
+                whole, a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for row in range(top, bottom):
+                    for column in range(first, end):
+                        squared = (column - middle_x - x) ** 2 + (row - middle_y - y) ** 2
+                        if squared < far2_px2:
+                            here, spread = of_pixel[row, column], 1.0 + squared * per_px2
+                            profile = here[6] / (spread * spread)
+                            whole += profile * profile
+                            a, b, c = a + profile * here[0], b + profile * here[1], c + profile * here[2]
+                            d, e, f = d + profile * here[3], e + profile * here[4], f + profile * here[5]
+                power = whole - (a * a + b * b + c * c + d * d + e * e)
+                if power > _LEAST_KEPT * whole and f > 0.0 and f * f > most * power:
+                    most, height_e = f * f / power, f / power
                     x_px, y_px, wide_px = x, y, width_px
     return most, height_e, x_px, y_px, wide_px
