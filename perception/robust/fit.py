@@ -22,6 +22,8 @@ class Fit:
         self.structure = window.beside
         self.layout = self.known.layout(len(problem.starts), self.structure.amplitudes)
         self.values = np.zeros(self.layout.size)
+        self.own = self.layout.of_sources(self.values)
+        """The sources' unknowns, a view of shape (sources, unknowns of each)."""
         self.own[:, :3] = problem.starts
         if problem.motions is not None:
             self.own[:, self.layout.motion :] = problem.motions
@@ -34,48 +36,46 @@ class Fit:
         self.log_flux_at_1_m, self.image_radius_px = (np.empty(self.layout.sources) for _ in range(2))
 
     @property
-    def own(self) -> Array:
-        """The sources' unknowns, a view of shape (sources, unknowns of each)."""
-        return self.layout.of_sources(self.values)
-
-    @property
-    def background_e(self) -> Array:
-        """Of a pixel, for each source."""
-        return np.full(self.layout.sources, self.values[self.layout.background])
+    def background_e(self) -> float:
+        """Of a pixel."""
+        return float(self.values[self.layout.background])
 
     @property
     def of_sources(self) -> Array:
         """Their covariances, shape (sources, unknowns of each, unknowns of each)."""
         step = self.layout.per_source
+        if self.layout.sources == 1:
+            return self.covariance[None, :step, :step]
         return np.array(
             [self.covariance[at : at + step, at : at + step] for at in range(0, self.layout.width, step)]
         )
 
     @property
-    def place_sigmas_px(self) -> Array:
-        """Standard deviation of each source's place, the lesser of both."""
-        variances = self.layout.of_sources(np.diagonal(self.covariance))[:, :2]
-        return np.asarray(np.sqrt(variances.min(axis=1)))
+    def place_variances_px2(self) -> list[float]:
+        """Variance of each source's place, the lesser of both."""
+        of_all = np.diagonal(self.covariance).tolist()
+        return [min(of_all[at : at + 2]) for at in range(0, self.layout.width, self.layout.per_source)]
 
     @property
     def prior(self) -> Array:
         """Precision of the unknowns a priori."""
         return self.layout.prior(self.structure, self.known.motion_px)
 
-    def climb(self, sources: Sources, reach_px: Array) -> None:
-        """Go on to the greatest likelihood, with images as laid out, of so large radii.
-
-        It converges where images are no wider than the window's diagonal.
-        """
-        self.sources = sources
+    def climb(self, sources: Sources) -> None:
+        """Go on to the greatest likelihood, with images as laid out."""
+        self.sources, self.log_flux_at_1_m = sources, sources.log_flux_at_1_m
         self.deviance, self.log_information = maximise(
             self.window.view, sources, self.structure, self.known, self.prior, self.layout.most_step,
             self.window.to_beat, self.values, self.covariance, self.expected_e.ravel(),
         )  # fmt: skip
-        growth = np.exp(sources.log_range_at - log_range_by_size(self.own, self))
-        self.log_flux_at_1_m, self.image_radius_px = sources.log_flux_at_1_m, reach_px * growth
-        # Of larger ones no limb is seen: they are even ground, and may be as near as they like.
-        shows_limb = float(self.image_radius_px.max()) < self.window.diagonal_px
+
+    def end_at(self, image_radius_px: Array) -> None:
+        """Tell whether it converged, to images of such radii: it does to no wider ones than the window.
+
+        Of larger ones no limb is seen: they are even ground, and may be as near as they like.
+        """
+        self.image_radius_px = image_radius_px
+        shows_limb = float(image_radius_px.max()) < self.window.diagonal_px
         self.converged = math.isfinite(self.deviance) and shows_limb
 
 

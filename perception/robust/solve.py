@@ -227,53 +227,52 @@ def solve(problems: Sequence[Problem], camera: Camera) -> list[Solution | None]:
 
 def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     """Lay images out and climb; return those that have moved so far that it is to be done anew."""
+    counts = [fit.layout.sources for fit in fits]
     own = np.concatenate([fit.own for fit in fits])
-    background_e = np.concatenate([fit.background_e for fit in fits])
+    background_e = np.repeat([fit.background_e for fit in fits], counts)
     motion_px = _motion_px(own, fits[0])
     laid_px = None if motion_px is None else motion_px + _LINE_KEPT_PX
-    laid, imaged, hidden_px = _laid_out(fits, camera, laid_px)
-    reach_px = laid.reach_px
-    ends = np.cumsum([fit.layout.sources for fit in fits]).tolist()
-    for fit, first, end in zip(fits, [0, *ends], ends, strict=False):
-        fit.converged = False
-        if imaged[first:end].all():
-            fit.climb(part_of(laid, first, end), reach_px[first:end])
-    laid_at, own = own[:, :2], np.concatenate([fit.own for fit in fits])
-    change = laid.log_range_at - log_range_by_size(own, fits[0])
-    moved = (change > _GROWTH_KEPT) & (reach_px * np.exp(change) > _LEAST_DISC_PX)
-    if laid_px is not None and (motion_px := _motion_px(own, fits[0])) is not None:
-        moved |= motion_px > laid_px
-    if hidden_px is not None:
-        more_e = np.concatenate([fit.background_e for fit in fits]) - background_e
-        moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
-    # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
-    away_px = abs(change) * reach_px + np.hypot(*(own[:, :2] - laid_at).T)
-    skewed_px = 2.0 * camera.radius_m * np.exp(-laid.log_range_at) * away_px
-    blur = (_BLURRED * smoothing_px(camera.calibration)) ** 2
-    # Its middle lies off its place by its radius squared; that no point spread blurs.
-    off_px = laid.middle_px * abs(change)
-    seen_px = skewed_px * reach_px**2 / (reach_px**2 + blur) + off_px
-    moved |= seen_px > _KEPT_SIGMAS * np.concatenate([fit.place_sigmas_px for fit in fits])
-    if not moved.any():
-        return []
-    return [
-        fit
-        for fit, first, end in zip(fits, [0, *ends], ends, strict=False)
-        if fit.converged and moved[first:end].any()
-    ]
-
-
-def _laid_out(
-    fits: Sequence[Fit], camera: Camera, moved_px: Array | None
-) -> tuple[Sources, NDArray[np.bool_], Array | None]:
-    """Lay out the sources of fits; beside what `lay_out` returns, how many pixels each would hide at 1 m."""
-    own = np.concatenate([fit.own for fit in fits])
-    background_e = np.concatenate([fit.background_e for fit in fits])
+    most_px = np.repeat([fit.window.diagonal_px for fit in fits], counts)
     hidden_px = camera.hidden_px_at_1_m(own[:, :2])
     hidden_e = None if hidden_px is None else hidden_px * np.maximum(background_e, 0.0)
     by_size = log_range_by_size(own, fits[0])
-    most_px = np.concatenate([np.full(fit.layout.sources, fit.window.diagonal_px) for fit in fits])
-    return *lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, moved_px, None, most_px), hidden_px
+    laid, imaged = lay_out(camera, own[:, 0], own[:, 1], by_size, hidden_e, laid_px, None, most_px)
+    reach_px = laid.reach_px
+    ends = np.cumsum(counts).tolist()
+    parts = list(zip(fits, [0, *ends], ends, strict=False))
+    has_image = imaged.tolist()
+    climbed = [(fit, first, end) for fit, first, end in parts if all(has_image[first:end])]
+    for fit, first, end in climbed:
+        fit.climb(part_of(laid, first, end))
+    laid_at, own = own[:, :2], np.concatenate([fit.own for fit in fits])
+    change = laid.log_range_at - log_range_by_size(own, fits[0])
+    radius_px = reach_px * np.exp(change)
+    for fit in fits:
+        fit.converged = False
+    for fit, first, end in climbed:
+        fit.end_at(radius_px[first:end])
+    moved = (change > _GROWTH_KEPT) & (radius_px > _LEAST_DISC_PX)
+    if laid_px is not None and (motion_px := _motion_px(own, fits[0])) is not None:
+        moved |= motion_px > laid_px
+    if hidden_px is not None:
+        more_e = np.repeat([fit.background_e for fit in fits], counts) - background_e
+        moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
+    off_px = _off_px(laid, np.hypot(*(own[:, :2] - laid_at).T), abs(change), camera)
+    sigmas_px = np.sqrt([variance for fit in fits for variance in fit.place_variances_px2])
+    moved |= off_px > _KEPT_SIGMAS * sigmas_px
+    if not moved.any():
+        return []
+    return [fit for fit, first, end in parts if fit.converged and moved[first:end].any()]
+
+
+def _off_px(laid: Sources, moved_px: Array, grown: Array, camera: Camera) -> Array:
+    """Return how far images are seen to be off that have moved and grown, in ln size, since they were laid out."""
+    # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
+    reach_px = laid.reach_px
+    skewed_px = 2.0 * camera.radius_m * np.exp(-laid.log_range_at) * (grown * reach_px + moved_px)
+    blur = (_BLURRED * smoothing_px(camera.calibration)) ** 2
+    # Its middle lies off its place by its radius squared; that no point spread blurs.
+    return np.asarray(skewed_px * reach_px**2 / (reach_px**2 + blur) + laid.middle_px * grown)
 
 
 def _motion_px(own: Array, fit: Fit) -> Array | None:
@@ -295,7 +294,8 @@ def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
     log_range, log_range_sigma, log_range_common = camera.log_range(own[:, 2], slack, covariance[:, 2:, 2:])
     hidden = np.zeros(len(own))
     if unsure := camera.calibration.sigma.get("hidden_background", 0.0):
-        background_e = np.maximum(np.concatenate([fit.background_e for fit in fits]), 0.0)
+        counts = [fit.layout.sources for fit in fits]
+        background_e = np.maximum(np.repeat([fit.background_e for fit in fits], counts), 0.0)
         behind_e = covered_px_at_1_m(own[:, :2], camera.calibration) * background_e
         hidden = 0.5 * unsure * behind_e / np.exp(log_flux_at_1_m)
         log_range_sigma = np.hypot(log_range_sigma, hidden)
@@ -306,7 +306,7 @@ def solutions_of(fits: Sequence[Fit], camera: Camera) -> list[Solution]:
     for fit in fits:
         these = slice(first, first + fit.layout.sources)
         first = these.stop
-        background_e, radius_px = float(fit.values[fit.layout.background]), fit.image_radius_px
+        background_e, radius_px = fit.background_e, fit.image_radius_px
         motion_px = own[these, fit.layout.motion :] if fit.layout.moves else None
         motion_cost = 0.0
         if motion_px is not None:
