@@ -266,7 +266,7 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
 
 
 def _off_px(laid: Sources, moved_px: Array, grown: Array, camera: Camera) -> Array:
-    """Return how far images are seen to be off that have moved and grown, in ln size, since they were laid out."""
+    """Return how far images are seen to be off that moved, and grew in ln size, since they were laid out."""
     # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
     reach_px = laid.reach_px
     skewed_px = 2.0 * camera.radius_m * np.exp(-laid.log_range_at) * (grown * reach_px + moved_px)
