@@ -46,8 +46,7 @@ class Blob:
 
     def places(self, width: int) -> NDArray[np.int64]:
         """Return its pixels as indices in a frame of so many columns, in order."""
-        rows, columns = np.nonzero(self.pixels)
-        return np.asarray((self.box.top + rows) * width + self.box.left + columns)
+        return _places(self.pixels, self.box.top, self.box.left, width)
 
 
 def half_axes_px(mask: NDArray[np.bool_]) -> tuple[float, float]:
@@ -55,9 +54,35 @@ def half_axes_px(mask: NDArray[np.bool_]) -> tuple[float, float]:
 
     Along each an ellipse scatters by the square of half of that axis, over four.
     """
-    variances_px2 = np.linalg.eigvalsh(np.cov(np.argwhere(mask).T))
-    shorter, longer = (2.0 * np.sqrt(np.maximum(variances_px2, 0.0))).tolist()
-    return shorter, longer
+    across, down, both = _scatter(mask)
+    mean, half = 0.5 * (across + down), math.hypot(0.5 * (across - down), both)
+    return 2.0 * math.sqrt(max(mean - half, 0.0)), 2.0 * math.sqrt(mean + half)
+
+
+@compiled
+def _scatter(mask: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """Return the variances of the columns and of the rows of a mask's pixels, and their covariance."""
+    count, u, v, uu, vv, uv = 0, 0, 0, 0, 0, 0
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            if mask[row, column]:
+                count, u, v = count + 1, u + column, v + row
+                uu, vv, uv = uu + column * column, vv + row * row, uv + column * row
+    # Whole numbers: nothing is lost in the differences.
+    scale = max(count * (count - 1), 1)
+    return (count * uu - u * u) / scale, (count * vv - v * v) / scale, (count * uv - u * v) / scale
+
+
+@compiled
+def _places(mask: NDArray[np.bool_], top: int, left: int, width: int) -> NDArray[np.int64]:
+    """Return the pixels of a mask, which begins in such a row and column, as indices in a frame, in order."""
+    places, count = np.empty(mask.size, dtype=np.int64), 0
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            if mask[row, column]:
+                places[count] = (top + row) * width + left + column
+                count += 1
+    return places[:count].copy()
 
 
 def is_large(blob: Blob) -> bool:
@@ -79,18 +104,36 @@ def blobs_at(places: NDArray[np.int64], filtered_e: NDArray[np.float32], width: 
     in most frames that is next to nothing.
     """
     labels, boxes = _labelled(places, width)
-    order = np.argsort(labels, kind="stable")
-    ends = np.cumsum(np.bincount(labels, minlength=len(boxes)))
-    rows, columns = np.divmod(places[order], width)
-    values, blobs, first = filtered_e[order], [], 0
-    for end, (top, left, bottom, right) in zip(ends.tolist(), boxes.tolist(), strict=True):
-        pixels = np.zeros((bottom - top, right - left), dtype=bool)
-        image_e = np.zeros(pixels.shape, dtype=np.float32)
-        at = (rows[first:end] - top, columns[first:end] - left)
-        pixels[at], image_e[at] = True, values[first:end]
-        blobs.append(Blob(PixelBox(top, left, *pixels.shape), pixels, image_e))
-        first = end
-    return blobs
+    first, pixels, image_e = _in_boxes(places, filtered_e, width, labels, boxes)
+    return [
+        Blob(
+            PixelBox(top, left, bottom - top, right - left),
+            pixels[begin:end].reshape(bottom - top, right - left),
+            image_e[begin:end].reshape(bottom - top, right - left),
+        )
+        for (top, left, bottom, right), begin, end in zip(
+            boxes.tolist(), first[:-1].tolist(), first[1:].tolist(), strict=True
+        )
+    ]
+
+
+@compiled
+def _in_boxes(
+    places: NDArray[np.int64], values: NDArray[np.float32], width: int, labels: NDArray[np.int64],
+    boxes: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float32]]:  # fmt: skip
+    """Return where each component begins in what follows: its mask and its values, in its box, row by row."""
+    first = np.zeros(len(boxes) + 1, dtype=np.int64)
+    for label in range(len(boxes)):
+        top, left, bottom, right = boxes[label]
+        first[label + 1] = first[label] + (bottom - top) * (right - left)
+    pixels, image = np.zeros(first[-1], dtype=np.bool_), np.zeros(first[-1], dtype=np.float32)
+    for at in range(len(places)):
+        top, left, _, right = boxes[labels[at]]
+        row = places[at] // width
+        here = first[labels[at]] + (row - top) * (right - left) + places[at] - row * width - left
+        pixels[here], image[here] = True, values[at]
+    return first, pixels, image
 
 
 @compiled
@@ -100,20 +143,20 @@ def _labelled(places: NDArray[np.int64], width: int) -> tuple[NDArray[np.int64],
     Returns the number of each pixel, and each component's first and end row and column, as (top, left,
     bottom, right), shape (components, 4).
     """
-    leader = np.arange(len(places))
+    leader, rows = np.arange(len(places)), places // width
     above = 0
     for at in range(len(places)):
-        place = places[at]
-        column = place % width
-        if at > 0 and places[at - 1] == place - 1 and column > 0:
+        place, row = places[at], rows[at]
+        if at > 0 and places[at - 1] == place - 1 and rows[at - 1] == row:
             _join(leader, at - 1, at)
         # Those of the row above that touch: from the one to the left to the one to the right.
-        while places[above] < place - width - 1:
+        first = max(place - width - 1, (row - 1) * width)
+        last = min(place - width + 1, row * width - 1)
+        while places[above] < first:
             above += 1
         near = above
-        while near < at and places[near] <= place - width + 1:
-            if places[near] // width == place // width - 1 and abs(places[near] % width - column) <= 1:
-                _join(leader, near, at)
+        while near < at and places[near] <= last:
+            _join(leader, near, at)
             near += 1
     labels, count = np.empty(len(places), dtype=np.int64), 0
     for at in range(len(places)):
@@ -126,7 +169,7 @@ def _labelled(places: NDArray[np.int64], width: int) -> tuple[NDArray[np.int64],
     boxes = np.empty((count, 4), dtype=np.int64)
     boxes[:, :2], boxes[:, 2:] = np.iinfo(np.int64).max, 0
     for at in range(len(places)):
-        row, column, box = places[at] // width, places[at] % width, boxes[labels[at]]
+        row, column, box = rows[at], places[at] - rows[at] * width, boxes[labels[at]]
         box[0], box[1] = min(box[0], row), min(box[1], column)
         box[2], box[3] = max(box[2], row + 1), max(box[3], column + 1)
     return labels, boxes
