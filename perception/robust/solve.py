@@ -25,8 +25,8 @@ from perception.robust.problem import Motion, Problem, Start, Window
 Array = NDArray[np.float64]
 
 _MOST_LAYOUTS = 7
-# Images are laid out anew where they grow by so much in ln size: strips are then too few (by up to 0.02 σ),
-_GROWTH_KEPT, _LEAST_DISC_PX = 0.3, 0.05
+# Images are laid out anew where they grow by so much in ln size: strips are then too few (by up to .004 σ),
+_GROWTH_KEPT, _LEAST_DISC_PX = 0.15, 0.05
 # and where they change by so many σ, but for what so many widths of the point spread blur.
 _KEPT_SIGMAS, _BLURRED = 0.1, 4.0
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 HARMONICS = 7
 AROUND = 2 * HARMONICS + 2  # points of an outline
-_STEPS, _SETTLED = 40, 1e-5  # Newton's, in rad: what is left then is its square
+_STEPS, _SETTLED = 40, 1e-5  # Newton's, in rad: of the last one its square is left
 _LEFT_OUT = 1e-5  # of an outline's radius: how large its last harmonic may be
 # Of each harmonic at each of the points.
 _TURNS = 2.0 * math.pi / AROUND * (np.outer(np.arange(1 + HARMONICS), np.arange(AROUND)) % AROUND)

@@ -75,10 +75,8 @@ def unlikeliness(
         if not is_inside(own.ravel(), view, len(own), 3):
             continue
         expected, variance = views.known_e[here] + background_e[at], np.empty(view.image_e.size)
-        blur, image = (
-            blur_of(known.psf_sigma_px, max(rows, columns)),
-            np.empty((1, rows, whole_lanes(columns))),
-        )
+        image = np.empty((1, rows, whole_lanes(columns)))
+        blur = blur_of(known.psf_sigma_px, max(rows, columns))
         for source in range(first_source[guess], first_source[guess + 1]):
             image[:], of = 0.0, laid_as[source]
             place = (starts[source, 0] - left, starts[source, 1] - top)

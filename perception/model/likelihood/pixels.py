@@ -125,7 +125,8 @@ def slopes(
 ) -> None:  # fmt: skip
     """Write the gradient of ln L and the information, priors included.
 
-    The information is what these very pixels give, or, `of_average`, what such pixels give on average.
+    The information is what these very pixels give, or, `of_average`, what such pixels give on average; the
+    gradient counts what clips in the first case alone.
     `first_wave` is the index of the first amplitude of a wave of the structure, which `jacobian` leaves out.
     """
     image, state, waves = view.image_e.ravel(), view.state.ravel(), len(structure.order)

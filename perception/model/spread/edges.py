@@ -23,8 +23,7 @@ LANES = 8
 
 _STEP = 1.0 / 32.0  # σ
 _PLACES_PER_SIGMA = 6.0  # off by 10⁻⁹ between them
-_MOST_PLACES = 1024
-_WIDEST_PX = 200.0
+_NARROWEST_PX, _WIDEST_PX = 0.006, 200.0
 
 
 def _table() -> Array:
@@ -85,9 +84,9 @@ def whole_lanes(count: int) -> int:
 
 @compiled
 def blur_of(sigma_px: float, count: int) -> Blur:
-    """Return a Gaussian of a width, for rows of so many pixels; one wider than 200 px counts as 200."""
-    sigma = min(sigma_px, _WIDEST_PX)
-    places = int(min(math.ceil(_PLACES_PER_SIGMA / sigma), _MOST_PLACES))
+    """Return a Gaussian of a width, 0.006 to 200 px or the nearest of these, for rows of so many pixels."""
+    sigma = min(max(sigma_px, _NARROWEST_PX), _WIDEST_PX)
+    places = math.ceil(_PLACES_PER_SIGMA / sigma)
     before = int(REACH_SIGMAS * sigma)
     edges = whole_lanes(2 * before + 2)
     below, density = np.empty((places + 1, edges)), np.empty((places + 1, edges))
@@ -123,7 +122,8 @@ def fall_at(middle: float, blur: Blur, first: int, count: int, end: int) -> int:
         Its width: of rows `2 end` and `2 end + 1` of `falls`, from what is returned on, `count` + 1 become
         the share below each edge and σ² times the density there.
     first, count
-        The first edge wanted, and how many there are beyond it, no more than fit the row.
+        The first edge wanted, and how many there are beyond it: as many as `whole_lanes` of the pixels that
+        `blur` is for, at most.
     end
         0 or 1.
     """

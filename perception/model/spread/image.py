@@ -33,10 +33,10 @@ def spread_nodes(
     blur, columns
         The point spread, made for as many pixels as the window has columns or rows; and its columns.
     image
-        Zeros of shape (planes, rows, `whole_lanes(columns)`): the share of its flux in each pixel is added,
-        and beyond the first plane that share's derivatives by column, row and ln size, these four alone, or,
-        of five or seven, that by ln width of the point spread, and by both parts of its motion. What is
-        beyond the columns does not count.
+        Zeros of shape (planes, rows, `whole_lanes(columns)`), to which is added: in one plane the share of
+        its flux in each pixel; in four also that share's derivatives by column, row and ln size; in five also
+        that by ln width of the point spread; in seven also those by both parts of its motion. What is beyond
+        the columns does not count.
     """
     planes, rows, width = image.shape
     across, down = np.zeros((4, width)), np.empty((3, whole_lanes(rows)))

@@ -49,7 +49,8 @@ def strip_shares(
 
     Its light is 1 + a t + b (t² - 1/3) with `shading` (a, b), t from -1 at its left end to 1 at its right.
     Rows 0 to 2 of `into` become as there, row 3 the derivative by ln size as the strip and `off_px`, how far
-    its middle lies from the point that it grows about, grow in proportion.
+    its middle lies from the point that it grows about, grow in proportion. Much shorter strips than the point
+    spread is wide are to be even: their shading would be lost in differences.
     """
     reach_px = REACH_SIGMAS * blur.sigma_px + half_px
     if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):

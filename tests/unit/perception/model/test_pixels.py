@@ -7,8 +7,8 @@ import pytest
 from scipy.special import log_ndtr, ndtr
 from scipy.stats import norm
 
-from perception.model.layout import CLIPPED, SEEN, UNUSABLE, View
-from perception.model.likelihood.pixels import log_variances
+from perception.model.layout import CLIPPED, SEEN, UNUSABLE, View, even
+from perception.model.likelihood.pixels import log_variances, objective, slopes
 from perception.model.normal import kept_of_clipping, log_upper_tail, of_clipped
 
 
@@ -33,3 +33,37 @@ def test_logarithms_of_variances_are_those_of_each(scale: float) -> None:
     nothing_e = np.zeros((5, 7))
     told = log_variances(View(0, 0, nothing_e, state, 1.0, nothing_e), variance)
     assert told == pytest.approx(float(np.log(variance[state.ravel() == SEEN]).sum()), rel=1e-12)
+
+
+@pytest.mark.parametrize("of_average", [False, True])
+def test_what_each_pixel_tells(of_average: bool) -> None:
+    """Of one unknown, that each pixel's light is in proportion to: by SciPy's Φ, as far as 40 σ from clipping."""
+    clip_e, count = 3000.0, 400
+    expected = np.linspace(100.0, 8000.0, count)
+    variance = expected + 50.0
+    image = np.minimum(expected + 3.0 * np.sqrt(variance) * np.sin(np.arange(count)), clip_e)
+    state = np.where(image < clip_e, SEEN, CLIPPED).astype(np.uint8)
+    state[::7], image[::7] = UNUSABLE, np.nan
+    view = View(0, 0, image.reshape(20, 20), state.reshape(20, 20), 50.0, np.zeros((20, 20)))
+    jacobian, precision, values = np.ones((1, count)), np.array([[0.1]]), np.array([2.0])
+    gradient, information = np.empty(1), np.empty((1, 1))
+    slopes(
+        view, even(count), 1, values, expected, jacobian, variance, precision, clip_e, of_average, gradient,
+        information,
+    )  # fmt: skip
+    z = (clip_e - expected) / np.sqrt(variance)
+    mills = np.exp(norm.logpdf(z) - log_ndtr(-z))
+    seen, clipped = state == SEEN, state == CLIPPED
+    if of_average:
+        near = np.clip(z, -30.0, 8.0)
+        kept = (
+            ndtr(near) - near * norm.pdf(near) + norm.pdf(near) * np.exp(norm.logpdf(near) - log_ndtr(-near))
+        )
+        told = (kept / variance)[seen | clipped].sum()
+    else:
+        told = (1.0 / variance)[seen].sum() + (mills * (mills - z) / variance)[clipped].sum()
+        pull = ((image - expected) / variance)[seen].sum() + (mills / np.sqrt(variance))[clipped].sum()
+        assert gradient[0] == pytest.approx(pull - 0.1 * 2.0, rel=1e-7)
+    assert information[0, 0] == pytest.approx(told + 0.1, rel=1e-7)
+    chi2 = ((image - expected) ** 2 / variance)[seen].sum() - 2.0 * log_ndtr(-z[clipped]).sum() + 0.1 * 4.0
+    assert objective(view, values, expected, variance, precision, clip_e) == pytest.approx(chi2, rel=1e-9)

@@ -43,13 +43,14 @@ def _laid(
 
 
 def _image(
-    nodes: DiscNodes, u_px: float, v_px: float, half_px: int, sigma_px: float, motion: tuple[float, float]
-) -> Array:
+    nodes: DiscNodes, u_px: float, v_px: float, half_px: int, sigma_px: float, motion: tuple[float, float],
+    growth: float = 1.02,
+) -> Array:  # fmt: skip
     source = Sources.of(nodes, np.zeros(1), np.zeros(1))
     side = 2 * half_px + 1
     image = np.zeros((7 if any(motion) else 5, side, whole_lanes(side)))
     place = (half_px + u_px % 1.0, half_px + v_px % 1.0)
-    spread_nodes(source, 0, place, 1.02, motion, blur_of(sigma_px, side), side, image)
+    spread_nodes(source, 0, place, growth, motion, blur_of(sigma_px, side), side, image)
     return image[:, :, :side]
 
 
@@ -72,6 +73,22 @@ def test_rows_say_the_same_as_points(lens: str, range_m: float, u_px: float, v_p
         # What a point's size changes is next to nothing.
         least = 1e-3 * float(np.abs(points[4]).max()) if plane == 3 else 0.0
         assert float(np.abs(rows[plane] - points[plane]).max()) < most * max(greatest, least), plane
+
+
+@pytest.mark.parametrize("psf_sigma_px", [0.4, 0.7, 1.4])
+@pytest.mark.parametrize("radius_px", [1.0, 5.0, 25.0, 70.0])
+def test_images_may_grow(psf_sigma_px: float, radius_px: float) -> None:
+    """By e^.15, as fits keep them: to 5e-4 of the greatest of what six times as many rows say."""
+    camera = calibration(psf_sigma_px=psf_sigma_px)
+    half_px, place = math.ceil(1.2 * radius_px + 6.0 * psf_sigma_px) + 3, (900.2, 700.3)
+    few, many = (
+        _image(
+            _laid(disc_rows, *place, radius_px / camera.fx_px, camera, finer, 0.0),
+            *place, half_px, psf_sigma_px, (0.0, 0.0), math.exp(0.15),
+        )[0]
+        for finer in (1.0, 6.0)
+    )  # fmt: skip
+    assert np.abs(few - many).max() < 5e-4 * many.max()
 
 
 def test_what_moves_is_the_mean_of_what_stands_still() -> None:
