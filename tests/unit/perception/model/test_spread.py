@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def _below(z: Array) -> Array:
-    return 0.5 + 0.5 * np.vectorize(math.erf)(z * math.sqrt(0.5))
+    return np.asarray(0.5 + 0.5 * np.vectorize(math.erf)(z * math.sqrt(0.5)))
 
 
 def _density(z: Array) -> Array:
@@ -28,7 +28,7 @@ def test_a_gaussian_at_edges(sigma_px: float) -> None:
     """Its middle anywhere in a row, or beyond: Φ to 4e-9, σ φ to 3e-8 of its greatest."""
     count = 24
     blur = blur_of(sigma_px, count)
-    edges = np.arange(count + 1)
+    edges = np.arange(count + 1, dtype=np.float64)
     for middle in np.linspace(-3.0, 27.0, 311).tolist():
         begin = fall_at(middle, blur, 0, count, 1)
         below, slope = (blur.falls[row, begin : begin + count + 1] for row in (2, 3))
@@ -50,7 +50,7 @@ def test_a_point_against_erf(at_px: float) -> None:
     sigma_px, count = 0.7, 23
     blur, into = blur_of(sigma_px, 40), np.zeros((3, whole_lanes(count)))
     first, end = shares(at_px, count, blur, into)
-    z = (np.arange(count + 1) - 0.5 - at_px) / sigma_px
+    z = (np.arange(count + 1, dtype=np.float64) - 0.5 - at_px) / sigma_px
     expected = [np.diff(_below(z)), -np.diff(_density(z)) / sigma_px, -np.diff(z * _density(z))]
     reached = np.flatnonzero(abs(z[:-1] + 0.5 / sigma_px) < REACH_SIGMAS + 0.5 / sigma_px)
     assert (first, end) == (reached[0], reached[-1] + 1)
