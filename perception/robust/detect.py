@@ -355,6 +355,8 @@ def _off_hill(
     row, column = divmod(int(peak), part.box.width)
     down, across = part.box.top - component.box.top + row, part.box.left - component.box.left + column
     clips = part.pixels & prepared.clipped_in(part.box)
+    if clips[row, column] and not is_large(part):
+        return [part]  # as `summit` would
     around = component.filtered_e[max(down - 1, 0) : down + 2, max(across - 1, 0) : across + 2]
     # What is clipped is left alone, but where it is too large to be fitted with its hill.
     left_alone = np.zeros_like(clips) if is_large(part) else clips
