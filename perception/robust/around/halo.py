@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.model.layout import Structure, any_of
+from perception.compiled import compiled
+from perception.model.layout import SEEN, Structure, any_of
+from perception.model.likelihood.products import dot
 from perception.model.window import Camera
-from perception.robust.goodness import halo_sigmas
+from perception.robust.goodness import LEAST_KNOWN, noise_e2
 from perception.robust.overlap.rivals import weighed
 from perception.robust.problem import Problem
 from perception.robust.search.structure import joined
@@ -175,3 +177,73 @@ def _covered(flare: Solution) -> tuple[tuple[slice, slice], tuple[Array, Array],
         inside_px = radius_px - np.hypot(across - along_u, down - along_v)
         covered += np.clip(inside_px * _FINE + 0.5, 0.0, 1.0) / len(motions)
     return (there[0], there[1]), (shares[0], shares[1]), covered, down**2 + across**2
+
+
+@compiled
+def halo_sigmas(
+    image_e: Array, state: NDArray[np.uint8], expected_e: Array, flares_e: Array, floor_e2: float,
+    prnu: float, place: tuple[float, float], widths_px: Array, least: float,
+) -> float:  # fmt: skip
+    """Return by how many standard deviations light around a flare shows in what its fit leaves.
+
+    Light that falls off as (1 + ρ²/w²)^(-3/2) from the flare's column and row in the window, `place`, for
+    each width w; of it only what even ground, flux and place do not take up. Widths of which all shows by
+    `least` or less are not looked at so closely; 0 where that is so of all. The rest is as for
+    `goodness.left_over`.
+    """
+    rows, columns = image_e.shape
+    weight, distance2, seen, count = np.empty(image_e.size), np.empty(image_e.size), np.empty(image_e.size), 0
+    for row in range(rows):
+        for column in range(columns):
+            if state[row, column] == SEEN:
+                weight[count] = 1.0 / math.sqrt(noise_e2(expected_e[row, column], floor_e2, prnu))
+                seen[count] = weight[count] * (image_e[row, column] - expected_e[row, column])
+                distance2[count] = (column - place[0]) ** 2 + (row - place[1]) ** 2
+                count += 1
+    halo, seen, taken_up, most = np.empty(count), seen[:count], np.empty((0, count)), 0.0
+    for width in widths_px:
+        for pixel in range(count):
+            spread = 1.0 + distance2[pixel] / width**2
+            halo[pixel] = weight[pixel] / (spread * math.sqrt(spread))
+        power = dot(halo, halo)
+        if not dot(halo, seen) > least * math.sqrt(power):
+            continue
+        if len(taken_up) == 0:
+            taken_up = _taken_up(state, flares_e, weight[:count])
+        _take_off(halo, taken_up, len(taken_up))
+        left_power = dot(halo, halo)
+        if left_power > LEAST_KNOWN * power:
+            most = max(most, dot(halo, seen) / math.sqrt(left_power))
+    return most
+
+
+@compiled
+def _taken_up(state: NDArray[np.uint8], flares_e: Array, weight: Array) -> Array:
+    """Return what even ground, flux and place change in the pixels seen, orthogonal to each other, (4, n)."""
+    (rows, columns), taken_up, at = state.shape, np.empty((4, len(weight))), 0
+    for row in range(rows):
+        for column in range(columns):
+            if state[row, column] != SEEN:
+                continue
+            left, right = max(column - 1, 0), min(column + 1, columns - 1)
+            above, below = max(row - 1, 0), min(row + 1, rows - 1)
+            taken_up[0, at] = weight[at]
+            taken_up[1, at] = weight[at] * flares_e[row, column]
+            taken_up[2, at] = weight[at] * (flares_e[row, right] - flares_e[row, left])
+            taken_up[3, at] = weight[at] * (flares_e[below, column] - flares_e[above, column])
+            at += 1
+    for one in range(1, len(taken_up)):
+        _take_off(taken_up[one], taken_up, one)
+    return taken_up
+
+
+@compiled
+def _take_off(one: Array, others: Array, count: int) -> None:
+    """Take off what the first of some other columns, orthogonal to each other, can explain of one."""
+    for other in range(count):
+        column = others[other]
+        power = dot(column, column)
+        if power > 0.0:
+            share = dot(column, one) / power
+            for at in range(len(one)):
+                one[at] -= share * column[at]

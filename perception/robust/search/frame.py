@@ -162,19 +162,18 @@ def exceeding(
                 samples[sample_of[row], at] = result[sampled[at]]
         if not bright_pixels.any():
             continue
-        one, other, share = between(row, rows, len(limit_e))
-        rest, part = np.float32(1.0 - share), np.float32(share)
         if sample_of[row] < 0:
             _sum_rows(across, kernel, row, result)
+        one, other, share = between(row, rows, len(limit_e))
+        rest, part = np.float32(1.0 - share), np.float32(share)
         for column in range(columns):
             row_limit_e[column] = rest * limit_e[one, column] + part * limit_e[other, column]
         found = _brighter(result, row_limit_e, lit)
-        while count + found > len(places):
-            places = np.append(places, np.empty(len(places), dtype=np.int64))
-            values = np.append(values, np.empty(len(values), dtype=np.float32))
-        for column in lit[:found]:
-            places[count], values[count] = row * columns + column, result[column]
-            count += 1
+        if count + found > len(places):
+            places = np.append(places, np.empty(count + found, dtype=np.int64))
+            values = np.append(values, np.empty(count + found, dtype=np.float32))
+        places[count:][:found], values[count:][:found] = row * columns + lit[:found], result[lit[:found]]
+        count += found
     return places[:count].copy(), values[:count].copy(), samples
 
 

@@ -10,8 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from perception.model.flare import PixelBox
 from perception.model.layout import SEEN, UNUSABLE
-from perception.robust.around.halo import _halos
-from perception.robust.goodness import halo_sigmas
+from perception.robust.around.halo import _halos, halo_sigmas
 from perception.robust.solve import Solution
 from tests.unit.perception.simulation import random
 
