@@ -257,7 +257,7 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     if hidden_px is not None:
         more_e = np.repeat([fit.background_e for fit in fits], counts) - background_e
         moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
-    off_px = _off_px(laid, np.hypot(*(own[:, :2] - laid_at).T), abs(change), camera)
+    off_px = _off_px(laid, reach_px, np.hypot(*(own[:, :2] - laid_at).T), abs(change), camera)
     sigmas_px = np.sqrt([variance for fit in fits for variance in fit.place_variances_px2])
     moved |= off_px > _KEPT_SIGMAS * sigmas_px
     if not moved.any():
@@ -265,10 +265,9 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     return [fit for fit, first, end in parts if fit.converged and moved[first:end].any()]
 
 
-def _off_px(laid: Sources, moved_px: Array, grown: Array, camera: Camera) -> Array:
+def _off_px(laid: Sources, reach_px: Array, moved_px: Array, grown: Array, camera: Camera) -> Array:
     """Return how far images are seen to be off that moved, and grew in ln size, since they were laid out."""
     # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
-    reach_px = laid.reach_px
     skewed_px = 2.0 * camera.radius_m * np.exp(-laid.log_range_at) * (grown * reach_px + moved_px)
     blur = (_BLURRED * smoothing_px(camera.calibration)) ** 2
     # Its middle lies off its place by its radius squared; that no point spread blurs.

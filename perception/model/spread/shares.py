@@ -12,6 +12,15 @@ Array = NDArray[np.float64]
 
 
 @compiled
+def _reached(at_px: float, half_px: float, count: int, blur: Blur) -> tuple[int, int]:
+    """Return the first pixel that a strip of half such a length reaches, the one after the last; or 0, 0."""
+    reach_px = REACH_SIGMAS * blur.sigma_px + half_px
+    if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):
+        return 0, 0
+    return max(0, math.ceil(at_px - reach_px - 0.5)), min(count, math.floor(at_px + reach_px + 0.5) + 1)
+
+
+@compiled
 def shares(at_px: float, count: int, blur: Blur, into: Array) -> tuple[int, int]:
     """Spread a point along a row of pixels.
 
@@ -20,11 +29,9 @@ def shares(at_px: float, count: int, blur: Blur, into: Array) -> tuple[int, int]
     `whole_lanes(count)` pixels; beside those reached some are written, too, from a whole number of `LANES` to
     another, with what falls there: nothing.
     """
-    reach_px = REACH_SIGMAS * blur.sigma_px
-    if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):
+    first, end = _reached(at_px, 0.0, count, blur)
+    if first == end:
         return 0, 0
-    first = max(0, math.ceil(at_px - reach_px - 0.5))
-    end = min(count, math.floor(at_px + reach_px + 0.5) + 1)
     left = first // LANES * LANES
     pixels = whole_lanes(end) - left
     begin = fall_at(at_px + 0.5, blur, left, pixels, 0)
@@ -52,11 +59,9 @@ def strip_shares(
     its middle lies from the point that it grows about, grow in proportion. Much shorter strips than the point
     spread is wide are to be even: their shading would be lost in differences.
     """
-    reach_px = REACH_SIGMAS * blur.sigma_px + half_px
-    if not (-reach_px - 0.5 < at_px < count - 0.5 + reach_px):
+    first, end = _reached(at_px, half_px, count, blur)
+    if first == end:
         return 0, 0
-    first = max(0, math.ceil(at_px - reach_px - 0.5))
-    end = min(count, math.floor(at_px + reach_px + 0.5) + 1)
     left = first // LANES * LANES
     pixels = whole_lanes(end) - left
     begin_a = fall_at(at_px - half_px + 0.5, blur, left, pixels, 0)
