@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,12 +162,12 @@ class Cluster:
         """Whether it is a part of a larger group."""
         return len(self.wanted) < len(self.members)
 
-    @property
+    @cached_property
     def is_beyond_fit(self) -> bool:
         """Whether any member is."""
         return any(member.is_beyond_fit for member in self.members)
 
-    @property
+    @cached_property
     def is_clipped(self) -> bool:
         """Whether any member is."""
         return any(member.is_clipped for member in self.members)

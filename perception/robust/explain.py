@@ -53,8 +53,11 @@ _GOOD_SIGMAS = 10.0  # of χ²: what leaves so much more is not as good, whateve
 
 def by_blobs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
     """Solve clusters by a flare at rest for each blob; None where that does not converge."""
-    # The same window with each set of first guesses, from the faintest on.
-    first = [[Problem(c.window, starts, c.background_e) for starts in guesses(c, prepared)] for c in found]
+    # The same window with each set of first guesses.
+    first = [
+        [Problem(cluster.window, starts, cluster.background_e) for starts in sets]
+        for cluster, sets in zip(found, guesses(found, prepared), strict=True)
+    ]
     problems = likely_starts(first, camera)
     chosen: list[Solution | None] = [None] * len(found)
     for (index, _), solution in zip(problems, solve([p for _, p in problems], camera), strict=True):

@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.model.bearing import pixel_turn
 from perception.model.discs.nodes import smoothing_px
 from perception.model.layout import Sources, part_of
 from perception.model.ranging import covered_px_at_1_m
@@ -21,6 +22,7 @@ from perception.model.window import motion_cost as cost_of_motion
 from perception.robust.fit import Fit, log_range_by_size
 from perception.robust.goodness import LeftOver, drawn_out, left_over, residual_e
 from perception.robust.problem import Motion, Problem, Start, Window
+from perception.types import Calibration
 
 Array = NDArray[np.float64]
 
@@ -28,7 +30,7 @@ _MOST_LAYOUTS = 7
 # Images are laid out anew where they grow by so much in ln size: strips are then too few (by up to .004 σ),
 _GROWTH_KEPT, _LEAST_DISC_PX = 0.15, 0.05
 # and where they change by so many σ, but for what so many widths of the point spread blur.
-_KEPT_SIGMAS, _BLURRED = 0.1, 4.0
+_KEPT_SIGMAS, _BLURRED = 0.05, 4.0
 _HIDDEN_KEPT = 4e-4  # share of a source's flux, by the background that it hides: 2e-4 of its range
 _LINE_KEPT_PX = 0.5  # by how much a flare may move farther than its image is laid out for
 _BLOB_PX2, _PLACES = 50.0, 200.0  # of a flare in a blob: so many px², by four e-foldings of its range
@@ -128,7 +130,7 @@ class Solution:
         by_chance = -2.0 * (self.count - 1) * math.log(NEIGHBOURS_PER_PX2 * _BLOB_PX2)
         return self.deviance + self.log_information + by_flares + by_chance + self.motion_cost
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Number of flares."""
         return len(self.flux_e)
@@ -140,8 +142,8 @@ class Solution:
     @property
     def starts(self) -> list[Start]:
         """The flares as first guesses of another fit."""
-        own = np.column_stack([self.u_px, self.v_px, self.log_photometric_range])
-        return [(u, v, log_range) for u, v, log_range in own.tolist()]
+        own = (self.u_px.tolist(), self.v_px.tolist(), self.log_photometric_range.tolist())
+        return list(zip(*own, strict=True))
 
     def again(self, window: Window | None = None) -> Problem:
         """Return the problem of fitting these flares again, or to another view of their window."""
@@ -257,21 +259,50 @@ def _climbed(fits: Sequence[Fit], camera: Camera) -> list[Fit]:
     if hidden_px is not None:
         more_e = np.repeat([fit.background_e for fit in fits], counts) - background_e
         moved |= abs(hidden_px * more_e) > _HIDDEN_KEPT * np.exp(laid.log_flux_at_1_m)
-    off_px = _off_px(laid, reach_px, np.hypot(*(own[:, :2] - laid_at).T), abs(change), camera)
-    sigmas_px = np.sqrt([variance for fit in fits for variance in fit.place_variances_px2])
-    moved |= off_px > _KEPT_SIGMAS * sigmas_px
+    kept_px = _KEPT_SIGMAS * np.sqrt([variance for fit in fits for variance in fit.place_variances_px2])
+    moved |= _are_off(laid, reach_px, laid_at, own[:, :2], abs(change), kept_px, camera)
     if not moved.any():
         return []
     return [fit for fit, first, end in parts if fit.converged and moved[first:end].any()]
 
 
-def _off_px(laid: Sources, reach_px: Array, moved_px: Array, grown: Array, camera: Camera) -> Array:
-    """Return how far images are seen to be off that moved, and grew in ln size, since they were laid out."""
-    # Where and how large a disc is, off the axis, makes it longer than wide and its middle its brightest.
-    skewed_px = 2.0 * camera.radius_m * np.exp(-laid.log_range_at) * (grown * reach_px + moved_px)
-    blur = (_BLURRED * smoothing_px(camera.calibration)) ** 2
-    # Its middle lies off its place by its radius squared; that no point spread blurs.
-    return np.asarray(skewed_px * reach_px**2 / (reach_px**2 + blur) + laid.middle_px * grown)
+def _are_off(
+    laid: Sources,
+    reach_px: Array,
+    laid_px: Array,
+    now_px: Array,
+    grown: Array,
+    kept_px: Array,
+    camera: Camera,
+) -> NDArray[np.bool_]:
+    """Tell which images are seen to be off by more than is kept, as they moved and grew in ln size since.
+
+    Off the axis a disc is longer than wide, and its middle not its brightest: by where it is, and how large.
+    """
+    blurred = reach_px**2 / (reach_px**2 + (_BLURRED * smoothing_px(camera.calibration)) ** 2)
+    radius_rad = camera.radius_m * np.exp(-laid.log_range_at)
+    # The middle of its light lies off its place by its radius squared, too; that no point spread blurs.
+    by_growth_px = 0.5 * radius_rad * grown * reach_px * blurred + laid.middle_px * grown
+    by_place_px = 2.0 * radius_rad * np.hypot(*(now_px - laid_px).T) * blurred
+    is_off = by_growth_px + by_place_px > kept_px
+    if is_off.any():
+        scale = _change_of_scale(laid_px[is_off], now_px[is_off], camera.calibration)
+        off_px = by_growth_px[is_off] + scale * (reach_px * blurred)[is_off]
+        is_off[is_off] = ~(off_px <= kept_px[is_off])
+    return np.asarray(is_off)
+
+
+def _change_of_scale(places_px: Array, others_px: Array, calibration: Calibration) -> Array:
+    """Return by what share small discs are longer, or wider, at other places; NaN where none is seen."""
+    before, after = (
+        turn @ turn.swapaxes(1, 2)
+        for turn in (pixel_turn(places_px, calibration), pixel_turn(others_px, calibration))
+    )
+    changed = np.full(len(before), np.nan)
+    known = np.isfinite(before).all(axis=(1, 2)) & np.isfinite(after).all(axis=(1, 2))
+    turned = np.linalg.solve(before[known], after[known] - before[known])
+    changed[known] = 0.5 * np.linalg.norm(turned, axis=(1, 2))
+    return changed
 
 
 def _motion_px(own: Array, fit: Fit) -> Array | None:

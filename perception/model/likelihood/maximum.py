@@ -7,12 +7,20 @@ from numpy.typing import NDArray
 
 from perception.compiled import compiled
 from perception.model.layout import CLIPPED, SEEN, Known, Sources, Structure, View
-from perception.model.likelihood.pixels import expectation, is_inside, log_variances, objective, slopes
+from perception.model.likelihood.pixels import (
+    expectation,
+    is_inside,
+    log_variances,
+    objective,
+    slopes,
+    take_last_step,
+)
 from perception.model.likelihood.products import dot, factorised, inverted, solved, variance_of
 
 Array = NDArray[np.float64]
 
-SETTLED_SIGMAS = 0.01
+# A climb is settled where a step is so short, or the next one is if steps go on to shorten as they did.
+SETTLED_SIGMAS, LAST_SIGMAS = 0.01, 0.1
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 MOST_STEPS = 50
 # Whether a climb is hopeless is judged after so many steps: ahead is, in -2 ln L, at most so much more than
@@ -74,7 +82,7 @@ def maximise(
     Returns
     -------
     −2 ln L, priors included, but for a constant of the data, and ln of the determinant of information and
-    priors; both infinite where no step below a hundredth of a standard deviation was reached, or none tried.
+    priors; both infinite where no step below a hundredth of a standard deviation was ahead, or none tried.
     """
     size, pixels, count = len(values), len(expected), len(sources.log_range_at)
     step = 3 + (known.tie_spread > 0.0) + 2 * (known.motion_px > 0.0)
@@ -85,7 +93,7 @@ def maximise(
     gradient, trial, shift, clip_e = np.empty(size), np.empty(size), np.empty(size), known.clip_e
     fisher, damped, factor = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
     scale = np.empty(size)
-    damping, is_new, to_gain, before, taken = FIRST_DAMPING, True, 0.0, 0.0, 0
+    damping, is_new, to_gain, before, taken, sigmas = FIRST_DAMPING, True, 0.0, 0.0, 0, math.inf
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
     for _ in range(MOST_STEPS):
         if is_new:
@@ -97,12 +105,14 @@ def maximise(
                 return math.inf, math.inf
             solved(scale, factor, gradient, shift)
             to_gain = dot(shift, gradient)
-            settled = True
+            before_sigmas, sigmas = sigmas, 0.0
             for one in range(count * step):
-                if settled:
-                    sigma = math.sqrt(variance_of(scale, factor, one))
-                    settled = abs(shift[one]) <= SETTLED_SIGMAS * sigma
-            if settled:
+                sigmas = max(sigmas, abs(shift[one]) / math.sqrt(variance_of(scale, factor, one)))
+            left_sigmas = sigmas * min(sigmas / before_sigmas, 1.0)
+            if sigmas <= SETTLED_SIGMAS or (sigmas <= LAST_SIGMAS and left_sigmas <= SETTLED_SIGMAS):
+                take_last_step(
+                    view, structure, known, first_wave, shift, values, jacobian, expected, variance
+                )
                 break
             before = objective(view, values, expected, variance, precision, clip_e)
             if taken >= JUDGED_AFTER and math.isfinite(to_beat):

@@ -86,9 +86,32 @@ def expectation(
                 add_plane(flux, image[plane], columns, jacobian[at + step + plane - 7])
         if known.width_spread > 0.0:
             add_plane(known.width_spread * flux, image[4], columns, jacobian[width])
+    _set_variance(view, known, expected, variance)
+
+
+@compiled
+def _set_variance(view: View, known: Known, expected: Array, variance: Array) -> None:
     for pixel in range(len(expected)):
         lit_e = max(expected[pixel], 0.0)
         variance[pixel] = lit_e + (known.prnu * lit_e) ** 2 + view.floor_e2
+
+
+@compiled
+def take_last_step(
+    view: View, structure: Structure, known: Known, first_wave: int, shift: Array, values: Array,
+    jacobian: Array, expected: Array, variance: Array,
+) -> None:  # fmt: skip
+    """Take a step that is so short that what is expected follows from the derivatives."""
+    waves = len(structure.order)
+    values += shift
+    for row in range(len(jacobian)):
+        factor = shift[row if row < first_wave else row + waves]
+        for pixel in range(len(expected)):
+            expected[pixel] += factor * jacobian[row, pixel]
+    if waves:
+        amplitudes = shift[first_wave : first_wave + waves]
+        add_waves(structure.cosines, structure.order, amplitudes, expected.reshape(view.image_e.shape))
+    _set_variance(view, known, expected, variance)
 
 
 @compiled

@@ -39,7 +39,7 @@ class Blob:
         """Which of its pixels are brighter than half of its maximum, in its box."""
         return np.asarray(self.filtered_e > 0.5 * self.peak_e)
 
-    @property
+    @cached_property
     def area_px(self) -> int:
         """Number of pixels."""
         return int(np.count_nonzero(self.pixels))

@@ -36,9 +36,13 @@ def light_of(
     """Look at a blob's pixels: centroid (u, v), flux in electrons, and how many are clipped.
 
     `places` are their indices in a frame of so many columns; of each the light above the background and the
-    count are given. The centroid is weighted by that light; pixels that are bad count nowhere.
+    count are given. The centroid is weighted by that light, where some clips by what bends smoothly towards
+    it: on pixels the kink would move it. Those that are bad count nowhere.
     """
     u, v, weight, flux, clipped, even_u, even_v = 0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0
+    bend = 0.0
+    if counts_dn.max() >= full_dn:
+        bend = 1.0 / max(excess_e.max(), 1.0)
     for index, place in enumerate(places):
         row, column = place // columns, place % columns
         even_u += column / len(places)
@@ -49,9 +53,10 @@ def light_of(
         light = excess_e[index]
         clipped += counts_dn[index] >= full_dn
         flux += light
-        u += max(light, 0.0) * column
-        v += max(light, 0.0) * row
-        weight += max(light, 0.0)
+        bent = max(light, 0.0) * (2.0 - bend * light) if bend > 0.0 else max(light, 0.0)
+        u += bent * column
+        v += bent * row
+        weight += bent
     if not weight > 0.0:
         return even_u, even_v, flux, clipped
     return u / weight, v / weight, flux, clipped

@@ -1,26 +1,44 @@
 """First guesses of flares: by their light, and where that is clipped or cut, by more than is seen of it."""
 
 import math
-from statistics import NormalDist
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from perception.model.discs.nodes import smoothing_px
-from perception.robust.clusters import Candidate, Cluster
+from perception.model.ranging import brightness_e
+from perception.robust.clusters import Cluster
 from perception.robust.problem import Start
-from perception.robust.search.blobs import half_axes_px
 from perception.robust.search.prepare import PreparedFrame
+from perception.robust.starts.curve_of_growth import whole_fluxes
 
 _FAR_OFF_PX = 1.5  # of a blob's brightest pixel from the middle of its light
 _CLIPPED_FACTORS = (1.0, 4.0, 16.0, 64.0)
 _CUT_FACTORS = (1.0, 2.0, 4.0)
-_LEAST_DISC_PX2 = 50  # of what is clipped, from which on its longer axis tells a disc's size
-_MOST_SHARE = 1.0 - 1e-9
-_SMALL_DISC = 0.7  # of the width that blurs it
+_OUTLINE_PX, _OUTLINE_SHARE = 0.3, 0.05  # of the radius within which a disc clips
+_OF_POINT = 1e6  # as bright as its flux in so small a part of a pixel
+_BESIDE_PX = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+_OF_FLANK = 0.6  # by how much the flank counts: .5 to .75 where the disc is 10 to 1.5 times what clips
 
 
-def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
-    """Return sets of first guesses, the best of which is to be followed.
+class _Disc(NamedTuple):
+    """A lone disc as the light seen of it tells, and whether as much of it clips as is seen to."""
+
+    u_px: float
+    v_px: float
+    flux_e: float
+    is_sure: bool
+
+
+def guesses(found: Sequence[Cluster], prepared: PreparedFrame) -> list[list[list[Start]]]:
+    """Return each cluster's sets of first guesses, from the faintest on: the best is to be followed."""
+    discs = _lone_discs(found, prepared)
+    return [_of_cluster(cluster, disc, prepared) for cluster, disc in zip(found, discs, strict=True)]
+
+
+def _of_cluster(cluster: Cluster, disc: _Disc | None, prepared: PreparedFrame) -> list[list[Start]]:
+    """Return sets of first guesses of a cluster, which may be a lone disc.
 
     Of a clipped flare, and of one that the frame's edge cuts, the part seen may be a small part of the flux;
     but no source is larger than what is seen of it. Where the middle of a lone blob's light is far from its
@@ -28,12 +46,15 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
     """
     cut = any(member.blob.box.touches_border(prepared.shape) for member in cluster.members)
     factors = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
-    if len(cluster.members) == 1 and cluster.is_clipped:
-        factors = tuple(
-            sorted({*factors, *_factor_by_outline(cluster.members[0], cluster.window.clip_e, prepared)})
-        )
     floor_e = least_flux_e(prepared)
     sets: list[list[Start]] = []
+    if disc is not None:
+        flux_e = max(disc.flux_e, floor_e)
+        if disc.is_sure:
+            sets.append([(disc.u_px, disc.v_px, cluster.members[0].log_range(flux_e))])
+            factors = ()
+        else:
+            factors = tuple(sorted({*factors, flux_e / max(cluster.members[0].flux_e, floor_e)}))
     for factor in factors:
         starts: list[Start] = []
         for member in cluster.members:
@@ -47,7 +68,7 @@ def guesses(cluster: Cluster, prepared: PreparedFrame) -> list[list[Start]]:
             starts.append((member.u_px, member.v_px, member.log_range(times * flux_e)))
         if starts not in sets:
             sets.append(starts)
-    if len(sets) == 1 and len(cluster.members) == 1:
+    if len(sets) == 1 and len(cluster.members) == 1 and not cluster.is_clipped:
         (member,), smooth_px = cluster.members, smoothing_px(prepared.calibration)
         box, filtered_e = member.blob.box, member.blob.filtered_e
         row, column = divmod(int(np.argmax(filtered_e)), box.width)
@@ -64,34 +85,39 @@ def least_flux_e(prepared: PreparedFrame) -> float:
     return 3.0 * math.sqrt(prepared.floor_e2)
 
 
-def _factor_by_outline(member: Candidate, clip_e: float, prepared: PreparedFrame) -> tuple[float, ...]:
-    """Return how many times as bright a clipped flare is if it is a disc whose image clips so far out."""
-    brightness_e = prepared.brightness_e(member.u_px, member.v_px)
-    clipped = prepared.clipped_in(member.blob.box) & member.blob.pixels
-    clipped_px2 = np.count_nonzero(clipped)
-    if not (clipped_px2 and member.image_radius_px > 0.0 and clip_e < brightness_e < math.inf):
-        return ()
-    at_px = math.sqrt(clipped_px2 / math.pi)
-    if clipped_px2 >= _LEAST_DISC_PX2:
-        at_px = half_axes_px(clipped)[1]
-    radius_px = _blurred_radius_px(at_px, clip_e / brightness_e, smoothing_px(prepared.calibration))
-    return (max((radius_px / member.image_radius_px) ** 2, 1.0),)
-
-
-def _blurred_radius_px(at_px: float, share: float, smooth_px: float) -> float:
-    """Return the radius of a disc that, blurred by a Gaussian, is so bright at a place, relative to itself.
-
-    There χ'², of two degrees of freedom and a noncentrality of (place / width)², is below (radius / width)²
-    with this probability: by Sankaran's approximation (Biometrika 50, 199, 1963), of a small one by its flux.
-    """
-    away = (at_px / smooth_px) ** 2
-    of_point = math.sqrt(2.0 * share) * math.exp(min(0.25 * away, 50.0))
-    if of_point < _SMALL_DISC:
-        wider = 1.0 + 0.25 * of_point**2  # as its own radius widens it
-        return smooth_px * math.sqrt(2.0 * share * wider) * math.exp(0.25 * away / wider)
-    h = 1.0 - 2.0 / 3.0 * (2.0 + away) * (2.0 + 3.0 * away) / (2.0 + 2.0 * away) ** 2
-    p, m = (2.0 + 2.0 * away) / (2.0 + away) ** 2, (h - 1.0) * (1.0 - 3.0 * h)
-    mean = 1.0 + h * p * (h - 1.0 - 0.5 * (2.0 - h) * m * p)
-    sigma = h * math.sqrt(2.0 * p) * (1.0 + 0.5 * m * p)
-    root = max(mean + NormalDist().inv_cdf(min(share, _MOST_SHARE)) * sigma, 0.0)
-    return smooth_px * max(math.sqrt((2.0 + away) * root ** (1.0 / h)), _SMALL_DISC)
+def _lone_discs(found: Sequence[Cluster], prepared: PreparedFrame) -> list[_Disc | None]:
+    """Return what the light of lone blobs tells of discs; None where it tells nothing."""
+    discs: list[_Disc | None] = [None] * len(found)
+    lone = {
+        index: cluster.members[0]
+        for index, cluster in enumerate(found)
+        if len(cluster.members) == 1 and not cluster.members[0].blob.box.touches_border(prepared.shape)
+    }
+    if not lone:
+        return discs
+    frame, calibration, smooth_px = prepared.frame, prepared.calibration, smoothing_px(prepared.calibration)
+    place_px = np.array([(one.u_px, one.v_px) for one in lone.values()])
+    clipped_px = np.sqrt([one.clipped_px / math.pi for one in lone.values()])
+    light_e, area_px2, radius_px = np.array(
+        [(one.flux_e, one.blob.area_px, one.image_radius_px) for one in lone.values()]
+    ).T
+    clip_e = np.array([found[index].window.clip_e - found[index].background_e for index in lone])
+    around_px = np.concatenate([place_px + beside_px for beside_px in _BESIDE_PX])
+    bright_e = brightness_e(around_px, frame.exposure_s, frame.gain, calibration).reshape(3, -1)
+    flux_e, told_px2 = whole_fluxes(
+        light_e, area_px2, np.minimum(bright_e[0], _OF_POINT * light_e),
+        np.where(clipped_px > 0.0, clip_e, math.inf), smooth_px,
+    ).T  # fmt: skip
+    told_px = np.sqrt(told_px2 / math.pi)
+    is_sure = abs(told_px - clipped_px) < _OUTLINE_PX + _OUTLINE_SHARE * told_px
+    with np.errstate(invalid="ignore"):
+        # The middle of a disc's outline lies where less light falls, that of all of its light at its place.
+        # Of its flank more is bright where more light falls.
+        radius_px = radius_px * np.sqrt(flux_e / light_e)
+        shift_px = radius_px * (0.25 * radius_px - _OF_FLANK * smooth_px) * np.log(bright_e[1:] / bright_e[0])
+    place_px += np.where((clipped_px > 0.0) & np.isfinite(shift_px), shift_px, 0.0).T
+    rows = zip(lone, place_px.tolist(), flux_e.tolist(), is_sure.tolist(), strict=True)
+    for index, (u_px, v_px), one_e, as_seen in rows:
+        if not math.isnan(one_e):
+            discs[index] = _Disc(u_px, v_px, one_e, as_seen)
+    return discs

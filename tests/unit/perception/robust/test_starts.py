@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import ncx2
 
 from perception import Detection, detect
 from perception.model.bearing import direction_camera
@@ -18,7 +17,6 @@ from perception.model.window import Camera, lay_out
 from perception.robust import explain
 from perception.robust import solve as solve_module
 from perception.robust.problem import Problem, Window
-from perception.robust.starts.guesses import _blurred_radius_px
 from perception.robust.starts.likely import start_costs
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, expose, random
@@ -156,17 +154,6 @@ def test_what_is_larger_than_its_window_is_not_laid_out() -> None:
         Camera(CAMERA, 1e-4, 1.0), u_px[1:], v_px[1:], log_range[1:], most_radius_px=np.full(2, 60.0)
     )
     assert imaged.all()
-
-
-@pytest.mark.parametrize("smooth_px", [0.5, 0.757, 2.0])
-def test_where_a_blurred_disc_clips_tells_its_size(smooth_px: float) -> None:
-    """Within 5 %: by the noncentral χ² itself, which is the share of its own brightness that is seen there."""
-    for radius in (0.05, 0.2, 0.5, 0.8, 1.2, 2.0, 5.0, 15.0):
-        for away in (0.3, 0.8, 1.5, 3.0, 5.5, 15.5):
-            share = float(ncx2.cdf(radius**2, 2, away**2))
-            if 1e-3 < share < 0.98:
-                told_px = _blurred_radius_px(away * smooth_px, share, smooth_px)
-                assert told_px == pytest.approx(radius * smooth_px, rel=0.05), (radius, away)
 
 
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["rectilinear", "fisheye"])
