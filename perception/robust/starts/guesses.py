@@ -45,7 +45,7 @@ def _of_cluster(cluster: Cluster, disc: _Disc | None, prepared: PreparedFrame) -
     brightest pixel, a flare there may stand beside something else.
     """
     cut = any(member.blob.box.touches_border(prepared.shape) for member in cluster.members)
-    factors = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
+    factors: tuple[float, ...] = _CLIPPED_FACTORS if cluster.is_clipped else _CUT_FACTORS if cut else (1.0,)
     floor_e = least_flux_e(prepared)
     sets: list[list[Start]] = []
     if disc is not None:

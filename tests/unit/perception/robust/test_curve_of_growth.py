@@ -95,6 +95,12 @@ def test_a_lone_disc_is_guessed_nearly_as_it_is_fitted(times: float, monkeypatch
             strict=True,
         )
     ]
+
+    def kept(sets: Sequence[Sequence[Problem]], _: object) -> list[tuple[int, Problem]]:
+        problems.append(sets[0])
+        return []
+
+    monkeypatch.setattr(explain, "likely_starts", kept)
     middle = np.array([place[:2] for place in places])
     clip_e = (4095.0 - 64.0) / 0.74
     for (u, v, range_m), per_s in zip(places, brightness_e(middle, 1.0, 1.0, CAMERA), strict=True):
@@ -105,7 +111,6 @@ def test_a_lone_disc_is_guessed_nearly_as_it_is_fitted(times: float, monkeypatch
             random(97, round(u), round(times)),
             exposure_s,
         )
-        monkeypatch.setattr(explain, "likely_starts", lambda sets, _: problems.append(sets[0]) or [])
         problems.clear()
         detect(frame, CAMERA)
         (guessed,) = problems[0]
