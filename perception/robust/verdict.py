@@ -21,7 +21,7 @@ _FLANK_PX, _FLANK_SHARE = 3.0, 0.25
 _FLANK_PEAKS, _FLANK_PEAKS_ON_EDGES = 0.5, 1.0
 _LEAST_SEEN, _MOST_OFF = 2.0 / 3.0, 0.5
 _CLIPPED_DIM, _MOST_CLIPPED_DIM = 0.5, 0.1
-_MOST_OF_CLIPPED = 2  # flares more than blobs
+_MOST_OF_CLIPPED, _MOST_MOVING_OF_CLIPPED = 2, 1  # flares more than blobs
 _LIMB_RADIUS_PX, _MOST_LEFT_OF_LIMB = 2.0, 0.1
 _MOST_LIMB_ASPECT, _MOST_LIMB_BRIGHTNESS = 1.08, 1.15  # of sources that are not quite round or known
 _OF_TIE = 4.0  # σ
@@ -190,8 +190,12 @@ def is_clipped_elsewhere(solution: Solution) -> bool:
 
 
 def is_any_outline(solution: Solution, blobs: int) -> bool:
-    """Tell whether it takes so many more flares than blobs that they have the outline of any clipped lamp."""
-    return solution.count > blobs + _MOST_OF_CLIPPED
+    """Tell whether it takes so many more flares than blobs that they have the outline of any clipped lamp.
+
+    Those that move have two unknowns more each: three are as long and as bent as any lamp is.
+    """
+    moves = solution.motion_px is not None and bool((solution.window.state == CLIPPED).any())
+    return solution.count > blobs + (_MOST_MOVING_OF_CLIPPED if moves else _MOST_OF_CLIPPED)
 
 
 def is_other_limb(solution: Solution, camera: Camera) -> bool:

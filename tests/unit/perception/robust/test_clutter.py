@@ -14,7 +14,7 @@ from perception.robust.search.prepare import bad_pixels
 from perception.robust.search.structure import autocorrelation, structure_of
 from tests.hard_frames.flares import textured
 from tests.hard_frames.rows import ROWS
-from tests.hard_frames.scores import BACKGROUND_E, POINT, Flare, cell_centres, frame_of
+from tests.hard_frames.scores import BACKGROUND_E, EXPOSURE_S, POINT, Flare, cell_centres, frame_of
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
 EMPTY = (
@@ -57,6 +57,23 @@ def test_the_limb_of_a_clipped_lamp_is_no_source_s(frame: int) -> None:
     """Discs and ovals of 7 to 35 px, .5 to .87 times as bright as balls of 1 cm or up to a third longer than wide:
     told at .3 to 1.9 m, some with σ of mm. In the fourth one of 28 px by 18, by its flanks as a ball of 12 px."""
     assert ROWS["lamps where sources are balls of 1 cm"](frames=1, first=frame)["reported"] == 0
+
+
+def test_a_small_clipped_oval_is_no_row_of_flares_that_move() -> None:
+    """Ten px long: of forty such three were told as two or three balls side by side, each drawn out."""
+    camera = replace(POINT, width_px=96, height_px=96, bit_depth=12, saturation_dn=4095, source_radius_m=0.01)
+    parts, told = 8, 0
+    within_px = (np.arange(parts * 96) + 0.5) / parts - 48.0
+    for key in range(40):
+        number = random(98, key)
+        du, dv = number.uniform(-0.5, 0.5, 2)
+        half_u = number.uniform(4.2, 5.4)
+        half_v = half_u * number.uniform(0.62, 0.8)
+        inside = np.hypot((within_px - du) / half_u, (within_px[:, None] - dv) / half_v) < 1.0
+        covered = inside.reshape(96, parts, 96, parts).mean(axis=(1, 3))
+        mean_e = gaussian_filter(BACKGROUND_E + 9600.0 * covered, camera.psf_sigma_px)
+        told += len(perception.detect(expose(mean_e, camera, random(99, key), EXPOSURE_S), camera))
+    assert told == 0
 
 
 @pytest.mark.parametrize("frame", [14, 128, 209, 241, 463, 485])
