@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 # A climb is settled where a step is so short, or the next one is if steps go on to shorten as they did.
 SETTLED_SIGMAS, LAST_SIGMAS = 0.01, 0.1
+LAST_SHARE = 0.1  # of the farthest step: so short it must be for that slopes say what it changes
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
 MOST_STEPS = 50
 # Whether a climb is hopeless is judged after so many steps: ahead is, in -2 ln L, at most so much more than
@@ -109,10 +110,13 @@ def maximise(
             for one in range(count * step):
                 sigmas = max(sigmas, abs(shift[one]) / math.sqrt(variance_of(scale, factor, one)))
             left_sigmas = sigmas * min(sigmas / before_sigmas, 1.0)
-            if sigmas <= SETTLED_SIGMAS or (sigmas <= LAST_SIGMAS and left_sigmas <= SETTLED_SIGMAS):
+            is_short = bool((np.abs(shift) <= LAST_SHARE * most_step).all())
+            if is_short and sigmas <= LAST_SIGMAS and left_sigmas <= SETTLED_SIGMAS:
                 take_last_step(
                     view, structure, known, first_wave, shift, values, jacobian, expected, variance
                 )
+                break
+            if sigmas <= SETTLED_SIGMAS:
                 break
             before = objective(view, values, expected, variance, precision, clip_e)
             if taken >= JUDGED_AFTER and math.isfinite(to_beat):
