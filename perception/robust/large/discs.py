@@ -34,6 +34,9 @@ _LEAST_ROUND, _LEAST_ROUND_IF_CLIPPED = 0.3, 0.6
 """Parts of an outline that must lie on a circle: of a square's 0.2 do. The rest may be what lies around, or
 missing; of a clipped disc the outline is all that is known."""
 
+_LEAST_LIT = 0.35
+"""Of the disc that the frame shows. A stripe's edge lies on a circle that is far larger than the stripe."""
+
 _MOST_BRIGHTNESS_FACTOR = 2.0
 _LEAST_OF_BLOB = 0.25  # that the disc of its outline is, where its light is to bound a range
 _ODD_SIGMAS = 3.0
@@ -213,6 +216,8 @@ def _is_no_large_disc(member: Candidate, outline: Outline | None, prepared: Prep
     """
     calibration = prepared.calibration
     if outline is None or outline.share < (_LEAST_ROUND_IF_CLIPPED if member.is_clipped else _LEAST_ROUND):
+        return True
+    if outline.lit < _LEAST_LIT:
         return True
     if calibration.source_radius_m / math.sin(outline.angle_rad) < LEAST_RANGE_M:
         return True

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from perception import Detection, detect
 from perception.robust import measure
 from perception.robust.large import discs
-from perception.robust.large.outline import outline_of
+from perception.robust.large.outline import Outline, outline_of
 from perception.types import Calibration
 from tests.unit.perception.robust.test_eclipse import _pulls
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, expose, random
@@ -181,6 +181,23 @@ def test_whole_discs_are_told_without_a_look_at_outlines(
     monkeypatch.setattr(discs, "outline_of", counted)
     _told(_seen_e([(90.3, 101.6, 0.14)], 0.97, 0.5), SMALL)
     assert outlined
+
+
+@pytest.mark.parametrize("place", [(400.3, 300.2, 0.12), (2.5, 500.3, 0.1), (1275.0, 4.0, 0.09)])
+def test_what_is_within_the_outline_of_a_disc_is_lit(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of it that the frame shows: whole, or half and three quarters of it beyond the border."""
+    outlines: list[Outline | None] = []
+
+    def kept(*arguments: object) -> Outline | None:
+        outlines.append(outline_of(*arguments))  # type: ignore[arg-type]
+        return outlines[-1]
+
+    monkeypatch.setattr(discs, "outline_of", kept)
+    monkeypatch.setattr(measure, "as_whole_discs", lambda *_: {})
+    detect(expose(expected_e(CAMERA, [place], 1e-4) + 20.0, CAMERA, random(100), 1e-4), CAMERA)
+    (outline,) = outlines
+    assert outline is not None
+    assert outline.lit > 0.95
 
 
 @pytest.mark.parametrize("range_m", [0.028, 0.035])
