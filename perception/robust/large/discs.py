@@ -34,7 +34,7 @@ _LEAST_ROUND, _LEAST_ROUND_IF_CLIPPED = 0.3, 0.6
 """Parts of an outline that must lie on a circle: of a square's 0.2 do. The rest may be what lies around, or
 missing; of a clipped disc the outline is all that is known."""
 
-_LEAST_LIT = 0.35
+_LEAST_LIT = 2.0 / 3.0
 """Of the disc that the frame shows. A stripe's edge lies on a circle that is far larger than the stripe."""
 
 _MOST_BRIGHTNESS_FACTOR = 2.0
