@@ -16,7 +16,6 @@ from perception.model.ranging import flux_at_one_metre_dn
 from perception.model.sensor import check_frame, gain_dn_per_e
 from perception.model.window import Camera
 from perception.robust.clusters import Cluster, brightest, candidates, clusters, is_extended
-from perception.robust.explain import by_blobs
 from perception.robust.flare import MeasuredFlare
 from perception.robust.goodness import is_likely
 from perception.robust.measure import as_it_turns, measure
@@ -28,6 +27,7 @@ from perception.robust.search.near import most_brightness
 from perception.robust.search.prepare import PreparedFrame, prepare
 from perception.robust.search.reason import reason_of_none
 from perception.robust.solve import Solution
+from perception.robust.starts.at_rest import by_blobs
 from perception.robust.together.free_width import (
     NOTHING_SEEN,
     log_range_slopes,

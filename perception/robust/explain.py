@@ -41,33 +41,11 @@ from perception.robust.overlap.oval import is_oval
 from perception.robust.overlap.pairs import LEAST_RADIUS_PX
 from perception.robust.overlap.rivals import against, beside_rival, better, to_beat, weighed
 from perception.robust.overlap.unparted import doubted
-from perception.robust.problem import Problem
 from perception.robust.search.prepare import PreparedFrame
-from perception.robust.solve import Solution, solve
-from perception.robust.starts.guesses import guesses
-from perception.robust.starts.likely import likely_starts
-from perception.robust.verdict import is_hardly_seen, is_one_pixel
+from perception.robust.solve import Solution
+from perception.robust.verdict import is_hardly_seen
 
 _GOOD_SIGMAS = 10.0  # of χ²: what leaves so much more is not as good, whatever error the model may have
-
-
-def by_blobs(found: Sequence[Cluster], prepared: PreparedFrame, camera: Camera) -> list[Solution | None]:
-    """Solve clusters by a flare at rest for each blob; None where that does not converge."""
-    # The same window with each set of first guesses.
-    first = [
-        [Problem(cluster.window, starts, cluster.background_e) for starts in sets]
-        for cluster, sets in zip(found, guesses(found, prepared), strict=True)
-    ]
-    problems = likely_starts(first, camera)
-    chosen: list[Solution | None] = [None] * len(found)
-    for (index, _), solution in zip(problems, solve([p for _, p in problems], camera), strict=True):
-        held = chosen[index]
-        if solution is not None and (held is None or solution.deviance < held.deviance):
-            chosen[index] = solution
-    for index, (cluster, solution) in enumerate(zip(found, chosen, strict=True)):
-        if len(cluster.members) == 1 and solution is not None and is_one_pixel(solution):
-            chosen[index] = None
-    return chosen
 
 
 def best(

@@ -7,7 +7,7 @@ from dataclasses import replace
 from perception.model.window import Camera
 from perception.robust.around.uneven import MOST_LEFT, explains_flanks
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters
-from perception.robust.explain import best, by_blobs
+from perception.robust.explain import best
 from perception.robust.flare import MeasuredFlare, measured_flare
 from perception.robust.large.discs import measure_large
 from perception.robust.large.whole import as_whole_discs
@@ -17,6 +17,7 @@ from perception.robust.overlap.free_fits import of_free_size, with_model_error
 from perception.robust.search.blobs import Blob, divide
 from perception.robust.search.prepare import PreparedFrame
 from perception.robust.solve import Solution
+from perception.robust.starts.at_rest import by_blobs
 from perception.robust.together.camera_turn import turning, with_turn
 from perception.robust.verdict import (
     is_any_outline,

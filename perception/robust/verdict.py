@@ -181,11 +181,13 @@ def _seen(
 def is_clipped_elsewhere(solution: Solution) -> bool:
     """Tell whether pixels are clipped where the flares that explain a window are half as bright at most.
 
-    Long lamps have 12 to 37 % of their clipped pixels there, points none up to fifty times full scale.
+    Long lamps have 12 to 37 % of their clipped pixels there, points none up to fifty times full scale. What
+    structure of the background explains, which may be any lamp, counts for nothing.
     """
     window = solution.window
     clipped = window.state == CLIPPED
-    dim = clipped & (solution.expected_e < _CLIPPED_DIM * window.image_e)
+    bright_e = solution.flares_e + solution.background_e
+    dim = clipped & (bright_e < _CLIPPED_DIM * window.image_e)
     return int(dim.sum()) > _MOST_CLIPPED_DIM * int(clipped.sum())
 
 

@@ -19,7 +19,8 @@ from perception.model.likelihood.products import dot, factorised, inverted, solv
 
 Array = NDArray[np.float64]
 
-# A climb is settled where a step is so short, or the next one is if steps go on to shorten as they did.
+# A climb is settled where a step is so short, or the next one is if steps go on to shorten as they did; a
+# first one below the latter is taken for the last, as from where images were laid out anew.
 SETTLED_SIGMAS, LAST_SIGMAS = 0.01, 0.1
 LAST_SHARE = 0.1  # of the farthest step: so short it must be for that slopes say what it changes
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-6, 1e-3, 1e7
@@ -95,6 +96,7 @@ def maximise(
     fisher, damped, factor = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
     scale = np.empty(size)
     damping, is_new, to_gain, before, taken, sigmas = FIRST_DAMPING, True, 0.0, 0.0, 0, math.inf
+    was_rejected = False
     expectation(values, view, sources, structure, known, expected, jacobian, variance)
     for _ in range(MOST_STEPS):
         if is_new:
@@ -142,9 +144,10 @@ def maximise(
             values[:], expected[:] = trial, new_expected
             jacobian, new_jacobian = new_jacobian, jacobian
             variance, new_variance = new_variance, variance
-            damping, taken = max(0.1 * damping, LEAST_DAMPING), taken + 1
+            damping, taken = max(damping if was_rejected else 0.1 * damping, LEAST_DAMPING), taken + 1
+            was_rejected = False
         else:
-            damping *= 10.0
+            damping, was_rejected = 10.0 * damping, True
             if not damping < MOST_DAMPING:
                 return math.inf, math.inf
     else:

@@ -46,7 +46,7 @@ _STEPS = 2.0  # a width
 _LEAST_AROUND = (
     20.0  # of 2 Δ ln L where the flare does not reach: within it, what is not as taken looks like one
 )
-_SEEMS_WIDE, _SEEMS_LIT = 9.0, 20.0  # 2 Δ ln L to first order, from which one is tried
+_SEEMS_WIDE, _SEEMS_LIT = 9.0, 15.0  # 2 Δ ln L to first order, from which one is tried
 _EACH_SEEMS_WIDE = 4.0  # likewise of any, where one is divided into several
 _FARTHEST = 10.0  # 1 + ρ²/w² of what counts in first guesses: a hundredth of the light there
 _LEAST_KEPT = 0.02  # of a highlight's power, beside what flares and an even background may take of it

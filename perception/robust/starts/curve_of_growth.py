@@ -50,7 +50,7 @@ def whole_fluxes(
     fluxes = np.full((len(light_e), 2), np.nan)
     px2 = smooth_px * smooth_px
     for index in range(len(light_e)):
-        if not (light_e[index] > 0.0 and brightness_e[index] > 0.0):
+        if not (light_e[index] > 0.0 and brightness_e[index] > 0.0 and clip_e[index] > 0.0):
             continue
         bright, clip, light = brightness_e[index] * px2, clip_e[index] * px2, light_e[index]
         within = math.sqrt(area_px2[index] / (math.pi * px2))

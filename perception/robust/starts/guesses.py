@@ -37,6 +37,11 @@ def guesses(found: Sequence[Cluster], prepared: PreparedFrame) -> list[list[list
     return [_of_cluster(cluster, disc, prepared) for cluster, disc in zip(found, discs, strict=True)]
 
 
+def more_guesses(found: Sequence[Cluster], prepared: PreparedFrame) -> list[list[list[Start]]]:
+    """Return sets of first guesses of clusters where those of `guesses` lead nowhere."""
+    return [_of_cluster(cluster, None, prepared) for cluster in found]
+
+
 def _of_cluster(cluster: Cluster, disc: _Disc | None, prepared: PreparedFrame) -> list[list[Start]]:
     """Return sets of first guesses of a cluster, which may be a lone disc.
 
@@ -110,7 +115,7 @@ def _lone_discs(found: Sequence[Cluster], prepared: PreparedFrame) -> list[_Disc
     ).T  # fmt: skip
     told_px = np.sqrt(told_px2 / math.pi)
     is_sure = abs(told_px - clipped_px) < _OUTLINE_PX + _OUTLINE_SHARE * told_px
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):
         # The middle of a disc's outline lies where less light falls, that of all of its light at its place.
         # Of its flank more is bright where more light falls.
         radius_px = radius_px * np.sqrt(flux_e / light_e)

@@ -9,9 +9,9 @@ from scipy.integrate import quad
 from scipy.stats import ncx2
 
 from perception import detect
-from perception.model.ranging import brightness_e
-from perception.robust import explain
+from perception.model import ranging
 from perception.robust.problem import Problem
+from perception.robust.starts import at_rest
 from perception.robust.starts.curve_of_growth import whole_fluxes
 from tests.unit.perception.simulation import calibration, expected_e, expose, random
 
@@ -69,14 +69,10 @@ def test_the_light_within_a_circle_tells_the_flux(smooth_px: float) -> None:
 
 
 def test_what_no_disc_shows_tells_nothing() -> None:
-    """No light, none that a range could be had from, or more than clips in so small a circle."""
-    told = whole_fluxes(
-        np.array([0.0, 100.0, -3.0]),
-        np.full(3, 30.0),
-        np.array([50.0, math.nan, 50.0]),
-        np.full(3, math.inf),
-        0.7,
-    )
+    """No light, none that a range could be had from, or a background as bright as what clips."""
+    light_e, brightness_e = np.array([0.0, 100.0, -3.0, 100.0]), np.array([50.0, math.nan, 50.0, 50.0])
+    clip_e = np.array([math.inf, math.inf, math.inf, 0.0])
+    told = whole_fluxes(light_e, np.full(4, 30.0), brightness_e, clip_e, 0.7)
     assert np.isnan(told).all()
 
 
@@ -97,13 +93,13 @@ def test_a_lone_disc_is_guessed_nearly_as_it_is_fitted(times: float, monkeypatch
     ]
 
     def kept(sets: Sequence[Sequence[Problem]], _: object) -> list[tuple[int, Problem]]:
-        problems.append(sets[0])
+        problems.extend(sets)
         return []
 
-    monkeypatch.setattr(explain, "likely_starts", kept)
+    monkeypatch.setattr(at_rest, "likely_starts", kept)
     middle = np.array([place[:2] for place in places])
     clip_e = (4095.0 - 64.0) / 0.74
-    for (u, v, range_m), per_s in zip(places, brightness_e(middle, 1.0, 1.0, CAMERA), strict=True):
+    for (u, v, range_m), per_s in zip(places, ranging.brightness_e(middle, 1.0, 1.0, CAMERA), strict=True):
         exposure_s = times * clip_e / float(per_s)
         frame = expose(
             expected_e(CAMERA, [(u, v, range_m)], exposure_s, 3.0),

@@ -13,7 +13,7 @@ from perception.model.fisher import flare_limits
 from perception.model.window import Camera, motion_cost
 from perception.robust.goodness import drawn_out
 from perception.types import Calibration, Detections
-from tests.moving_flares import CAMERA, drawn, drawn_out_e, lit_for
+from tests.moving_flares import CAMERA, LIT_S, drawn, drawn_out_e, lit_for
 from tests.unit.perception.simulation import expose, random
 
 Array = NDArray[np.float64]
@@ -45,6 +45,30 @@ def test_drawn_out_flares_are_one_each_and_their_errors_are_as_claimed() -> None
         pulls += [(hit.u_px - u) / hit.u_sigma_px, (hit.v_px - v) / hit.v_sigma_px]
         pulls.append((hit.range_m - range_m) / hit.range_sigma_m)
     assert float(np.mean(np.square(pulls))) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / len(pulls)))
+
+
+@pytest.mark.parametrize(("times", "key"), [(20.0, 1), (60.0, 2)])
+def test_near_balls_that_clip_and_move_are_found(times: float, key: int) -> None:
+    """35 at .55 to 1.65 m, 3 to 60 times as bright as what clips, that move by 1 to 5 px.
+
+    What clips is as wide as a larger ball at rest, and from there the way to the one that moves may be barred.
+    """
+    number = random(101, key, round(times))
+    mean_e, balls = np.full((CAMERA.height_px, CAMERA.width_px), 5.0), []
+    for v in range(45, 440, 80):
+        for u in range(45, 600, 80):
+            range_m, length = 0.55 * 3.0 ** number.random(), number.uniform(1.0, 5.0)
+            angle = number.uniform(0.0, math.pi)
+            place = u + number.uniform(-0.5, 0.5), v + number.uniform(-0.5, 0.5)
+            way_px = length * math.cos(angle), length * math.sin(angle)
+            left, top, light_e = drawn_out_e(CAMERA, *place, range_m, way_px)
+            mean_e[top : top + len(light_e), left : left + len(light_e)] += times * light_e
+            balls.append((*place, range_m))
+    hits = perception.detect(expose(mean_e, CAMERA, random(102, key, round(times)), times * LIT_S), CAMERA)
+    assert len(hits) == len(balls)
+    for u, v, range_m in balls:
+        (hit,) = (one for one in hits if math.hypot(one.u_px - u, one.v_px - v) < 1.5)
+        assert abs(hit.range_m - range_m) < 4.5 * hit.range_sigma_m
 
 
 def numerical_sigmas(range_m: float, way_px: tuple[float, float], camera: Calibration) -> Array:
