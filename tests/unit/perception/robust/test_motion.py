@@ -54,12 +54,13 @@ def test_near_balls_that_clip_and_move_are_found(times: float, key: int) -> None
     What clips is as wide as a larger ball at rest, and from there the way to the one that moves may be barred.
     """
     number = random(101, key, round(times))
-    mean_e, balls = np.full((CAMERA.height_px, CAMERA.width_px), 5.0), []
-    for v in range(45, 440, 80):
-        for u in range(45, 600, 80):
+    mean_e = np.full((CAMERA.height_px, CAMERA.width_px), 5.0)
+    balls: list[tuple[float, float, float]] = []
+    for row in range(45, 440, 80):
+        for column in range(45, 600, 80):
             range_m, length = 0.55 * 3.0 ** number.random(), number.uniform(1.0, 5.0)
             angle = number.uniform(0.0, math.pi)
-            place = u + number.uniform(-0.5, 0.5), v + number.uniform(-0.5, 0.5)
+            place = column + number.uniform(-0.5, 0.5), row + number.uniform(-0.5, 0.5)
             way_px = length * math.cos(angle), length * math.sin(angle)
             left, top, light_e = drawn_out_e(CAMERA, *place, range_m, way_px)
             mean_e[top : top + len(light_e), left : left + len(light_e)] += times * light_e

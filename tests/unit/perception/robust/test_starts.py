@@ -17,6 +17,7 @@ from perception.model.window import Camera, lay_out
 from perception.robust import solve as solve_module
 from perception.robust.problem import Problem, Window
 from perception.robust.starts import at_rest
+from perception.robust.starts.guesses import more_guesses
 from perception.robust.starts.likely import start_costs
 from perception.types import Calibration
 from tests.unit.perception.simulation import FLUX_PER_S_AT_1_M, calibration, expected_e, expose, random
@@ -74,7 +75,7 @@ def test_the_likeliest_guesses_lead_where_all_lead(key: int, monkeypatch: pytest
         return chosen
 
     monkeypatch.setattr(at_rest, "likely_starts", all_of)
-    monkeypatch.setattr(at_rest, "guesses", at_rest.more_guesses)  # several, also where the light tells one
+    monkeypatch.setattr(at_rest, "guesses", more_guesses)  # several, also where the light tells one
     every = _told(key)
     assert followed > 2 * len(every)
     assert len(few) == len(every) >= 10
