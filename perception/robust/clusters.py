@@ -52,7 +52,7 @@ class Candidate:
     clipped_px
         How many of them are clipped.
     u_px, v_px
-        Centroid of the blob, weighted by what exceeds the background.
+        Centroid of the blob, weighted by what exceeds the background (`cutout.light_of`).
     flux_e
         Sum of what exceeds the background in the blob.
     at_one_metre_e
