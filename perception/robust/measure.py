@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from perception.model.window import Camera
+from perception.model.window import MOST_MOTION_PX, Camera
 from perception.robust.around.uneven import MOST_LEFT, explains_flanks
 from perception.robust.clusters import LEAST_RANGE_M, Candidate, Cluster, clusters
 from perception.robust.explain import best
@@ -163,6 +163,10 @@ def _judged(
     if (cluster.is_clipped or solution.motion_px is not None) and is_any_outline(solution, blobs_seen):
         return []
     if misfit and is_clipped_elsewhere(solution):
+        return []
+    if (
+        solution.most_motion_px > MOST_MOTION_PX
+    ):  # as a halo may draw it out beyond `moves`
         return []
     is_at_once = prepared.frame.line_time_s == 0.0  # else flares that move are not fitted as such
     if (solution.window.state != cluster.window.state).any():  # by the flanks of what is clipped alone
