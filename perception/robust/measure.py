@@ -164,9 +164,7 @@ def _judged(
         return []
     if misfit and is_clipped_elsewhere(solution):
         return []
-    if (
-        solution.most_motion_px > MOST_MOTION_PX
-    ):  # as a halo may draw it out beyond `moves`
+    if solution.most_motion_px > MOST_MOTION_PX:  # as a halo may draw it out beyond `moves`
         return []
     is_at_once = prepared.frame.line_time_s == 0.0  # else flares that move are not fitted as such
     if (solution.window.state != cluster.window.state).any():  # by the flanks of what is clipped alone
