@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.model.bearing import direction_camera
-from perception.model.discs.nodes import across_and_down
+from perception.model.discs.nodes import disc_nodes
 from perception.model.lens import project
 from perception.robust.hiding.outlines import on_cones, refined_cone
 from perception.robust.search.blobs import Blob
@@ -21,7 +21,7 @@ _WIDER_THAN_SPILL_PX = 5
 _FEWEST = 24  # pixels of an outline
 _TRIED, _LEAST_VOLUME, _ROUNDS = 20, 1e-12, 3
 _MOST_ANGLE_RAD = 0.6  # nearly straight lines are no limbs
-_PLACES, _GOLDEN_RAD = 300, math.pi * (3.0 - math.sqrt(5.0))  # evenly over a disc
+_COARSE = 0.1  # of the fineness of images: so fine one tells what part of it is lit
 _ON_PX, _ON_SHARE = 0.75, 0.01  # so far from a circle, beside a share of its radius, an outline lies on it
 
 
@@ -83,7 +83,9 @@ def outline_of(blob: Blob, prepared: PreparedFrame) -> Outline | None:
     ((u_px, v_px),) = project(np.asarray(axis[None] / length), prepared.calibration).tolist()
     if not math.isfinite(u_px):
         return None
-    return Outline(u_px, v_px, math.acos(1.0 / length), share, _lit_part(axis, blob, prepared))
+    angle_rad = math.acos(1.0 / length)
+    part = _lit_part(u_px, v_px, axis / length, angle_rad, prepared, blob)
+    return Outline(u_px, v_px, angle_rad, share, part)
 
 
 def _likeliest_cone(limb: Array, calibration: Calibration) -> tuple[Array | None, float]:
@@ -106,30 +108,28 @@ def _likeliest_cone(limb: Array, calibration: Calibration) -> tuple[Array | None
     return axis, float(on_cones(axis[None], limb, *within, _MOST_ANGLE_RAD)[0].mean())
 
 
-def _lit_part(axis: Array, blob: Blob, prepared: PreparedFrame) -> float:
-    """Return what part of a cone that the frame shows is half as bright as a blob, or more.
+def _lit_part(
+    u_px: float, v_px: float, axis: Array, angle_rad: float, prepared: PreparedFrame, blob: Blob
+) -> float:
+    """Return what part of a disc's light that the frame shows falls where it is half as bright as a blob.
 
     By the counts themselves: where much is lit, the mesh of the background may have taken a disc for some.
     """
-    length = float(np.linalg.norm(axis))
-    across, down = across_and_down(*(axis / length).tolist())
-    ahead = 1.0 - (1.0 - 1.0 / length) * (np.arange(_PLACES) + 0.5) / _PLACES
-    turn, aside = _GOLDEN_RAD * np.arange(_PLACES), np.sqrt(1.0 - ahead**2)
-    places_px = project(
-        np.outer(ahead, axis / length)
-        + np.outer(aside * np.cos(turn), across)
-        + np.outer(aside * np.sin(turn), down),
-        prepared.calibration,
-    )
+    nodes = disc_nodes(
+        np.array([u_px]), np.array([v_px]), axis[None], np.array([angle_rad]), prepared.calibration,
+        finer=np.array([_COARSE]),
+    )  # fmt: skip
+    row, column = np.rint(nodes.v_px + v_px), np.rint(nodes.u_px + u_px)
     rows, columns = prepared.shape
-    with np.errstate(invalid="ignore"):
-        shown = ((places_px > -0.5) & (places_px < (columns - 0.5, rows - 0.5))).all(axis=1)
-    if not shown.any():
-        return 0.0
-    column, row = np.rint(places_px[shown]).astype(np.int64).T
+    shown = (row >= 0.0) & (row < rows) & (column >= 0.0) & (column < columns)
     counts_dn, black_dn = prepared.pixels.data_dn, prepared.frame.black_level_dn
     bright_dn = float(np.median(counts_dn[blob.box.slices][blob.pixels])) - black_dn
-    return float(np.mean(counts_dn[row, column] > black_dn + 0.5 * bright_dn))
+    is_lit = (
+        counts_dn[row[shown].astype(np.int64), column[shown].astype(np.int64)] > black_dn + 0.5 * bright_dn
+    )
+    weight = nodes.weight[shown]
+    whole = float(weight.sum())
+    return float(weight[is_lit].sum()) / whole if whole > 0.0 else 0.0
 
 
 def _along(corners: Array) -> Array:

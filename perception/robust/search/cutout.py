@@ -53,7 +53,7 @@ def light_of(
         light = excess_e[index]
         clipped += counts_dn[index] >= full_dn
         flux += light
-        bent = max(light, 0.0) * (2.0 - bend * light) if bend > 0.0 else max(light, 0.0)
+        bent = max(light, 0.0) * (2.0 - bend * light)
         u += bent * column
         v += bent * row
         weight += bent

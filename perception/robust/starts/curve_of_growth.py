@@ -85,47 +85,54 @@ def whole_fluxes(
 @compiled
 def _light(radius: float, bright: float, clip: float, within: float) -> tuple[float, float]:
     """Return the light of a disc within a circle, and within which radius it clips, in units of the blur."""
+    halves, weights = _chords(radius)
     clipped_at, share = 0.0, clip / bright
     if share < -math.expm1(-0.5 * radius * radius):
         clipped_at = max(radius, 1.0)
         # ln of the brightness is concave: from beyond, Newton's steps fall short.
         for _ in range(_MOST_STEPS):
-            at, slope = _brightness(radius, clipped_at)
+            at, slope = _brightness(halves, weights, clipped_at)
             step = math.log(at / share) * at / slope
             clipped_at = max(clipped_at - step, 0.5 * clipped_at)
             if abs(step) < _ENOUGH:
                 break
-    light = bright * (_light_beyond(radius, clipped_at) - _light_beyond(radius, max(within, clipped_at)))
+    beyond = _light_beyond(halves, weights, max(within, clipped_at))
+    light = bright * (_light_beyond(halves, weights, clipped_at) - beyond)
     if clipped_at > 0.0:
         light += math.pi * min(clipped_at, within) ** 2 * clip
     return light, clipped_at
 
 
 @compiled
-def _brightness(radius: float, at: float) -> tuple[float, float]:
-    """Return how bright a blurred disc is so far from its middle, and by how much that changes outwards."""
-    widest = math.asin(min(_FARTHEST / radius, 1.0))
-    step = widest / _CHORDS
-    brightness = slope = 0.0
+def _chords(radius: float) -> tuple[Array, Array]:
+    """Return half the lengths of a disc's chords, and how often a normal variate lies on each."""
+    halves, weights = np.empty(_CHORDS), np.empty(_CHORDS)
+    step = math.asin(min(_FARTHEST / radius, 1.0)) / _CHORDS
     for chord in range(_CHORDS):
         angle = (chord + 0.5) * step
-        off, half = radius * math.sin(angle), radius * math.cos(angle)
-        weight = 2.0 * step * half * math.exp(-0.5 * off * off) / _SQRT_2_PI
+        off = radius * math.sin(angle)
+        halves[chord] = radius * math.cos(angle)
+        weights[chord] = 2.0 * step * halves[chord] * math.exp(-0.5 * off * off) / _SQRT_2_PI
+    return halves, weights
+
+
+@compiled
+def _brightness(halves: Array, weights: Array, at: float) -> tuple[float, float]:
+    """Return how bright a blurred disc is so far from its middle, and by how much that changes outwards."""
+    brightness = slope = 0.0
+    for chord in range(_CHORDS):
+        half, weight = halves[chord], weights[chord]
         brightness += weight * (_beyond(at - half) - _beyond(at + half))
         slope += weight * (math.exp(-0.5 * (at + half) ** 2) - math.exp(-0.5 * (at - half) ** 2)) / _SQRT_2_PI
     return brightness, slope
 
 
 @compiled
-def _light_beyond(radius: float, at: float) -> float:
+def _light_beyond(halves: Array, weights: Array, at: float) -> float:
     """Return how much light of a blurred disc of brightness 1 lies beyond a radius."""
-    widest = math.asin(min(_FARTHEST / radius, 1.0))
-    step = widest / _CHORDS
     light = 0.0
     for chord in range(_CHORDS):
-        angle = (chord + 0.5) * step
-        off, half = radius * math.sin(angle), radius * math.cos(angle)
-        weight = 2.0 * step * half * math.exp(-0.5 * off * off) / _SQRT_2_PI
+        half, weight = halves[chord], weights[chord]
         light += weight * (_of_chord(half, at) - _of_chord(-half, at))
     return 2.0 * math.pi * light
 
